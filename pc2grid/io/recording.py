@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Collection, Iterator
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
@@ -13,15 +14,18 @@ import numpy as np
 from pc2grid.config import ReadConfig
 from pc2grid.display import html_table, short
 from pc2grid.errors import ConfigError, LogError
+from pc2grid.io import topics
 from pc2grid.io.containers.detect import open_source
 from pc2grid.io.error_translation import guarded, guarded_stream
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.map_pose import MapPose, last_map_pose
-from pc2grid.io.message_source import Choice, LogInfo, MessageSource, RawMessage
+from pc2grid.io.message_source import GAP_NS, Choice, LogInfo, MessageSource, RawMessage
 from pc2grid.io.read_plan import Plan, make_plan
 from pc2grid.io.scan_stream import Part, Stream
-from pc2grid.io.scan_times import with_scan_times
 from pc2grid.model import ReadReport, Scan
+
+_STEP_NS = 1_000_000_000
+"""The last message is looked for in steps that begin with this; chosen by hand: a scanner is faster."""
 
 
 def open_log(path: str | Path, config: ReadConfig | None = None, *, recover: bool = False) -> Log:
@@ -51,16 +55,14 @@ class Log:
     def __init__(self, source: MessageSource, config: ReadConfig) -> None:
         self._source = source
         self._config = config
-        self._plan: Plan | None = None
         self._frames = FrameTree()
-        self._digest: str | None = None
         self._stream: Stream | None = None
 
     @functools.cached_property
     def info(self) -> LogInfo:
         """The facts that are known without decoding a message; its times are those of the scans."""
         try:
-            return guarded(self._source.info.path, lambda: with_scan_times(self._source, self._config.topic))
+            return guarded(self._source.info.path, lambda: _with_scan_times(self._source, self._config.topic))
         except LogError:  # said again where the scans are read
             return self._source.info
 
@@ -95,14 +97,12 @@ class Log:
 
     def digest(self) -> str:
         """SHA-256 (hex) of the file, or of all files of a folder one after another, in reading order."""
-        if self._digest is None:
-            total = hashlib.sha256()
-            for path in self._source.files:
-                with path.open("rb") as file:
-                    while block := file.read(1 << 20):
-                        total.update(block)
-            self._digest = total.hexdigest()
-        return self._digest
+        total = hashlib.sha256()
+        for path in self._source.files:
+            with path.open("rb") as file:
+                while block := file.read(1 << 20):
+                    total.update(block)
+        return total.hexdigest()
 
     def report(self) -> ReadReport:
         """Counts of what was read and of what was lost, so far."""
@@ -113,10 +113,12 @@ class Log:
 
         Raises TopicError, NoScans, UnsupportedSchema or FrameError.
         """
-        if self._plan is None:
-            read, path = (self._source, self._config, self._frames), self._source.info.path
-            self._plan = guarded(path, lambda: make_plan(*read))
         return self._plan.choice
+
+    @functools.cached_property
+    def _plan(self) -> Plan:
+        read = self._source, self._config, self._frames
+        return guarded(self._source.info.path, lambda: make_plan(*read))
 
     def map_pose(self, topic: str, end_s: float | None = None) -> MapPose:
         """The last pose in a map that localization on the robot published, at most `end_s` seconds after the
@@ -142,18 +144,15 @@ class Log:
             raise ConfigError(f"start: expected seconds >= 0, found {start_s:g}")
         if duration_s is not None and not duration_s > 0:
             raise ConfigError(f"duration: expected seconds > 0, found {duration_s:g}")
-        self.choose()
-        plan = self._plan
-        assert plan is not None
-        path, part = self._source.info.path, self._part(start_s, duration_s)
-        read = self._source, self._config, self._frames, plan, part
+        path = self._source.info.path
+        read = self._source, self._config, self._frames, self._plan, self._part(start_s, duration_s)
         self._stream = guarded(path, lambda: Stream(*read))
         return guarded_stream(path, self._stream.run())
 
     @property
     def last_scan_ns(self) -> int:
         """The log time of the last scan that `scans` has given; 0 before the first."""
-        return 0 if self._stream is None else self._stream.last_log_ns
+        return 0 if self._stream is None else self._stream.stamps.last_log_ns
 
     def _part(self, start_s: float, duration_s: float | None) -> Part:
         if not start_s and duration_s is None:
@@ -161,5 +160,61 @@ class Log:
         info = self.info
         start_ns = info.start_ns + round(start_s * 1e9)
         end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
-        name = f"from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
+        name = f" from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
         return Part(start_ns if start_s else None, end_ns, name, info.duration_s)
+
+
+def _with_scan_times(source: MessageSource, wanted: str | None) -> LogInfo:
+    """The facts about a recording, with the times of its scans in place of those of all messages.
+
+    Other messages may lie far from the scans: odometry that was started first, a transform of a wrong clock.
+
+    wanted : the topics of the scans; None: of all that hold scans. Messages far from the scans are among the
+    warnings. Without scans, the times are those of all messages.
+
+    Raises LogError if damage is reached.
+    """
+    info = source.info
+    names = {t.topic for t in topics.usable(info.topics, wanted) if t.message_count != 0}
+    first_ns = _first_ns(source, names)
+    if first_ns is None:
+        return info
+    last_ns = _last_ns(source, names, first_ns)
+    of_scans = replace(info, start_ns=first_ns, end_ns=last_ns)
+    if max(first_ns - info.start_ns, info.end_ns - last_ns) <= GAP_NS:
+        return of_scans
+    others = [t.topic for t in info.topics if t.topic not in names and t.message_count != 0]
+    return replace(of_scans, warnings=(*info.warnings, *_strays(source, of_scans, others)))
+
+
+def _strays(source: MessageSource, scans: LogInfo, names: Collection[str]) -> list[str]:
+    """A sentence for each topic with messages far from the scans."""
+    told = []
+    for name in names:
+        first_ns = _first_ns(source, {name})
+        if first_ns is None:
+            continue
+        before_ns, after_ns = scans.start_ns - first_ns, _last_ns(source, {name}, first_ns) - scans.end_ns
+        where = [f"{before_ns * 1e-9:.1f} s before the first scan"] if before_ns > GAP_NS else []
+        where += [f"{after_ns * 1e-9:.1f} s after the last scan"] if after_ns > GAP_NS else []
+        if where:
+            told.append(f"{name}: a message {' and one '.join(where)}; times are those of the scans")
+    return told
+
+
+def _first_ns(source: MessageSource, names: Collection[str]) -> int | None:
+    return next((message.log_time_ns for message in source.messages(names)), None)
+
+
+def _last_ns(source: MessageSource, names: Collection[str], first_ns: int) -> int:
+    """The last log time of messages of these topics, found from the end without reading all of them."""
+    low_ns, high_ns = first_ns, source.info.end_ns + 1  # the last one is not before low, and before high
+    step_ns = _STEP_NS
+    while high_ns - low_ns > _STEP_NS:
+        middle_ns = max(high_ns - step_ns, low_ns)
+        if next(iter(source.messages(names, middle_ns, high_ns)), None) is None:
+            high_ns, step_ns = middle_ns, 2 * step_ns
+        else:
+            low_ns, step_ns = middle_ns, _STEP_NS
+    times_ns = (message.log_time_ns for message in source.messages(names, low_ns, high_ns))
+    return max(times_ns, default=first_ns)

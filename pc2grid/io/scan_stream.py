@@ -24,12 +24,13 @@ from pc2grid.errors import (
 from pc2grid.geometry import invert_pose
 from pc2grid.io import topics
 from pc2grid.io.attitude import Attitude
+from pc2grid.io.frames import PARAMETERS as FRAMES
 from pc2grid.io.frames import FrameTree, PoseTrack
 from pc2grid.io.further_scans import FurtherScans, together
-from pc2grid.io.message_source import MessageSource, RawMessage, Tally, TopicInfo
+from pc2grid.io.message_source import GAP_NS, MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
-from pc2grid.io.messages.types import Imu, Odometry, ScanMessage, Transform
-from pc2grid.io.read_plan import Plan, is_static, registered, tolerant
+from pc2grid.io.messages.types import CameraInfo, Imu, Odometry, ScanMessage, Transform
+from pc2grid.io.read_plan import Plan, Sensor, is_static, registered, tolerant
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
 from pc2grid.model import Scan
@@ -38,30 +39,21 @@ from pc2grid.sensor_model import SENSOR_MODELS
 
 @dataclass(frozen=True, slots=True)
 class StreamParameters:
-    """How scans are sorted, and which stamps are reported or refused; chosen by hand.
+    """How scans are sorted, and when reading stops; chosen by hand.
 
     wait_ns : log time for which a scan waits for later odometry and for scans with earlier stamps.
     max_waiting, max_waiting_bytes : scans that wait at the same time.
-    margin_ns : log time in front of and behind the wanted part, read for tf and odometry.
-    clock_jump_ns : a stamp that runs ahead of the time of recording by more needs a second one near it.
-    gap_ns : a longer time between two scans is reported.
     patience : number of undecodable scans, with no other before them, at which reading stops.
     max_bad_share : share of undecodable scans above which the log counts as damaged.
     eager : a scan waits no longer than until the odometry for all of its points is known.
-    sweep_ns : time from the stamp of a scan to its last point, until a scan has times of its points; a lidar
-    turns ten times a second.
     """
 
     wait_ns: int = 500_000_000
     max_waiting: int = 256
     max_waiting_bytes: int = 128_000_000
-    margin_ns: int = 1_000_000_000
-    clock_jump_ns: int = 60_000_000_000
-    gap_ns: int = 5_000_000_000
     patience: int = 10
     max_bad_share: float = 0.1
     eager: bool = False
-    sweep_ns: int = 100_000_000
 
 
 PARAMETERS = StreamParameters()
@@ -74,6 +66,60 @@ _EMPTY_HINT = (
 )
 
 
+@dataclass(slots=True)
+class Part:
+    """A part of a log: log times of its scans; None: from the first one on, to the last one.
+
+    name, log_s : for errors, which seconds of how many are wanted.
+    count, good, bad, returns : scans that were found, that were given, that cannot be used; points of those
+    given. error : why the first one cannot be used.
+    """
+
+    start_ns: int | None = None
+    end_ns: int | None = None
+    name: str = ""
+    log_s: float = 0.0
+    count: int = 0
+    good: int = 0
+    bad: int = 0
+    returns: int = 0
+    error: Pc2GridError | None = None
+
+    def holds(self, log_time_ns: int) -> bool:
+        """Whether a scan recorded then is wanted."""
+        return (self.start_ns or 0) <= log_time_ns and (self.end_ns is None or log_time_ns < self.end_ns)
+
+    def with_margin(self) -> tuple[int | None, int | None]:
+        """Log times between which odometry and tf are read: what lies farther away is not interpolated."""
+        low_ns = None if self.start_ns is None else max(self.start_ns - FRAMES.max_gap_ns, 0)
+        return low_ns, None if self.end_ns is None else self.end_ns + FRAMES.max_gap_ns
+
+    def skipped(self, error: Pc2GridError, topic: str, patience: int) -> None:
+        """Count a scan that cannot be used. Raises after too many from the beginning on."""
+        self.bad += 1
+        self.error = self.error or error
+        if self.bad >= patience and not self.good:
+            raise self._mostly_bad(topic, self.error)
+
+    def finish(self, topic: str, max_bad_share: float, empty: str) -> None:
+        """Raises NoScans if there were none or all were empty, LogCorrupt or PointCloudError if too many were
+        bad.
+
+        empty : why the last empty scan was so.
+        """
+        if self.count == 0:
+            raise NoScans(f"{topic}: no scan{self.name}", hint=f"the log lasts {self.log_s:.1f} s")
+        if self.error is not None and (self.good == 0 or self.bad > max_bad_share * self.count):
+            raise self._mostly_bad(topic, self.error)
+        if not self.returns:
+            raise NoScans(f"{topic}: none of {self.good} scans holds a return: {empty}", hint=_EMPTY_HINT)
+
+    def _mostly_bad(self, topic: str, error: Pc2GridError) -> Pc2GridError:
+        kind = LogCorrupt if self.good else PointCloudError
+        words = f"{topic}: {self.bad} of {self.count} scans are unreadable: {error.message}"
+        return kind(words, hint=error.hint)
+
+
 class _Waiting(NamedTuple):
     """A scan that waits; scans with equal stamps are sorted by their number in the log."""
 
@@ -84,84 +130,15 @@ class _Waiting(NamedTuple):
     message: ScanMessage
 
 
-class Part:
-    """The part of the log that is read, how many of its scans could be decoded, and their returns.
-
-    start_ns, end_ns : log times of its scans; None: from the first one on, to the last one.
-    """
-
-    def __init__(
-        self, start_ns: int | None = None, end_ns: int | None = None, name: str = "", length_s: float = 0.0
-    ) -> None:
-        """name, length_s : for errors, which seconds of how many are wanted."""
-        self.start_ns, self.end_ns = start_ns, end_ns
-        self._name, self._length_s = name, length_s
-        self.count = self.good = self.returns = self._bad = 0
-        self._error: Pc2GridError | None = None
-
-    def holds(self, log_time_ns: int) -> bool:
-        """Whether a scan recorded then is wanted."""
-        return (self.start_ns is None or log_time_ns >= self.start_ns) and (
-            self.end_ns is None or log_time_ns < self.end_ns
-        )
-
-    def skipped(self, error: Pc2GridError, topic: str, patience: int) -> None:
-        """Count a scan that cannot be used. Raises after too many from the beginning on."""
-        self._bad += 1
-        self._error = self._error or error
-        if self._bad >= patience and not self.good:
-            raise self._mostly_bad(topic)
-
-    def finish(self, topic: str, max_bad_share: float, empty: str) -> None:
-        """Raises NoScans if there were none or all were empty, LogCorrupt or PointCloudError if too many were
-        bad.
-
-        empty : why the last empty scan was so.
-        """
-        if self.count == 0:
-            hint = f"the log lasts {self._length_s:.1f} s"
-            raise NoScans(f"{topic}: no scan {self._name}".rstrip(), hint=hint)
-        if self.good == 0 or self._bad > max_bad_share * self.count:
-            raise self._mostly_bad(topic)
-        if not self.returns:
-            raise NoScans(f"{topic}: none of {self.good} scans holds a return: {empty}", hint=_EMPTY_HINT)
-
-    def _mostly_bad(self, topic: str) -> Pc2GridError:
-        assert self._error is not None
-        kind = PointCloudError if self.good == 0 else LogCorrupt
-        return kind(
-            f"{topic}: {self._bad} of {self.count} scans are unreadable: {self._error.message}",
-            hint=self._error.hint,
-        )
-
-
-class _Queue:
-    """Scans that wait, the earliest stamp first."""
-
-    def __init__(self) -> None:
-        self.scans: list[_Waiting] = []
-        self.size_bytes = 0
-
-    def push(self, scan: _Waiting) -> None:
-        """Add a scan."""
-        heapq.heappush(self.scans, scan)
-        self.size_bytes += scan.size_bytes
-
-    def pop(self) -> _Waiting:
-        """Take the scan with the earliest stamp."""
-        scan = heapq.heappop(self.scans)
-        self.size_bytes -= scan.size_bytes
-        return scan
-
-
 class _Stamps:
     """Whether stamps go on; compared with the time of recording.
 
-    last_ns, last_log_ns : of the last scan that was used. out_of_time : see Stream.
+    last_ns, last_log_ns : of the last scan that was used. out_of_time : number of scans in a row that were
+    skipped because their stamps go back or jump.
     """
 
-    def __init__(self, parameters: StreamParameters, tally: Tally) -> None:
-        self._parameters, self._tally = parameters, tally
+    def __init__(self, tally: Tally) -> None:
+        self._tally = tally
         self.last_ns: int | None = None
         self.last_log_ns = 0
         self.out_of_time = 0
@@ -175,23 +152,22 @@ class _Stamps:
         """Compare a stamp with the one before. Raises PointCloudError for a scan to be skipped."""
         if self.last_ns is None:
             return
-        if stamp_ns == self.last_ns:
+        since_ns = stamp_ns - self.last_ns
+        if not since_ns:
             raise PointCloudError("stamp is a duplicate")
-        if stamp_ns < self.last_ns:
+        # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.
+        jumps = since_ns - (log_time_ns - self.last_log_ns) > GAP_NS
+        alone = not any(0 <= entry.stamp_ns - stamp_ns < GAP_NS for entry in waiting)
+        if since_ns < 0 or (jumps and alone):
             self.out_of_time += 1
             raise PointCloudError(
-                "stamp goes back in time",
+                "stamp goes back in time" if since_ns < 0 else "stamp jumps",
                 hint="the stamps in the headers must increase: a topic for each sensor, and a clock that is "
                 "not set while it is recorded; a part in which they do: --start and --duration",
             )
-        ahead_ns = (stamp_ns - self.last_ns) - (log_time_ns - self.last_log_ns)
-        if ahead_ns > self._parameters.clock_jump_ns:
-            # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.
-            if not any(0 <= entry.stamp_ns - stamp_ns < self._parameters.gap_ns for entry in waiting):
-                self.out_of_time += 1
-                raise PointCloudError("stamp jumps")
+        if jumps:
             self._tally.warn("the clock of the scans jumps forward within the log")
-        elif stamp_ns - self.last_ns > self._parameters.gap_ns:
+        elif since_ns > GAP_NS:
             self._tally.warn("the log has gaps of more than 5 s between scans")
 
 
@@ -203,6 +179,7 @@ class _Poses:
 
     def __init__(self, plan: Plan, frames: FrameTree, tally: Tally) -> None:
         self._plan, self._frames, self._tally = plan, frames, tally
+        self._base = plan.choice.base_frame
         self._track = PoseTrack()
         self._T_child_base: F64 | None = None
         model = SENSOR_MODELS[plan.choice.sensor]
@@ -211,53 +188,35 @@ class _Poses:
         self._imu_frame = ""
         self.frame = plan.odometry_frame
 
-    def take_odometry(self, topic: TopicInfo) -> Callable[[Any, int], None]:
-        """What takes in the messages of the topic of the odometry."""
-        decode = decoder_for(topic)
+    def take_odometry(self, found: Odometry | None, log_time_ns: int) -> None:
+        """Take in a message of the topic of the odometry; None: it cannot be decoded."""
+        if found is None or not self._track.add(found.header.stamp_ns or log_time_ns, found.pose):
+            self._tally.warn("some odometry messages are unreadable or not finite, and were ignored")
+        elif self._T_child_base is None:
+            self._T_child_base = self._child_to_base(found.child)
+            self.frame = found.header.frame or None
 
-        def take(data: Any, log_time_ns: int) -> None:
-            found: Odometry | None = tolerant(decode, data, None)
-            if found is None or not self._track.add(found.header.stamp_ns or log_time_ns, found.pose):
-                self._tally.warn("some odometry messages are unreadable or not finite, and were ignored")
-            elif self._T_child_base is None:
-                self._T_child_base = self._child_to_base(found.child)
-                self.frame = found.header.frame or None
+    def take_imu(self, found: Imu | None, log_time_ns: int) -> None:
+        """Take in a message of the topic of the IMU."""
+        if found is None:
+            self._tally.warn("some IMU messages are unreadable or not finite, and were ignored")
+            return
+        self._imu_frame = found.header.frame
+        self._attitude.add(found, found.header.stamp_ns or log_time_ns)
 
-        return take
-
-    def take_imu(self, topic: TopicInfo) -> Callable[[Any, int], None]:
-        """What takes in the messages of the topic of the IMU."""
-        decode = decoder_for(topic)
-
-        def take(data: Any, log_time_ns: int) -> None:
-            found: Imu | None = tolerant(decode, data, None)
-            if found is None:
-                self._tally.warn("some IMU messages are unreadable or not finite, and were ignored")
-                return
-            self._imu_frame = found.header.frame
-            self._attitude.add(found, found.header.stamp_ns or log_time_ns)
-
-        return take
-
-    def take_tf(self, topic: TopicInfo) -> Callable[[Any, int], None]:
-        """What takes in the messages of a topic of moving transforms."""
-        decode = decoder_for(topic)
-
-        def take(data: Any, log_time_ns: int) -> None:
-            edges: tuple[Transform, ...] | None = tolerant(decode, data, None)
-            self._frames.add_all(edges, log_time_ns=log_time_ns)
-
-        return take
+    def take_tf(self, edges: tuple[Transform, ...] | None, log_time_ns: int) -> None:
+        """Take in a message of moving transforms."""
+        self._frames.add_all(edges, log_time_ns=log_time_ns)
 
     def _child_to_base(self, child: str) -> F64:
         """`T_child_base` of the odometry's child frame; identity if it is the base, or not in tf."""
-        base, frames = self._plan.choice.base_frame, self._frames
+        base, frames = self._base, self._frames
         if not child or child == base or self._plan.sensor_is_base:
             return np.eye(4)
-        known = child in frames and base in frames
-        if known and frames.connected(child, base) and not frames.moving(child, base):
+        if frames.connected(child, base) and not frames.moving(child, base):
             found = frames.lookup(child, base, 0)
-            return np.eye(4) if found is None else found
+            assert found is not None  # nothing moves there
+            return found
         self._tally.warn(f"the odometry is of frame {child}, which is taken for {base}")
         return np.eye(4)
 
@@ -265,7 +224,7 @@ class _Poses:
         """The stamp up to which odometry is known; 0 if none has arrived, None if there is none at all."""
         plan = self._plan
         if plan.odometry_frame is not None:
-            return self._frames.newest_ns(plan.odometry_frame, plan.choice.base_frame)
+            return self._frames.newest_ns(plan.odometry_frame, self._base)
         return None if plan.odometry is None else self._track.newest_ns
 
     def complete_ns(self) -> int | None:
@@ -275,22 +234,23 @@ class _Poses:
 
     def odometry(self, stamp_ns: int) -> F64 | None:
         """`T_odom_base` (4, 4) at a time; None if it is not known."""
-        plan = self._plan
-        if plan.odometry_frame is not None:
-            return self._frames.lookup(plan.odometry_frame, plan.choice.base_frame, stamp_ns)
-        if plan.odometry is None:
-            return None
+        if self._plan.odometry_frame is not None:
+            return self._frames.lookup(self._plan.odometry_frame, self._base, stamp_ns)
         found = self._track.at(stamp_ns)
-        if found is None or self._T_child_base is None:
-            return found
-        return found @ self._T_child_base
+        return found if found is None or self._T_child_base is None else found @ self._T_child_base
+
+    def newest_odometry(self) -> tuple[int, F64] | None:
+        """The newest stamp of the odometry and `T_odom_base` (4, 4) there; None if there is none."""
+        newest_ns = self.newest_ns() or 0
+        pose = self.odometry(newest_ns)
+        return None if pose is None else (newest_ns, pose)
 
     def longest_gap_ns(self, begin_ns: int, end_ns: int) -> int:
         """The longest time without a reading of odometry between two times."""
-        plan = self._plan
-        if plan.odometry_frame is None:
+        frame = self._plan.odometry_frame
+        if frame is None:
             return self._track.longest_gap_ns(begin_ns, end_ns)
-        return self._frames.longest_gap_ns(plan.odometry_frame, plan.choice.base_frame, begin_ns, end_ns)
+        return self._frames.longest_gap_ns(frame, self._base, begin_ns, end_ns)
 
     def level(self, stamp_ns: int) -> F64 | None:
         """`T_level_base` (4, 4) at a time, see `Scan`; None if there is no IMU, or it does not tell."""
@@ -303,7 +263,7 @@ class _Poses:
                 "9.81 m/s2 at their stamps"
             )
             return None
-        T_imu_base = invert_pose(self.sensor(self._imu_frame, stamp_ns))
+        T_imu_base = invert_pose(self._in_base(self._imu_frame, stamp_ns))
         T_imu_base[:3, 3] = 0.0
         return T_level_imu @ T_imu_base
 
@@ -312,9 +272,7 @@ class _Poses:
 
         Raises FrameError, PointCloudError.
         """
-        base, frames = self._plan.choice.base_frame, self._frames
-        fixed = self._plan.mounted is not None
-        if not fixed or (base in frames and frame in frames and frames.connected(base, frame)):
+        if self._plan.mounted is None or self._frames.connected(self._base, frame):
             return self.sensor(frame, stamp_ns)
         T_fixed_base = self.odometry(stamp_ns)
         if T_fixed_base is None:
@@ -323,20 +281,8 @@ class _Poses:
 
     def sensor(self, frame: str, stamp_ns: int) -> F64:
         """`T_base_sensor` (4, 4) of the sensor with this frame. Raises FrameError, PointCloudError."""
-        if self._plan.sensor_is_base:
-            # REP-103: images are in optical axes (z forward); without tf they are turned here. A LaserScan is
-            # by its definition in the x-y plane of its frame, whatever the frame is called.
-            named = frame.endswith("_optical") or "_optical_" in frame
-            optical = self._images or (named and not self._planar)
-            return T_BODY_OPTICAL if optical else np.eye(4)
-        base = self._plan.choice.base_frame
-        if frame != base and frame not in self._frames:
-            raise self._frames.missing(frame, base)
-        found = self._frames.lookup(base, frame, stamp_ns)
-        if found is None:
-            raise PointCloudError("tf is unknown at the stamp")
-        of_images = self._images and frame != self._imu_frame
-        if of_images and "optical" not in frame and found[2, 2] > _UP:
+        found = self._in_base(frame, stamp_ns)
+        if self._images and not self._plan.sensor_is_base and "optical" not in frame and found[2, 2] > _UP:
             self._tally.warn(
                 f"the images are in frame {frame}, whose z axis points up, where that of a camera points "
                 "forward (REP-103): x is taken for forward; correct it to the camera's optical frame"
@@ -344,9 +290,25 @@ class _Poses:
             return found @ T_BODY_OPTICAL
         return found
 
+    def _in_base(self, frame: str, stamp_ns: int) -> F64:
+        """`T_base_frame` (4, 4); without tf, axes of cameras are turned (REP-103).
+
+        A LaserScan is by its definition in the x-y plane of its frame, whatever the frame is called.
+        """
+        if self._plan.sensor_is_base:
+            named = frame.endswith("_optical") or "_optical_" in frame
+            return T_BODY_OPTICAL if self._images or (named and not self._planar) else np.eye(4)
+        found = self._frames.lookup(self._base, frame, stamp_ns)
+        if found is None:
+            raise PointCloudError("tf is unknown at the stamp")
+        return found
+
 
 class Stream:
-    """One pass, to be run once; it counts in the source's tally what is read and what is lost."""
+    """One pass, to be run once; it counts in the source's tally what is read and what is lost.
+
+    poses : by what has been read so far. stamps : of the scans that were yielded.
+    """
 
     def __init__(
         self,
@@ -359,59 +321,67 @@ class Stream:
     ) -> None:
         """part : of the recording; None: all of it."""
         self._source, self._plan = source, plan
-        self._parameters = parameters = parameters or PARAMETERS
+        self._parameters = parameters or PARAMETERS
         self._part = part or Part()
-        sensor = plan.choice.sensor
-        self._decoder = self._decoder_of(plan.scans, plan.camera, config)
-        self._further = [
-            FurtherScans(t, camera, self._decoder_of(t, camera, config)) for t, camera in plan.further
-        ]
-        self._poses = _Poses(plan, frames, source.tally)
-        self._stamps = _Stamps(parameters, source.tally)
-        self._waiting = _Queue()
+        self._decoders = [self._decoder_of(sensor, config) for sensor in plan.sensors]
+        pairs = zip(plan.sensors, self._decoders, strict=True)
+        self._further = [FurtherScans(sensor.topic, decoder) for sensor, decoder in pairs][1:]
+        self.poses = _Poses(plan, frames, source.tally)
+        self.stamps = _Stamps(source.tally)
+        self._waiting: list[_Waiting] = []
         self._last_read_ns: int | None = None  # stamp of the last scan with odometry
-        self._sweep_ns = 0 if SENSOR_MODELS[sensor].image else parameters.sweep_ns
+        # From a stamp to the last point: until it is known, a lidar may turn until the next stamp.
+        self._sweep_ns = 0 if SENSOR_MODELS[plan.choice.sensor].image else plan.period_ns
         self._handlers = self._make_handlers()
 
-    def _decoder_of(self, topic: TopicInfo, camera: TopicInfo | None, config: ReadConfig) -> ScanDecoder:
+    def _decoder_of(self, sensor: Sensor, config: ReadConfig) -> ScanDecoder:
         return ScanDecoder(
-            topic.topic,
+            sensor.topic.topic,
             self._plan.choice.sensor,
-            decoder_for(topic),
+            decoder_for(sensor.topic),
             config,
-            camera_topic="" if camera is None else camera.topic,
+            camera_topic="" if sensor.camera is None else sensor.camera.topic,
+            camera=sensor.calibration,
             depth_unit_m=self._plan.depth_unit_m,
             fixed_frame=self._plan.mounted is not None,
+            longest_s=_MOST_PERIODS * self._plan.period_ns * 1e-9 or math.inf,
         )
 
     def _make_handlers(self) -> dict[TopicInfo, Callable[[Any, int], None]]:
-        """By topic, what takes in its messages. Reads the first CameraInfo of the source."""
-        plan = self._plan
-        on: dict[TopicInfo, Callable[[Any, int], None]] = {plan.scans: self._take_scan}
-        of_motion = (plan.odometry, self._poses.take_odometry), (plan.imu, self._poses.take_imu)
-        on.update((topic, take(topic)) for topic, take in of_motion if topic is not None)
+        """By topic, what takes in its messages."""
+        plan, poses = self._plan, self.poses
+        on: dict[TopicInfo, Callable[[Any, int], None]] = {self._topic: self._take_scan}
         on.update((f.topic, functools.partial(self._take_further, f)) for f in self._further)
-        for camera, decoder in (
-            (plan.camera, self._decoder),
-            *((further.camera, further.decoder) for further in self._further),
-        ):
-            if camera is not None and camera not in on:
-                on[camera] = _take_camera(camera, decoder)
-                self._first_camera(camera, on[camera])
+        decoded: list[tuple[TopicInfo | None, Callable[[Any, int], None]]] = [
+            (plan.odometry, poses.take_odometry),
+            (plan.imu, poses.take_imu),
+            *(
+                (sensor.camera, functools.partial(self._take_camera, sensor.camera))
+                for sensor in plan.sensors
+            ),
+        ]
         if plan.tf_moves:
-            tf = [t for t in self._source.info.topics if t.type in topics.TF and not is_static(t)]
-            on.update((topic, self._poses.take_tf(topic)) for topic in tf)
+            tf = (t for t in self._source.info.topics if t.type in topics.TF and not is_static(t))
+            decoded += [(topic, poses.take_tf) for topic in tf]
+        on.update((topic, _decoding(topic, take)) for topic, take in decoded if topic is not None)
         return on
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """The topics whose messages are used."""
+        return frozenset(topic.topic for topic in self._handlers)
+
+    @property
+    def _topic(self) -> TopicInfo:
+        return self._plan.sensors[0].topic
 
     def run(self) -> Iterator[Scan]:
         """Yield the scans of the source. Raises as `Log.scans` says."""
-        margin_ns, part = self._parameters.margin_ns, self._part
-        low = None if part.start_ns is None else max(part.start_ns - margin_ns, 0)
-        high = None if part.end_ns is None else part.end_ns + margin_ns
-        for message in self._source.messages(self.topics, low, high):
+        for message in self._source.messages(self.topics, *self._part.with_margin()):
             yield from self.take(message)
         yield from self.release_all()
-        part.finish(self._plan.scans.topic, self._parameters.max_bad_share, self._decoder.empty)
+        p = self._parameters
+        self._part.finish(self._topic.topic, p.max_bad_share, self._decoders[0].empty)
         if self._last_read_ns is None and self._plan.choice.odometry_topic is not None:
             self._source.tally.warn(
                 f"no scan has odometry: that from {self._plan.choice.odometry_topic} is of other times"
@@ -422,67 +392,30 @@ class Stream:
         take = self._handlers.get(message.channel)
         if take is not None:
             take(message.data, message.log_time_ns)
-        while self._waiting.scans and self._is_due(self._waiting.scans[0], message.log_time_ns):
+        while self._waiting and self._is_due(self._waiting[0], message.log_time_ns):
             yield from self._release()
-
-    def absorb(self, message: RawMessage) -> None:
-        """Take in a message of odometry or tf before its turn; it may be given to `take` as well."""
-        scans = (self._plan.scans, *(further.topic for further in self._further))
-        if message.channel not in scans and message.channel in self._handlers:
-            self._handlers[message.channel](message.data, message.log_time_ns)
-
-    @property
-    def out_of_time(self) -> int:
-        """Number of scans in a row that were skipped because their stamps go back or jump."""
-        return self._stamps.out_of_time
-
-    @property
-    def last_log_ns(self) -> int:
-        """The log time of the last scan that was yielded; 0 before the first one."""
-        return self._stamps.last_log_ns
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """The topics whose messages are used."""
-        return frozenset(topic.topic for topic in self._handlers)
 
     def release_all(self) -> Iterator[Scan]:
         """Yield the scans that wait: nothing more will come."""
-        while self._waiting.scans:
+        while self._waiting:
             yield from self._release()
 
     def _is_due(self, first: _Waiting, now_ns: int) -> bool:
-        p = self._parameters
+        p, waiting = self._parameters, self._waiting
         return (
             now_ns - first.log_time_ns > p.wait_ns
-            or len(self._waiting.scans) > p.max_waiting
-            or self._waiting.size_bytes > p.max_waiting_bytes
+            or len(waiting) > p.max_waiting
+            or sum(scan.size_bytes for scan in waiting) > p.max_waiting_bytes
             or (p.eager and self._all_is_there(first.stamp_ns))
         )
 
     def _all_is_there(self, stamp_ns: int) -> bool:
         """Whether what belongs to a scan has arrived: those of further sensors, and odometry or an IMU if
         there is any."""
-        if any(further.newest_ns < stamp_ns for further in self._further):
-            return False
-        newest_ns = self._poses.complete_ns()
-        needed_ns = [stamp_ns + self._sweep_ns, *(f.nearest_ns(stamp_ns) for f in self._further)]
-        return newest_ns is None or newest_ns >= max(needed_ns)
-
-    def newest_odometry_ns(self) -> int | None:
-        """The stamp up to which odometry is known; 0 if none has arrived, None if there is none at all."""
-        return self._poses.newest_ns()
-
-    def newest_odometry(self) -> tuple[int, F64] | None:
-        """The newest stamp of the odometry and `T_odom_base` (4, 4) there; None if there is none."""
-        newest_ns = self._poses.newest_ns()
-        pose = self._poses.odometry(newest_ns) if newest_ns else None
-        return None if pose is None or newest_ns is None else (newest_ns, pose)
-
-    @property
-    def odometry_frame(self) -> str | None:
-        """The parent frame of the odometry, such as `odom`; None as long as it is not known."""
-        return self._poses.frame
+        further_ns = [further.newest_ns for further in self._further]
+        known_ns = self.poses.complete_ns()
+        needed_ns = max([stamp_ns + self._sweep_ns, *further_ns])
+        return all(t >= stamp_ns for t in further_ns) and (known_ns is None or known_ns >= needed_ns)
 
     # --- decoding messages ----------------------------------------------------------------------------
 
@@ -491,13 +424,13 @@ class Stream:
             return
         self._part.count += 1
         try:
-            message = self._decoder.message(data)
+            message = self._decoders[0].message(data)
             stamp_ns = self._stamp_of(message, log_time_ns)
         except Pc2GridError as error:
             self._skip(error)
             return
         size = max(len(data), message.size_bytes)
-        self._waiting.push(_Waiting(stamp_ns, self._part.count, log_time_ns, size, message))
+        heapq.heappush(self._waiting, _Waiting(stamp_ns, self._part.count, log_time_ns, size, message))
 
     def _stamp_of(self, message: ScanMessage, log_time_ns: int) -> int:
         """The stamp of a scan. Raises PointCloudError for one that is none."""
@@ -505,7 +438,7 @@ class Stream:
         if self._plan.stampless:
             self._source.tally.warn("the stamps of the scans are zero: the time of recording is used instead")
             stamp_ns = log_time_ns
-        elif stamp_ns <= 0:
+        if stamp_ns <= 0:
             raise PointCloudError("stamp is zero or negative")
         if stamp_ns >= 1 << 63:
             raise PointCloudError("stamp is past the year 2262")
@@ -517,92 +450,70 @@ class Stream:
         except Pc2GridError as error:
             self._source.tally.skip(f"{further.topic.topic}: {error.message}")
 
-    def _first_camera(self, camera: TopicInfo, take: Callable[[Any, int], None]) -> None:
-        """Take the first CameraInfo of the log: it may have been published only once, at the beginning."""
-        for message in self._source.messages({camera.topic}):
-            if message.channel == camera:
-                take(message.data, message.log_time_ns)
-                return
-        raise NoScans(f"{camera.topic}: no message in the log, but the depth images need it")
+    def _take_camera(self, camera: TopicInfo | None, found: CameraInfo | None, log_time_ns: int) -> None:
+        for sensor, decoder in zip(self._plan.sensors, self._decoders, strict=True):
+            if sensor.camera == camera:
+                decoder.camera = found or decoder.camera
 
     # --- yielding scans -------------------------------------------------------------------------------
 
     def _release(self) -> Iterator[Scan]:
         """Yield the waiting scan with the earliest stamp, unless it is skipped."""
-        stamp_ns, _, log_time_ns, _, message = self._waiting.pop()
+        waiting = heapq.heappop(self._waiting)
         try:
-            self._stamps.check(stamp_ns, log_time_ns, self._waiting.scans)
-            T_base_points = self._poses.points(message.header.frame, stamp_ns)
-            scan = self._decoder.scan(message, stamp_ns, T_base_points, self._poses.odometry(stamp_ns))
-            scan = self._within_period(scan)
-            if self._plan.mounted is not None:
-                scan = self._measured(scan, self._plan.mounted)
-            scan = replace(
-                scan, T_level_base=self._poses.level(stamp_ns), odometry_gap_s=self._odometry_gap_s(stamp_ns)
-            )
-            scan = self._with_motion(self._with_further(scan))
+            self.stamps.check(waiting.stamp_ns, waiting.log_time_ns, self._waiting)
+            scan = self._scan(waiting.stamp_ns, waiting.message)
+        except UnsupportedSchema as error:
+            if not self._part.good:
+                raise UnsupportedSchema(f"{self._topic.topic}: {error.message}", hint=error.hint) from error
+            self._skip(error)
+            return
         except (PointCloudError, LimitExceeded) as error:
             self._skip(error)
             return
-        except UnsupportedSchema as error:
-            if self._part.good:
-                self._skip(error)
-                return
-            raise UnsupportedSchema(f"{self._plan.scans.topic}: {error.message}", hint=error.hint) from error
-        self._stamps.used(stamp_ns, log_time_ns)
+        self.stamps.used(waiting.stamp_ns, waiting.log_time_ns)
         if scan.T_odom_base is not None:
-            self._last_read_ns = stamp_ns
+            self._last_read_ns = waiting.stamp_ns
         self._part.good += 1
-        tally = self._source.tally
-        tally.scans_read += 1
-        tally.points_dropped += scan.dropped
-        for note in self._decoder.notes:
-            tally.warn(note)
         self._part.returns += len(scan.points_m)
+        self._source.tally.scans_read += 1
+        self._source.tally.points_dropped += scan.dropped
+        for note in self._decoders[0].notes:
+            self._source.tally.warn(note)
         yield scan
 
-    def _within_period(self, scan: Scan) -> Scan:
-        """A scan of a laser without the times of its beams, if these last longer than until the next scan."""
-        longest_s, offsets_s = _MOST_PERIODS * self._plan.period_ns * 1e-9, scan.offsets_s
-        if not SENSOR_MODELS[scan.sensor].planar or offsets_s is None or not len(offsets_s) or not longest_s:
-            return scan
-        if np.ptp(offsets_s) <= longest_s:
-            return scan
-        self._source.tally.warn(
-            "time_increment makes scans longer than the time from one to the next: it is ignored"
-        )
-        return replace(scan, offsets_s=None)
+    def _scan(self, stamp_ns: int, message: ScanMessage) -> Scan:
+        """The scan with all that belongs to it. Raises as `ScanDecoder.scan` does, and FrameError."""
+        T_base_points = self.poses.points(message.header.frame, stamp_ns)
+        scan = self._decoders[0].scan(message, stamp_ns, T_base_points, self.poses.odometry(stamp_ns))
+        if self._plan.mounted is not None:
+            scan = self._measured(scan, self._plan.mounted)
+        # Infinite before the first reading.
+        gap_ns = math.inf
+        if self._last_read_ns is not None:
+            gap_ns = self.poses.longest_gap_ns(self._last_read_ns, stamp_ns)
+        scan = replace(scan, T_level_base=self.poses.level(stamp_ns), odometry_gap_s=1e-9 * gap_ns)
+        return self._with_motion(self._with_further(scan))
 
     def _measured(self, scan: Scan, mounted: str) -> Scan:
         """A scan whose points were in a fixed frame, as one that the sensor with a frame measured.
 
         Raises FrameError if it cannot have been where tf puts it.
         """
-        T_base_sensor = self._poses.sensor(mounted, scan.stamp_ns)
+        T_base_sensor = self.poses.sensor(mounted, scan.stamp_ns)
         seen = scan.points_m[:, 2] < T_base_sensor[2, 3] - _FLOOR_BELOW_M
         if len(seen) and not self._part.returns and np.mean(seen) < _FLOOR_SHARE:
             raise registered(self._plan.choice.sensor_frame or "")
         return replace(scan, T_base_sensor=T_base_sensor, offsets_s=None)
 
-    def _odometry_gap_s(self, stamp_ns: int) -> float:
-        """The longest time without odometry since the last scan that has a reading; infinite if none has."""
-        if self._last_read_ns is None:
-            return math.inf
-        return 1e-9 * self._poses.longest_gap_ns(self._last_read_ns, stamp_ns)
-
     def _with_further(self, scan: Scan) -> Scan:
         """The scan together with those of the further sensors that are near in time."""
-        tally, found = self._source.tally, []
+        found = []
         for further in self._further:
             try:
-                near = further.near(scan.stamp_ns, self._poses.sensor, self._poses.odometry)
+                found.append(further.near(scan.stamp_ns, self.poses.sensor, self.poses.odometry))
             except (PointCloudError, LimitExceeded) as error:
-                tally.skip(f"{further.topic.topic}: {error.message}")
-                continue
-            if near is None:
-                tally.skip(f"{further.topic.topic}: no scan near the first sensor's")
-            else:
-                found.append(near)
+                self._source.tally.skip(f"{further.topic.topic}: {error.message}")
         return together(scan, found) if found else scan
 
     def _with_motion(self, scan: Scan) -> Scan:
@@ -615,7 +526,7 @@ class Stream:
         self._sweep_ns = max(round(times_s[1] * 1e9), 0)
         if scan.T_odom_base is None and scan.T_level_base is None:
             return scan
-        pose_at = self._poses.level if scan.T_odom_base is None else self._poses.odometry
+        pose_at = self.poses.level if scan.T_odom_base is None else self.poses.odometry
         first, last = (pose_at(scan.stamp_ns + round(time_s * 1e9)) for time_s in times_s)
         if first is None or last is None:
             return scan
@@ -623,16 +534,10 @@ class Stream:
 
     def _skip(self, error: Pc2GridError) -> None:
         self._source.tally.skip(error.message)
-        self._part.skipped(error, self._plan.scans.topic, self._parameters.patience)
+        self._part.skipped(error, self._topic.topic, self._parameters.patience)
 
 
-def _take_camera(camera: TopicInfo, decoder: ScanDecoder) -> Callable[[Any, int], None]:
-    """What takes in the calibrations of a camera."""
-    decode = decoder_for(camera)
-
-    def take(data: Any, log_time_ns: int) -> None:
-        found = tolerant(decode, data, None)
-        if found is not None:
-            decoder.camera = found
-
-    return take
+def _decoding(topic: TopicInfo, take: Callable[[Any, int], None]) -> Callable[[Any, int], None]:
+    """What decodes the messages of a topic for what takes them in; None for those that cannot be decoded."""
+    decode = decoder_for(topic)
+    return lambda data, log_time_ns: take(tolerant(decode, data), log_time_ns)

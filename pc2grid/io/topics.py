@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+import itertools
+from collections.abc import Sequence
 
 from pc2grid.errors import NoScans, TopicError, UnsupportedSchema
 from pc2grid.io.message_source import TopicInfo
@@ -45,51 +45,39 @@ _ADVICE = {
 }
 
 
-class Source(NamedTuple):
-    """Of the first message of a topic: its frame, and how long after its stamp it was recorded."""
+def scan_topics(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[list[TopicInfo], str]:
+    """The topics that hold scans, of those that `wanted` names only these; and a sentence that says why.
 
-    frame: str
-    delay_ns: int
-
-
-SourceOf = Callable[[TopicInfo], Source]
-
-
-def scan_topic(topics: Sequence[TopicInfo], wanted: str | None, source_of: SourceOf) -> tuple[TopicInfo, str]:
-    """The topic to read scans from, and a sentence that says why.
-
-    Raises TopicError if `wanted` is missing or if several topics hold scans, NoScans if none does,
-    UnsupportedSchema if `wanted` is of a type that holds no scans.
+    Raises TopicError if one is missing or of another kind of sensor than the first, NoScans if none holds
+    scans, UnsupportedSchema if one is of a type that holds none.
     """
     fitting = [t for t in topics if _fits(t, topics)]
-    if wanted is not None:
-        return _named(topics, fitting, names_in(wanted)[0]), "named by the user"
+    if names := names_in(wanted):
+        found = [_named(topics, fitting, name) for name in names]
+        for other in found:
+            kinds = SENSORS[found[0].type], SENSORS[other.type]
+            if kinds[0] != kinds[1]:
+                raise TopicError(
+                    f"{found[0].topic} ({kinds[0]}) and {other.topic} ({kinds[1]}) cannot be put together",
+                    hint=f"choose one, e.g. --topic {found[0].topic}",
+                )
+        others = "".join(f", {t.topic}" for t in found[1:])
+        return found, "named by the user" + others.replace(",", ", with", 1)
     full = [t for t in fitting if t.message_count != 0]
     if not full:
         raise _no_scans(topics, fitting)
     # An image and its compressed copy come from the same camera: take the uncompressed one.
-    distinct = [t for t in full if not (_is_compressed(t) and any(_raw_twin(t, other) for other in full))]
-    if len(distinct) > 1:
-        raise TopicError(
-            f"several topics hold scans: {_listed(distinct)}", hint=_proposal(distinct, source_of)
-        )
-    return distinct[0], f"the only topic with scans ({distinct[0].type})"
+    distinct = [t for t in full if not _is_copy(t, full)]
+    return distinct, f"the only topic with scans ({distinct[0].type})"
 
 
-def _proposal(topics: Sequence[TopicInfo], source_of: SourceOf) -> str:
-    """What to type where several topics hold scans: one of them, or one of each sensor of its kind.
-
-    Topics of one frame hold the scans of one sensor, filtered or delayed: the first one is proposed. What is
-    in a fixed frame is no longer as it was measured.
-    """
-    sources = {t: source_of(t) for t in topics}
-    of_sensor: dict[str, TopicInfo] = {}
-    for topic in sorted(topics, key=lambda t: sources[t].delay_ns):
-        of_sensor.setdefault(sources[topic].frame, topic)
-    measured = [t for t in topics if t in of_sensor.values() and not is_fixed(sources[t].frame)] or topics[:1]
+def several(found: Sequence[TopicInfo], measured: Sequence[TopicInfo]) -> TopicError:
+    """The error where several topics hold scans. measured : those to propose, one of each sensor."""
     alike = [t.topic for t in measured if t.type == measured[0].type]
     both = f", or one of each sensor: --topic {','.join(alike[:4])}" if len(alike) > 1 else ""
-    return f"choose one, e.g. --topic {measured[0].topic}{both}"
+    return TopicError(
+        f"several topics hold scans: {_listed(found)}", hint=f"choose one, e.g. --topic {alike[0]}{both}"
+    )
 
 
 def is_fixed(frame: str) -> bool:
@@ -123,23 +111,6 @@ def proposed(image: TopicInfo, topics: Sequence[TopicInfo]) -> NoScans:
     )
 
 
-def further_scan_topics(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicInfo, ...]:
-    """The topics whose scans are put together with those of the first one that `wanted` names.
-
-    Raises TopicError if one is missing or of another kind of sensor, UnsupportedSchema, NoScans.
-    """
-    fitting = [t for t in topics if _fits(t, topics)]
-    found = [_named(topics, fitting, name) for name in names_in(wanted)]
-    for other in found[1:]:
-        kinds = SENSORS[found[0].type], SENSORS[other.type]
-        if kinds[0] != kinds[1]:
-            raise TopicError(
-                f"{found[0].topic} ({kinds[0]}) and {other.topic} ({kinds[1]}) cannot be put together",
-                hint=f"choose one, e.g. --topic {found[0].topic}",
-            )
-    return tuple(found[1:])
-
-
 def names_in(wanted: str | None) -> list[str]:
     """The topics of a list such as `/front,/rear`; no topic of ROS has a comma in its name."""
     return list(dict.fromkeys(name.strip() for name in (wanted or "").split(",") if name.strip()))
@@ -169,7 +140,13 @@ def camera_info_topic(image: TopicInfo, topics: Sequence[TopicInfo]) -> TopicInf
     infos = [t for t in topics if t.type in CAMERA_INFOS]
     if not infos:
         raise _no_camera_info(image)
-    return max(infos, key=lambda t: (_shared(image.topic, t.topic), "depth" in t.topic, t.topic))
+
+    def rank(topic: TopicInfo) -> tuple[int, bool, str]:
+        pairs = zip(image.topic.split("/"), topic.topic.split("/"), strict=False)
+        shared = itertools.takewhile(lambda pair: pair[0] == pair[1], pairs)
+        return len(list(shared)), "depth" in topic.topic, topic.topic
+
+    return max(infos, key=rank)
 
 
 def _no_camera_info(image: TopicInfo) -> NoScans:
@@ -184,18 +161,16 @@ def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[Top
 
     Raises TopicError if `wanted` is missing.
     """
-    if wanted is not None and wanted.lower() == "none":
-        return None, "odometry is ignored as asked"
     if wanted is not None:
-        return _named_of(topics, wanted, "odometry", ODOMETRY, TF), f"odometry from {wanted} as asked"
+        named = _named_of(topics, wanted, "odometry", ODOMETRY, TF)
+        return named, f"odometry from {wanted} as asked" if named else "odometry is ignored as asked"
     candidates = [t for t in topics if t.message_count != 0 and _holds_odometry(t)]
     if not candidates:
         return None, "no odometry topic"
     best = min(candidates, key=lambda t: (t.topic not in ("/odom", "/odometry"), len(t.topic), t.topic))
-    if len(candidates) > 1:
-        rest = ", ".join(t.topic for t in candidates if t is not best)
-        return best, f"odometry from {best.topic} (also there: {rest}; --odometry chooses)"
-    return best, f"odometry from {best.topic}"
+    rest = ", ".join(t.topic for t in candidates if t is not best)
+    others = f" (also there: {rest}; --odometry chooses)" if rest else ""
+    return best, f"odometry from {best.topic}{others}"
 
 
 def imu_topic(topics: Sequence[TopicInfo], wanted: str | None) -> TopicInfo | None:
@@ -203,8 +178,6 @@ def imu_topic(topics: Sequence[TopicInfo], wanted: str | None) -> TopicInfo | No
 
     Raises TopicError if `wanted` is missing.
     """
-    if wanted is not None and wanted.lower() == "none":
-        return None
     if wanted is not None:
         return _named_of(topics, wanted, "imu", IMU)
     candidates = [t for t in topics if t.message_count != 0 and t.type in IMU]
@@ -213,8 +186,10 @@ def imu_topic(topics: Sequence[TopicInfo], wanted: str | None) -> TopicInfo | No
 
 def _named_of(
     topics: Sequence[TopicInfo], wanted: str, what: str, types: Sequence[str], also: Sequence[str] = ()
-) -> TopicInfo:
-    """The topic that is wanted, of one of the types; those of `also` are not proposed in an error."""
+) -> TopicInfo | None:
+    """The topic that is wanted, of one of the types; None for "none". Those of `also` are not proposed."""
+    if wanted.lower() == "none":
+        return None
     for topic in topics:
         if topic.topic == wanted and topic.type in (*types, *also):
             return topic
@@ -230,10 +205,9 @@ def _holds_odometry(topic: TopicInfo) -> bool:
 
 
 def _fits(topic: TopicInfo, topics: Sequence[TopicInfo]) -> bool:
-    kind = SENSORS.get(topic.type)
-    if kind is None or not SENSOR_MODELS[kind].image:
-        return kind is not None
-    return _is_depth_image(topic) and any(t.type in CAMERA_INFOS for t in topics)
+    if is_image(topic):
+        return _is_depth_image(topic) and any(t.type in CAMERA_INFOS for t in topics)
+    return topic.type in SENSORS
 
 
 def _is_depth_image(topic: TopicInfo) -> bool:
@@ -276,19 +250,8 @@ def _listed(topics: Sequence[TopicInfo]) -> str:
     return ", ".join(shown) + (f" and {len(topics) - 20} more" if len(topics) > 20 else "")
 
 
-def _is_compressed(topic: TopicInfo) -> bool:
-    return topic.type in ("sensor_msgs/CompressedImage", "foxglove.CompressedImage")
-
-
-def _raw_twin(compressed: TopicInfo, other: TopicInfo) -> bool:
-    return not _is_compressed(other) and compressed.topic.startswith(other.topic + "/")
-
-
-def _shared(a: str, b: str) -> int:
-    """The number of leading name parts that two topics have in common."""
-    count = 0
-    for x, y in zip(a.split("/"), b.split("/"), strict=False):
-        if x != y:
-            break
-        count += 1
-    return count
+def _is_copy(topic: TopicInfo, full: Sequence[TopicInfo]) -> bool:
+    """Whether a topic holds the images of another one, compressed."""
+    return topic.type.endswith("CompressedImage") and any(
+        topic.topic.startswith(t.topic + "/") for t in full if not t.type.endswith("CompressedImage")
+    )

@@ -9,7 +9,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
+import mcap
 import numpy as np
+from mcap.writer import CompressionType, Writer
 from numpy.typing import ArrayLike, NDArray
 
 from pc2grid._version import __version__
@@ -20,8 +22,6 @@ from pc2grid.io.export import ros_messages as ros
 from pc2grid.model import MapOf, OccupancyGrid, Trajectory
 
 if TYPE_CHECKING:
-    from mcap.writer import Writer
-
     from pc2grid.io.messages.types import Imu
 
 _FLOAT32 = 7  # sensor_msgs/PointField
@@ -62,9 +62,6 @@ class LogWriter:
         self._sequence: dict[int, int] = {}
 
     def __enter__(self) -> LogWriter:
-        import mcap
-        from mcap.writer import CompressionType, Writer
-
         with contextlib.ExitStack() as stack:
             temporary = stack.enter_context(replace_file(self._target))
             stream = stack.enter_context(temporary.open("wb"))

@@ -10,7 +10,7 @@ from typing import Any
 from pc2grid.config import ReadConfig
 from pc2grid.io import topics
 from pc2grid.io.live.inbox import INBOX, Arrived, FeedCounts, Inbox, InboxParameters
-from pc2grid.io.message_source import RawMessage, TopicInfo
+from pc2grid.io.message_source import TopicInfo
 
 
 @dataclass(slots=True)
@@ -79,16 +79,6 @@ class Feed:
         """
         return self._inbox.get(timeout_s)
 
-    def pending(self, topics: Collection[str]) -> Sequence[RawMessage]:
-        """Messages of these topics that have arrived and not been received yet."""
-        return self._inbox.pending(topics)
-
-    @property
-    def keeps_up(self) -> bool:
-        """Whether scans that wait too long are dropped: not before those are used that waited during the
-        preparations."""
-        return self._inbox.keeps_up
-
     def close(self) -> None:
         """Release connections, threads and files."""
         self._over = True
@@ -96,15 +86,10 @@ class Feed:
 
     # --- for the kinds of connections -----------------------------------------------------------------
 
-    def _known(self, topic: TopicInfo) -> TopicInfo:
-        """The topic as it was known first."""
-        with self._lock:
-            return self._topics.setdefault((topic.topic, topic.type), topic)
-
     def _offer(self, key: Hashable, topic: TopicInfo) -> None:
-        """A topic can be subscribed to, by a key of the connection's own."""
+        """A topic can be subscribed to, by a key of the connection's own; it stays as it was known first."""
         with self._lock:
-            self._offered[key] = self._known(topic)
+            self._offered[key] = self._topics.setdefault((topic.topic, topic.type), topic)
 
     def _withdraw(self, keys: Collection[Hashable] | None = None) -> None:
         """These topics cannot be subscribed to any more; None: all, as the connection is lost."""

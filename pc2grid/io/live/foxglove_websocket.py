@@ -13,18 +13,18 @@ import threading
 import time
 from collections.abc import Callable, Collection, Hashable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pc2grid import extras
+from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
+from websockets.sync.client import ClientConnection, connect
+from websockets.typing import Subprotocol
+
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LiveError
 from pc2grid.io.live.feed import Feed
 from pc2grid.io.live.inbox import INBOX, InboxParameters
 from pc2grid.io.message_source import RawMessage, TopicInfo
 from pc2grid.io.messages.ros_definitions import short_name
-
-if TYPE_CHECKING:
-    from websockets.sync.client import ClientConnection
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """What the bridge speaks since version 3.2, and before; the messages used here are the same in both."""
@@ -82,8 +82,6 @@ class _Link:
         connection = self._connection
         if connection is None:
             return
-        from websockets.exceptions import ConnectionClosed
-
         try:
             connection.send(message if isinstance(message, bytes) else json.dumps(message))
         except (ConnectionClosed, OSError):
@@ -108,10 +106,6 @@ class _Link:
             time.sleep(self._parameters.least_pause_s)
 
     def _connect(self) -> ClientConnection:
-        from websockets.exceptions import InvalidHandshake, InvalidURI
-        from websockets.sync.client import connect
-        from websockets.typing import Subprotocol
-
         p = self._parameters
         problem: Exception | None = None
         for subprotocol in SUBPROTOCOLS:
@@ -141,8 +135,6 @@ class _Link:
         )
 
     def _run(self) -> None:
-        from websockets.exceptions import ConnectionClosed
-
         pause_s = self._parameters.least_pause_s
         while not self._closing.is_set():
             connection = self._connection
@@ -200,8 +192,7 @@ class FoxgloveWebsocket(Feed):
         parameters: ConnectionParameters = CONNECTION,
         inbox: InboxParameters = INBOX,
     ) -> None:
-        """Raises LiveError if the first connection fails, or without the package `websockets`."""
-        extras.require({"live": "ws://"})
+        """Raises LiveError if the first connection fails."""
         super().__init__(url, config, inbox)
         self._introduced_s = parameters.open_s
         self._advertised: dict[str, _Advertised] = {}

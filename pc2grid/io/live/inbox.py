@@ -6,7 +6,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -52,15 +52,6 @@ class InboxParameters:
 INBOX = InboxParameters()
 
 
-@dataclass(slots=True)
-class _Entry:
-    """A message that waits; None once it is dropped."""
-
-    message: RawMessage | None
-    arrived_s: float
-    size: int
-
-
 class Inbox:
     """A queue that drops scans rather than letting them wait. One thread fills it, another one empties it.
 
@@ -74,16 +65,11 @@ class Inbox:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._counts, self._parameters, self._clock = counts, parameters, clock
-        self._entries: deque[_Entry] = deque()
-        self._scans: deque[_Entry] = deque()
+        self._entries: dict[int, Arrived] = {}  # by their number, oldest first
+        self._scans: deque[int] = deque()  # the numbers of those that are scans
         self._bytes = 0
         self._changed = threading.Condition()
-        self._patient_until_s = math.inf
-
-    @property
-    def keeps_up(self) -> bool:
-        """Whether scans that wait too long are dropped."""
-        return self._clock() >= self._patient_until_s
+        self._patient_until_s = math.inf  # before that, scans are not dropped for their lag
 
     def prepared(self) -> None:
         """The preparations are over: once what waits now is used up, scans that wait too long are dropped."""
@@ -93,56 +79,44 @@ class Inbox:
     def put(self, message: RawMessage) -> None:
         """Add a message that has just arrived."""
         now_s = self._clock()
-        entry = _Entry(message, now_s, len(message.data))
         with self._changed:
             self._counts.arrived += 1
-            self._entries.append(entry)
-            self._bytes += entry.size
+            self._entries[self._counts.arrived] = Arrived(message, now_s)
+            self._bytes += len(message.data)
             if message.channel.type in topics.SENSORS:
-                self._scans.append(entry)
-                limit_s = self._parameters.most_lag_s if self.keeps_up else math.inf
-                while len(self._scans) > 1 and now_s - self._scans[0].arrived_s > limit_s:
-                    self._drop(self._scans.popleft())
-            while self._bytes > self._parameters.most_bytes and len(self._scans) > 1:
-                self._drop(self._scans.popleft())
+                self._scans.append(self._counts.arrived)
+            oldest_s = now_s - (self._parameters.most_lag_s if now_s >= self._patient_until_s else math.inf)
+            while len(self._scans) > 1 and (
+                self._bytes > self._parameters.most_bytes
+                or self._entries[self._scans[0]].arrived_s < oldest_s
+            ):
+                self._drop(self._scans[0])
             while len(self._entries) > self._parameters.most_messages:
-                self._forget(self._entries.popleft())
+                self._drop(next(iter(self._entries)))
             self._changed.notify()
 
-    def _drop(self, entry: _Entry) -> None:
-        if entry.message is not None:
-            entry.message = None
-            self._bytes -= entry.size
-            self._counts.dropped += 1
-
-    def _forget(self, entry: _Entry) -> None:
-        if self._scans and self._scans[0] is entry:
+    def _take(self, number: int) -> Arrived:
+        arrived = self._entries.pop(number)
+        self._bytes -= len(arrived.message.data)
+        if self._scans and self._scans[0] == number:
             self._scans.popleft()
-        self._drop(entry)
+        return arrived
+
+    def _drop(self, number: int) -> None:
+        self._take(number)
+        self._counts.dropped += 1
 
     def get(self, timeout_s: float) -> Arrived | None:
         """The oldest message; None if there is none within `timeout_s` seconds."""
         end_s = self._clock() + timeout_s
         with self._changed:
-            while True:
-                while self._entries:
-                    entry = self._entries.popleft()
-                    if self._scans and self._scans[0] is entry:
-                        self._scans.popleft()
-                    if entry.message is not None:
-                        self._bytes -= entry.size
-                        return Arrived(entry.message, entry.arrived_s)
+            while not self._entries:
                 if math.isfinite(self._patient_until_s):
                     self._patient_until_s = 0.0
                 left_s = end_s - self._clock()
                 if left_s <= 0 or not self._changed.wait(left_s):
                     return None
-
-    def pending(self, names: Collection[str]) -> list[RawMessage]:
-        """The messages of these topics that wait, oldest first."""
-        with self._changed:
-            waiting = [entry.message for entry in self._entries]
-        return [m for m in waiting if m is not None and m.channel.topic in names]
+            return self._take(next(iter(self._entries)))
 
     def wake(self) -> None:
         """Let `get` return: nothing more will come."""

@@ -1,22 +1,29 @@
-"""Scans of messages that arrive while they are used."""
+"""Scans of messages that arrive while they are used.
+
+The first seconds of messages decide what is read of the robot and how. They are looked at as a recording, by
+the code that reads recordings, and then used like all others.
+"""
 
 from __future__ import annotations
 
 import time
-from collections import deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pc2grid.arrays import F64
 from pc2grid.config import ReadConfig
-from pc2grid.errors import NoScans, Pc2GridError, TopicError
-from pc2grid.io.error_translation import guarded_stream
-from pc2grid.io.live.feed import Feed, News
-from pc2grid.io.live.first_messages import FirstMessages, Planned
-from pc2grid.io.live.inbox import Arrived, FeedCounts
+from pc2grid.errors import FrameError, NoScans, TopicError
+from pc2grid.io import topics
+from pc2grid.io.error_translation import guarded, guarded_stream
+from pc2grid.io.frames import PARAMETERS as FRAMES
+from pc2grid.io.frames import FrameTree
+from pc2grid.io.live.feed import Feed
+from pc2grid.io.live.inbox import Arrived
 from pc2grid.io.map_pose import BelievedPose, MapPose
-from pc2grid.io.message_source import Choice, RawMessage, Tally
+from pc2grid.io.message_source import Choice, LogInfo, RawMessage, Tally, TopicInfo
+from pc2grid.io.read_plan import Plan, make_plan, published_once
 from pc2grid.io.scan_stream import Stream, StreamParameters
 from pc2grid.model import ReadReport, Scan
 
@@ -27,56 +34,132 @@ class LiveParameters:
 
     poll_s : longest time without a look at the clock. silent_s : time after which a topic without messages
     is named. clock_scans : so many scans in a row with stamps that go back or jump mean that the clock was
-    set. gap_s : after a longer time without scans, the pose of a robot without odometry is not known any
-    more.
+    set.
     """
 
     poll_s: float = 0.2
     silent_s: float = 5.0
     clock_scans: int = 5
-    gap_s: float = 2.0
 
 
 LIVE = LiveParameters()
+_HOLD_S, _MOST_S = 3.0, 12.0
+"""Time from the first scan to the last one that is held back for the plan: most transforms are published
+several times in it; it doubles after each plan that failed, up to the last try. Chosen by hand."""
 STREAM = StreamParameters(wait_ns=200_000_000, eager=True)
 """Scans wait for odometry, but not for scans with earlier stamps; and less long than in a recording."""
-_MOST_UNDER_WAY = 1000
-"""Scans whose time of arrival is remembered; chosen by hand: far more than ever wait."""
 
 
-class _Times:
-    """When scans arrived. lag_s : time from the arrival of the last one to the end of its use."""
+@dataclass(slots=True)
+class HeldMessages:
+    """Messages that have arrived, as a `MessageSource`."""
 
-    def __init__(self, clock: Callable[[], float]) -> None:
-        self.lag_s = 0.0
-        self._clock = clock
-        self._newest = (0, clock())
-        self._arrived_s: dict[int, float] = {}
+    info: LogInfo
+    found: Collection[RawMessage]
+    tally: Tally = field(default_factory=Tally)
+    files: tuple[Path, ...] = ()
 
-    def arrived(self, arrived: Arrived) -> None:
-        """Take note of a scan."""
-        if len(self._arrived_s) > _MOST_UNDER_WAY:  # of scans that were skipped
-            self._arrived_s.clear()
-        log_time_ns = arrived.message.log_time_ns
-        self._arrived_s[log_time_ns] = arrived.arrived_s
-        self._newest = max(self._newest, (log_time_ns, arrived.arrived_s))
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """See MessageSource."""
+        for message in self.found:
+            if message.channel.topic in topics and (end_ns is None or message.log_time_ns < end_ns):
+                yield message
 
-    def used(self, log_time_ns: int) -> None:
-        """A scan was used."""
-        arrived_s = self._arrived_s.pop(log_time_ns, None)
-        if arrived_s is not None:
-            self.lag_s = self._clock() - arrived_s
+    def close(self) -> None:
+        """Nothing is open."""
 
-    def now_ns(self) -> int:
-        """The present time of the robot's clock: that of the newest scan, and what has passed since."""
-        newest_ns, arrived_s = self._newest
-        return newest_ns + round((self._clock() - arrived_s) * 1e9)
+
+@dataclass(frozen=True, slots=True)
+class Planned:
+    """What was decided once enough had arrived. source : without its messages."""
+
+    source: HeldMessages
+    frames: FrameTree
+    plan: Plan
+
+
+class FirstMessages:
+    """The messages that are held back: of what may be published only once all, of the others the last
+    seconds."""
+
+    def __init__(self, feed: Feed, config: ReadConfig) -> None:
+        self._feed, self._config = feed, config
+        self._once: list[Arrived] = []
+        self._recent: deque[Arrived] = deque()
+        self._needed_s = _HOLD_S
+
+    @property
+    def held(self) -> deque[Arrived]:
+        """All of them, what is published once first."""
+        return deque((*self._once, *self._recent))
+
+    def add(self, arrived: Arrived) -> None:
+        """Hold a message back."""
+        if published_once(arrived.message.channel):
+            self._once.append(arrived)
+            return
+        self._recent.append(arrived)
+        while self._recent[0].arrived_s < arrived.arrived_s - 2 * _MOST_S:
+            self._recent.popleft()
+
+    def planned(self) -> Planned | None:
+        """The plan once it can be made; None before.
+
+        Raises what is missing for it after the last try: FrameError, NoScans; TopicError and
+        UnsupportedSchema at once.
+        """
+        ended = self._feed.ended
+        scans_ns = [a.message.log_time_ns for a in self._recent if a.message.channel.type in topics.SENSORS]
+        if not ended and (not scans_ns or scans_ns[-1] - scans_ns[0] < self._needed_s * 1e9):
+            return None
+        self._needed_s *= 2
+        try:
+            return self._plan()
+        except (FrameError, NoScans):
+            if ended or self._needed_s > _MOST_S:
+                raise
+            return None
+
+    def _plan(self) -> Planned:
+        found = [a.message for a in self.held]
+        counts = Counter(m.channel for m in found)
+        known = [replace(t, message_count=counts[t]) for t in self._feed.topics()]
+        times_ns = [m.log_time_ns for m in found]
+        info = LogInfo(
+            path=Path(self._feed.name),
+            format="live",
+            size_bytes=0,
+            start_ns=min(times_ns, default=0),
+            end_ns=max(times_ns, default=0),
+            message_count=len(found),
+            topics=tuple(sorted(known, key=lambda t: (t.topic, t.type))),
+        )
+        source, frames = HeldMessages(info, found), FrameTree()
+        plan = guarded(info.path, lambda: make_plan(source, self._config, frames))
+        source.found = ()
+        return Planned(source, frames, plan)
+
+    def silence(self) -> str:
+        """Why there is no plan yet."""
+        name, there = self._feed.name, self._feed.topics()
+        heard = {a.message.channel.topic for a in self._recent}
+        scans = topics.usable(there, self._config.topic)
+        silent = ", ".join(t.topic for t in scans if t.topic not in heard)
+        if silent:
+            return f"{silent}: no message yet (is the sensor's driver running? does its QoS fit?)"
+        if scans:
+            return f"{', '.join(t.topic for t in scans)}: too few messages so far"
+        listed = ", ".join(f"{t.topic} ({t.type})" for t in there[:12])
+        return f"{name}: no topic with scans yet; there is: {listed or 'no topic'}"
 
 
 class LiveLog:
     """Scans from a feed. Use as a context manager.
 
-    feed : where the messages arrive. realtime : whether scans are lost that are not used in time.
+    feed : where the messages arrive. name, counts, news : of the feed. realtime : whether scans are lost that
+    are not used in time. lag_s : time from the arrival of the last scan to the end of its use.
     on_poll : called several times a second while scans are awaited and with each scan; if it returns true, no
     more scans are given.
     """
@@ -90,15 +173,16 @@ class LiveLog:
         parameters: LiveParameters = LIVE,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.feed = feed
+        self.feed, self.name, self.counts, self.news = feed, feed.name, feed.counts, feed.news
         self.on_poll: Callable[[], bool] = lambda: False
+        self.lag_s = 0.0
         self._config, self._parameters, self._clock = config, parameters, clock
         self._stopped = False
         self._first = FirstMessages(feed, config)
         self._held: deque[Arrived] = deque()  # of the first messages, those that are not used yet
         self._planned: Planned | None = None
         self._stream: Stream | None = None
-        self._times = _Times(clock)
+        self._newest = (0, clock())  # log time of the newest scan, and when it arrived
         self._pose: BelievedPose | None = None
         self._begun_s = self._heard_s = clock()
 
@@ -117,26 +201,6 @@ class LiveLog:
         """Whether no scan will come any more."""
         return self._stopped or (self.feed.ended and not self._held)
 
-    @property
-    def name(self) -> str:
-        """For the user."""
-        return self.feed.name
-
-    @property
-    def counts(self) -> FeedCounts:
-        """Of messages that arrived and that were lost."""
-        return self.feed.counts
-
-    @property
-    def news(self) -> News:
-        """What the user should know."""
-        return self.feed.news
-
-    @property
-    def lag_s(self) -> float:
-        """Time from the arrival of the last scan to the end of its use."""
-        return self._times.lag_s
-
     def report(self) -> ReadReport:
         """Counts of what was read and of what was lost, so far."""
         planned = self._planned
@@ -154,22 +218,17 @@ class LiveLog:
             arrived = self.feed.receive(self._parameters.poll_s)
             if arrived is not None:
                 self._first.add(arrived)
-            now_s = self._clock()
-            planned = self._first.planned(now_s)
+            planned = self._first.planned()
             if planned is not None:
-                self._begin(planned, now_s)
+                self._planned, self._held = planned, self._first.held
+                self._begun_s = self._heard_s = self._clock()
+                self._want(self._new_stream(planned))
             elif self.on_poll():
                 self._stopped = True
                 raise NoScans(self._first.silence(), hint="--topic chooses another one")
-            elif now_s - self._begun_s >= self._parameters.silent_s and self.feed.connected:
+            elif self._clock() - self._begun_s >= self._parameters.silent_s and self.feed.connected:
                 self.news.tell(self._first.silence())
         return self._planned
-
-    def _begin(self, planned: Planned, now_s: float) -> None:
-        self._planned = planned
-        self._held = deque(map(planned.arrived, self._first.held))
-        self._begun_s = self._heard_s = now_s
-        self._want(self._new_stream(planned))
 
     def _new_stream(self, planned: Planned) -> Stream:
         made = planned.source, self._config, planned.frames, planned.plan
@@ -196,29 +255,28 @@ class LiveLog:
 
         Raises LogError as `Log.scans` does.
         """
-        planned = self._chosen()
-        stream = self._stream
+        planned, last_scan_ns = self._chosen(), None
+        stream, topic = self._stream, planned.plan.sensors[0].topic
         assert stream is not None
-        last_scan_ns: int | None = None
         while True:
-            arrived = self._next(planned, stream)
+            arrived = self._next(topic)
             self._stopped = self._stopped or self.on_poll()
-            if arrived is None or self._stopped:
-                if self.ended:
-                    yield from self._used(stream, stream.release_all())
-                    return
+            if self._stopped or (arrived is None and self.ended):
+                yield from self._used(stream, stream.release_all())
+                return
+            self._hear_pose(planned, stream, arrived)
+            if arrived is None:
                 continue
             message = arrived.message
-            self._hear_pose(message, planned, stream)
-            if message.channel == planned.plan.scans:
+            if message.channel == topic:
                 if last_scan_ns is not None and self._is_gap(message, last_scan_ns, stream):
                     yield from self._used(stream, stream.release_all())
                     self._held.appendleft(arrived)
                     break
                 last_scan_ns = message.log_time_ns
-                self._times.arrived(arrived)
+                self._newest = max(self._newest, (message.log_time_ns, arrived.arrived_s))
             yield from self._used(stream, stream.take(message))
-            if stream.out_of_time >= self._parameters.clock_scans:
+            if stream.stamps.out_of_time >= self._parameters.clock_scans:
                 self.news.tell("the clock of the scans was set; the search starts again", again=True)
                 planned.frames.forget_moving()
                 break
@@ -226,43 +284,36 @@ class LiveLog:
 
     def _is_gap(self, message: RawMessage, last_scan_ns: int, stream: Stream) -> bool:
         """Whether the motion since the last scan is unknown: no scans, and no odometry."""
-        gap_s = (message.log_time_ns - last_scan_ns) * 1e-9
-        if gap_s <= self._parameters.gap_s or stream.newest_odometry_ns() is not None:
+        gap_ns = message.log_time_ns - last_scan_ns
+        if gap_ns <= FRAMES.max_gap_ns or stream.poses.newest_ns() is not None:
             return False
         self.news.tell(
-            f"{message.channel.topic}: no scan for {gap_s:.1f} s; the search starts again", again=True
+            f"{message.channel.topic}: no scan for {gap_ns * 1e-9:.1f} s; the search starts again", again=True
         )
         return True
 
     def _used(self, stream: Stream, scans: Iterator[Scan]) -> Iterator[Scan]:
         """The scans; when the next one is asked for, the last one was used."""
         for scan in guarded_stream(Path(self.feed.name), scans):
-            log_time_ns = stream.last_log_ns
+            log_time_ns = stream.stamps.last_log_ns
             yield scan
-            self._times.used(log_time_ns)
+            self.lag_s = (self.now_ns() - log_time_ns) * 1e-9
 
-    def _next(self, planned: Planned, stream: Stream) -> Arrived | None:
-        """The next message: of those held back, then of those that arrive."""
+    def _next(self, topic: TopicInfo) -> Arrived | None:
+        """The next message: of those held back, then of those that arrive. Says if no scan has come for long.
+
+        topic : of the scans.
+        """
         if self._held:
             return self._held.popleft()
-        arrived = self.feed.receive(self._parameters.poll_s)
-        now_s = self._clock()
-        if arrived is None:
-            self._name_silent(planned, now_s)
-            self._find_pose_topic(planned, stream)
-            return None
-        arrived = planned.arrived(arrived)
-        if arrived.message.channel == planned.plan.scans:
+        arrived, now_s = self.feed.receive(self._parameters.poll_s), self._clock()
+        if arrived is not None and arrived.message.channel == topic:
+            self._heard_s = now_s
+        silent_s = now_s - self._heard_s
+        if arrived is None and silent_s >= self._parameters.silent_s and self.feed.connected:
+            self.news.tell(f"{topic.topic}: no message for {silent_s:.0f} s", again=True)
             self._heard_s = now_s
         return arrived
-
-    def _name_silent(self, planned: Planned, now_s: float) -> None:
-        """Say that no scan has come for a while."""
-        silent_s = now_s - self._heard_s
-        if silent_s >= self._parameters.silent_s and self.feed.connected:
-            topic = planned.plan.scans.topic
-            self.news.tell(f"{topic}: no message for {silent_s:.0f} s", again=True)
-            self._heard_s = now_s
 
     # --- the pose by the robot's own localization ----------------------------------------------------------
 
@@ -276,44 +327,35 @@ class LiveLog:
         """Keep `believed` up to date from a topic of a pose, an odometry or tf, also if it begins later."""
         self._pose = BelievedPose(topic)
 
-    def _find_pose_topic(self, planned: Planned, stream: Stream) -> None:
-        """Ask for the messages of the pose's topic as soon as it is there."""
-        if self._pose is None or self._pose.topics:
+    def _hear_pose(self, planned: Planned, stream: Stream, arrived: Arrived | None) -> None:
+        """Take in the next message. Says what is missing: the topic, or tf of the map, may begin later."""
+        pose = self._pose
+        if pose is None:
             return
         try:
-            self._pose.find(self.feed.topics(), planned.plan.choice.base_frame)
-            self._want(stream)
-        except TopicError as error:
-            self._tell_late(error)
-
-    def _hear_pose(self, message: RawMessage, planned: Planned, stream: Stream) -> None:
-        self._find_pose_topic(planned, stream)
-        if self._pose is not None:
-            self._pose.take(message)
-            if self._pose.problem is not None:  # tf of the map may begin later
-                self._tell_late(self._pose.problem)
-
-    def _tell_late(self, error: Pc2GridError) -> None:
-        """Report what is still missing, after `silent_s` or at the end of the feed."""
-        if self._clock() - self._begun_s > self._parameters.silent_s or self.feed.ended:
-            self.news.tell(error.in_short)
+            if not pose.topics:
+                pose.find(self.feed.topics(), planned.plan.choice.base_frame)
+                self._want(stream)
+            if arrived is not None:
+                pose.take(arrived.message)
+            if pose.problem is not None:
+                raise pose.problem
+        except (TopicError, FrameError) as error:
+            if self._clock() - self._begun_s > self._parameters.silent_s or self.feed.ended:
+                self.news.tell(error.in_short)
 
     # --- odometry, now --------------------------------------------------------------------------------
 
     @property
     def odometry_frame(self) -> str | None:
         """The parent frame of the robot's odometry, such as `odom`; None if there is none."""
-        return None if self._stream is None else self._stream.odometry_frame
+        return None if self._stream is None else self._stream.poses.frame
 
     def newest_odometry(self) -> tuple[int, F64] | None:
-        """The newest odometry that has arrived, used or not: its stamp and `T_odom_base` (4, 4)."""
-        planned, stream = self._planned, self._stream
-        if planned is None or stream is None:
-            return None
-        for message in (*(a.message for a in self._held), *self.feed.pending(stream.topics)):
-            stream.absorb(planned.named(message))
-        return stream.newest_odometry()
+        """The newest odometry that was read: its stamp and `T_odom_base` (4, 4)."""
+        return None if self._stream is None else self._stream.poses.newest_odometry()
 
     def now_ns(self) -> int:
         """The present time of the robot's clock: that of the newest scan, and what has passed since."""
-        return self._times.now_ns()
+        newest_ns, arrived_s = self._newest
+        return newest_ns + round((self._clock() - arrived_s) * 1e9)

@@ -10,10 +10,8 @@ from pc2grid.config import ReadConfig
 from pc2grid.errors import LogError
 from pc2grid.io.live.feed import Feed
 from pc2grid.io.live.inbox import INBOX, Arrived, InboxParameters
-from pc2grid.io.message_source import RawMessage
-from pc2grid.io.read_plan import published_once
 from pc2grid.io.recording import Log, open_log
-from pc2grid.io.scan_stream import PARAMETERS
+from pc2grid.io.scan_stream import Part
 
 
 class Replay(Feed):
@@ -54,20 +52,12 @@ class Replay(Feed):
         self._inbox.wake()
 
     def _send(self, log: Log) -> None:
-        """Send what is published once, then the others in their time."""
-        names = {t.topic: published_once(t) for t in log.info.topics}
-        for message in log.messages({name for name, once in names.items() if once}):
-            self._put(message)
+        """Send the messages in their time; those before the first scan at once."""
         begin_s, begin_ns = time.monotonic(), log.info.start_ns
-        end_ns = log.info.end_ns + PARAMETERS.margin_ns
-        for message in log.messages({name for name, once in names.items() if not once}):
-            if message.log_time_ns > end_ns:
-                return
+        _, end_ns = Part(end_ns=log.info.end_ns).with_margin()
+        for message in log.messages({topic.topic for topic in log.info.topics}):
             wait_s = (message.log_time_ns - begin_ns) * 1e-9 - (time.monotonic() - begin_s)
-            if self._stop.wait(max(wait_s, 0.0)):
+            if (end_ns is not None and message.log_time_ns > end_ns) or self._stop.wait(max(wait_s, 0.0)):
                 return
-            self._put(message)
-
-    def _put(self, message: RawMessage) -> None:
-        if (message.channel.topic, message.channel.type) in self._subscriptions:
-            self._inbox.put(message)
+            if (message.channel.topic, message.channel.type) in self._subscriptions:
+                self._inbox.put(message)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from pc2grid import extras
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogNotFound
-from pc2grid.io.live.foxglove_websocket import FoxgloveWebsocket
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.replay import Replay
 
@@ -29,6 +29,9 @@ def open_live(target: str, config: ReadConfig | None = None) -> LiveLog:
     """
     config = config or ReadConfig()
     if is_robot(target):
+        extras.require({"live": "ws://"})
+        from pc2grid.io.live.foxglove_websocket import FoxgloveWebsocket
+
         return LiveLog(FoxgloveWebsocket(target, config), config)
     return LiveLog(Replay(Path(target), config), config)
 

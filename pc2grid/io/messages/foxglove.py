@@ -14,6 +14,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Schema
 
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
 from pc2grid.io.message_source import TopicInfo
@@ -83,8 +85,6 @@ def _parse_json(data: bytes) -> Any:
 
 def _protobuf_parser(channel: TopicInfo) -> Callable[[bytes], Any]:
     from google.protobuf.message import DecodeError
-    from mcap.exceptions import McapError
-    from mcap.records import Schema
     from mcap_protobuf.decoder import DecoderFactory
 
     schema = Schema(id=1, name=channel.type, encoding=channel.schema_encoding, data=channel.schema)

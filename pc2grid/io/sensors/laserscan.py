@@ -19,13 +19,13 @@ METRES_HINT = "ranges of a LaserScan are in metres: correct the driver, and reco
 _LEAST_INCREMENT_S = 1e-9  # a smaller time_increment is one that was not set
 
 
-def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
+def decode(scan: LaserScan, *, max_points: int = 20_000_000, longest_s: float = LONGEST_SWEEP_S) -> Points:
     """Returns of a scan: beams with NaN, inf, or a range outside [range_min, range_max) are dropped.
 
     A limit that is not finite, and a range_max of 0, is one that was not set. Most drivers write a range of
     exactly range_max for a beam without a return. Beam i has the angle angle_min + i x angle_increment, also
     where that contradicts angle_max, as in ROS's laser_geometry.
-    Offsets come from `time_increment` if it is set and the whole scan lasts `LONGEST_SWEEP_S` at most.
+    Offsets come from `time_increment` if it is set and the whole scan lasts `longest_s` at most.
 
     Raises PointCloudError for angles that no laser has.
     """
@@ -44,10 +44,10 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000) -> Points:
     points[:, :2] = kept[:, None] * _directions(count, scan.angle_min, scan.angle_increment)[keep]
     offsets = None
     if math.isfinite(scan.time_increment) and abs(scan.time_increment) > _LEAST_INCREMENT_S:
-        if count * abs(scan.time_increment) <= LONGEST_SWEEP_S:
+        if count * abs(scan.time_increment) <= longest_s:
             offsets = (np.flatnonzero(keep) * scan.time_increment).astype(np.float32)
         else:
-            notes.append(f"time_increment makes a scan longer than {LONGEST_SWEEP_S:g} s: no deskewing")
+            notes.append(f"time_increment makes a scan longer than {longest_s:.2g} s: it is ignored")
     outside = f"every range lies outside the limits, {start:g} to {end:g} m"
     return Points(points, offsets, count - len(kept), tuple(notes), outside if returned.any() else NO_RETURN)
 

@@ -16,7 +16,7 @@ from pc2grid.geometry import pose_from_xyz_quat
 from pc2grid.io.messages.types import CameraInfo, ScanMessage, valid_pose
 from pc2grid.io.sensors import depth, laserscan, pointcloud2
 from pc2grid.io.sensors.floor_depth import FloorDepth
-from pc2grid.io.sensors.pointcloud2 import FARTHEST_HALF_M, Points, check_metres
+from pc2grid.io.sensors.pointcloud2 import FARTHEST_HALF_M, LONGEST_SWEEP_S, Points, check_metres
 from pc2grid.model import Scan, SensorKind
 from pc2grid.sensor_model import SENSOR_MODELS
 
@@ -42,11 +42,15 @@ class ScanDecoder:
         config: ReadConfig,
         *,
         camera_topic: str = "",
+        camera: CameraInfo | None = None,
         depth_unit_m: float | None = None,
         fixed_frame: bool = False,
+        longest_s: float = math.inf,
     ) -> None:
-        """depth_unit_m : None: that of the encoding. fixed_frame : points are in one, not in the sensor's."""
-        self.camera: CameraInfo | None = None
+        """depth_unit_m : None: that of the encoding. fixed_frame : points are in one, not in the sensor's.
+        longest_s : time from one scan to the next, in which the beams of a laser must fit."""
+        self.camera = camera
+        self._longest_s = min(longest_s, LONGEST_SWEEP_S)
         self.notes: list[str] = []
         self.empty = ""
         self._floor = FloorDepth()
@@ -127,7 +131,7 @@ class ScanDecoder:
         if self._sensor == "lidar":
             return pointcloud2.decode(message, unit=self._config.point_time, max_points=limit)
         if self._sensor == "laser":
-            return laserscan.decode(message, max_points=limit)
+            return laserscan.decode(message, max_points=limit, longest_s=self._longest_s)
         if self.camera is None:
             raise PointCloudError("no CameraInfo was recorded for the depth image")
         return depth.decode(

@@ -546,22 +546,6 @@ def test_numbers_that_name_no_type_of_a_field(tmp_path: Path, number: int) -> No
     assert report.lossy
 
 
-def test_a_calibration_that_is_not_a_pose(tmp_path: Path) -> None:
-    folder = tmp_path / "velodyne"
-    folder.mkdir()
-    for i in range(3):
-        (folder / f"{i:06}.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())
-    (tmp_path / "poses.txt").write_text("1 0 0 0 0 1 0 0 0 0 1 0\n" * 3)
-    for matrix in ("1 0 0 0 0 1 0 0 0 0 nan 0", "2 0 0 0 0 1 0 0 0 0 1 0", "2 0 0 0 0 0.5 0 0 0 0 1 0"):
-        (tmp_path / "calib.txt").write_text(f"P0: 1\nTr: {matrix}\n")
-        with pytest.raises(TrajectoryFileError, match=r"calib\.txt: Tr is not a rigid pose"):
-            read(folder)
-    (tmp_path / "calib.txt").unlink()
-    (tmp_path / "poses.txt").write_text("2 0 0 0 0 0.5 0 0 0 0 1 0\n" * 3)  # its determinant is 1
-    with pytest.raises(TrajectoryFileError, match=r"poses\.txt, line 1: not a rigid pose"):
-        read(folder)
-
-
 @pytest.mark.parametrize("name", ["9999999999.5", "9999999999999999999"])
 def test_names_past_all_calendars_are_no_times(tmp_path: Path, name: str) -> None:
     (tmp_path / f"{name}.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())

@@ -94,15 +94,6 @@ def test_get_waits_for_another_thread() -> None:
     thread.join()
 
 
-def test_pending_messages_can_be_looked_at() -> None:
-    inbox = Inbox(FeedCounts())
-    for k in range(3):
-        inbox.put(RawMessage(SCAN, k, b""))
-        inbox.put(RawMessage(TF, k, b""))
-    assert [m.log_time_ns for m in inbox.pending({"/tf"})] == [0, 1, 2]
-    assert len(inbox) == 6
-
-
 @pytest.mark.parametrize("most", [1, 4])
 def test_a_dropped_scan_gives_its_bytes_back(most: int) -> None:
     counts = FeedCounts()

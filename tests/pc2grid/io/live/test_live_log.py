@@ -51,9 +51,6 @@ class Given:
             self.now_s = max(self.now_s, (message.log_time_ns - T0) * 1e-9)
         return Arrived(message, self.now_s)
 
-    def pending(self, topics: Collection[str]) -> Sequence[RawMessage]:
-        return [m for m in self._waiting if m.channel.topic in topics]
-
     def close(self) -> None:
         pass
 
