@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, U8
@@ -163,8 +164,6 @@ class ColumnMap:
 
     def walls(self, sigma_m: float) -> tuple[F32, F64]:
         """The likelihood field (H, W), 0..1, of what stands, rows along y, and the corner (2,) of it."""
-        import cv2
-
         edge_m = self._config.resolution_m
         walls = np.roll(
             self._columns[0] >= kernels.LOW, (-self._low[:2] % self._columns.shape[1]).tolist(), (0, 1)

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -95,8 +96,6 @@ class PointGrid:
 
     def clear(self, outline_m: F64) -> None:
         """Mark the ground within an outline (B, 2) as free, but for its border, which may be a wall."""
-        import cv2
-
         corners = [polygon_corners((outline_m - self.low_m) / self.cell_m)]
         inside = np.zeros_like(self._free)
         cv2.fillPoly(inside, corners, 1, shift=SUBPIXEL_BITS)
@@ -116,8 +115,6 @@ class PointGrid:
 
     def likelihood(self, sigma_m: float) -> F32:
         """Return the likelihood field (H, W), 0..1, of the cells that hold points."""
-        import cv2
-
         empty = (self._index < 0).astype(np.uint8)
         distance_m = self.cell_m * cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_3)
         field: F32 = np.exp(np.float32(-0.5 / sigma_m**2) * distance_m**2)

@@ -15,6 +15,7 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -179,8 +180,6 @@ def drivable_plan(
     >>> bool(grid.free.any()), bool(grid.occupied.any())
     (True, True)
     """
-    import cv2
-
     p = parameters
     voxels = _voxels(np.asarray(level_points_m, np.float64), p)
     if not len(voxels):
@@ -325,8 +324,6 @@ def _viewpoints(near: F64, corner_m: F64, projection: ProjectionConfig, p: Cloud
 
     near : the points of the tile and around it. corner_m : (2,) of the tile.
     """
-    import cv2
-
     cell_m = projection.resolution_m
     side = round((p.tile_m + 2.0 * p.spacing_m) / cell_m)
     low_m = corner_m - p.spacing_m
@@ -378,8 +375,6 @@ def _near_seen_floor(grid: OccupancyGrid, points: F64, p: CloudMapParameters) ->
 
     A view through a wall that was not scanned ends on some obstacle of another room.
     """
-    import cv2
-
     floor = points[np.abs(points[:, 2]) < p.floor_m, :2]
     row, column = grid.to_cell(floor).T
     inside = (row >= 0) & (row < grid.cells.shape[0]) & (column >= 0) & (column < grid.cells.shape[1])

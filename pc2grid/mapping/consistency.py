@@ -17,6 +17,7 @@ import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -128,8 +129,6 @@ def consistency_warning(
 
 def _clear_ground(grid: OccupancyGrid, wall_m: float) -> BoolGrid:
     """(H, W) free cells whose centres are farther than `wall_m` from the centre of every occupied cell."""
-    import cv2
-
     if not grid.cells.size:
         return np.zeros(grid.cells.shape, np.bool_)
     reach = math.floor(wall_m / grid.resolution_m)

@@ -6,6 +6,7 @@ from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -102,8 +103,6 @@ class LocalMap:
 
     def _free(self, outlines: Sequence[F64]) -> NDArray[np.uint8]:
         """Cells (H, W) inside one of the outlines (B, 2) of free space."""
-        import cv2
-
         free = np.zeros(self._grid.shape, dtype=np.uint8)
         for outline in outlines:
             corners = polygon_corners((outline - self._low_m) / self._parameters.cell_m)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -135,8 +136,6 @@ class GridBuilder:
 
         Raises LimitExceeded if the map needs more than `max_cells`.
         """
-        import cv2
-
         height_m = math.nan if planar_scan.height_m is None else planar_scan.height_m
         low_m, high_m = self._heights_m or (height_m, height_m)
         self._heights_m = float(np.minimum(low_m, height_m)), float(np.maximum(high_m, height_m))
@@ -245,8 +244,6 @@ def _percent(log_odds: NDArray[np.floating] | np.floating) -> NDArray[np.floatin
 
 def _count_around(mask: NDArray[np.bool_], width: int) -> NDArray[np.uint8]:
     """Number of cells of the mask (H, W) in the square of `width` cells around each cell."""
-    import cv2
-
     return np.asarray(
         cv2.boxFilter(
             mask.astype(np.uint8), -1, (width, width), normalize=False, borderType=cv2.BORDER_CONSTANT

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -73,8 +74,6 @@ class LikelihoodField:
         parameters: LikelihoodParameters = LIKELIHOOD,
     ) -> LikelihoodField:
         """The field of a mask (H, W) of occupied cells, `known` (H, W) being those observed at all."""
-        import cv2
-
         values = np.zeros(occupied.shape, np.uint8)
         if occupied.any():
             distance = cv2.distanceTransform((~occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)

@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -121,8 +122,6 @@ class Walls:
         single scan consists of thin rays, its gradient points to that side. The points lie two standard
         deviations of the field from the wall, so that one drawn a little off does not hide them.
         """
-        import cv2
-
         cells = np.floor((self.points_m - np.asarray(self.field.origin_m)) / self.field.resolution_m)
         column, row = cells.astype(np.int64).T
         blurred = cv2.GaussianBlur(free, (0, 0), LIKELIHOOD.sigma_m / self.field.resolution_m)
@@ -153,8 +152,6 @@ class Walls:
 
 def _things(grid: OccupancyGrid, parameters: WallParameters) -> BoolGrid:
     """(H, W) the things of a grid without grains of noise: the middle value around each cell."""
-    import cv2
-
     things: BoolGrid = cv2.medianBlur(grid.things.astype(np.uint8), parameters.grain_cells) > 0
     return things
 
@@ -162,8 +159,6 @@ def _things(grid: OccupancyGrid, parameters: WallParameters) -> BoolGrid:
 def _edges(stands: BoolGrid) -> BoolGrid:
     """The cells (H, W) of what stands without those that have all their neighbours in it: nothing sees
     these."""
-    import cv2
-
     inside: BoolGrid = cv2.erode(stands.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return stands & ~inside
 
@@ -176,8 +171,6 @@ def steadiness(
     The longer side of the connected object that a cell belongs to, as a share of `fixed_m`, at most 1. Gaps
     of up to two cells are closed first.
     """
-    import cv2
-
     closed = cv2.dilate(occupied.astype(np.uint8), np.ones((3, 3), np.uint8))
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     longer = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)

@@ -24,6 +24,7 @@ import math
 from dataclasses import dataclass
 from itertools import pairwise
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, U8, U16
@@ -103,8 +104,6 @@ class SearchMap:
 
 def _images(field: U8, resolution_m: float) -> U8:
     """`SearchMap.images` of a field (H, W)."""
-    import cv2
-
     reaches = [math.ceil(reach_m / resolution_m - 1e-6) for reach_m in REACHES_M]
     height, width = (-(-side // SQUARE) for side in field.shape)
     above, left = TILE
