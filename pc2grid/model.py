@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, PlainSerializer
+from pydantic import BeforeValidator, PlainSerializer, computed_field
 
 from pc2grid.arrays import F32, F64, I64, U8, BoolGrid, freeze, hand_over
 from pc2grid.display import html_picture, html_table, map_png, short
@@ -367,6 +367,7 @@ class ReadReport:
     bytes_lost: int = 0
     warnings: tuple[str, ...] = ()
 
+    @computed_field  # type: ignore[prop-decorator]  # mypy has no decorated properties
     @property
     def lossy(self) -> bool:
         """Whether data was lost."""

@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Annotated, NamedTuple, Protocol
+
+from pydantic import Field, computed_field
 
 from pc2grid.model import ReadReport, SensorKind
 
@@ -31,8 +33,8 @@ class TopicInfo:
     topic: str
     type: str
     encoding: str
-    schema_encoding: str = field(default="", compare=False)
-    schema: bytes = field(default=b"", repr=False, compare=False)
+    schema_encoding: Annotated[str, Field(exclude=True)] = field(default="", compare=False)
+    schema: Annotated[bytes, Field(exclude=True)] = field(default=b"", repr=False, compare=False)
     message_count: int | None = field(default=None, compare=False)
 
 
@@ -55,6 +57,7 @@ class LogInfo:
     topics: tuple[TopicInfo, ...]
     warnings: tuple[str, ...] = ()
 
+    @computed_field  # type: ignore[prop-decorator]  # mypy has no decorated properties
     @property
     def duration_s(self) -> float:
         """Time from the start to the end."""

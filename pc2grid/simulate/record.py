@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from pydantic import Field
 
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.atomic import refuse_existing
@@ -37,8 +39,8 @@ class SimulatedSession:
     scans : their number. duration_s, length_m : of the drive. clutter : how many objects could be placed.
     """
 
-    path: Path
-    truth_path: Path
+    path: Annotated[Path, Field(serialization_alias="recording")]
+    truth_path: Annotated[Path, Field(serialization_alias="truth")]
     sensor: SensorKind
     scans: int
     duration_s: float

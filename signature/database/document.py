@@ -191,7 +191,7 @@ def stored_name(name: str) -> str:
 
 def encode_info(info: SessionInfo) -> str:
     """The document of a session."""
-    return to_json(_ADAPTERS["info"].dump_python(info))
+    return to_json(_ADAPTERS["info"].dump_python(info, round_trip=True))
 
 
 @functools.lru_cache(maxsize=256)

@@ -1,21 +1,26 @@
-"""The JSON document of an answer: its type, of which the JSON Schema is made, and what fills it.
+"""The JSON document of an answer: its type, of which JSON and JSON Schema are made, and what fills it.
 
 Metres, radians, int64 nanoseconds.
 """
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from functools import cache
+from typing import TYPE_CHECKING, Any, Literal
 
-# Before Python 3.12 pydantic, which makes the schema, does not take the TypedDict of typing.
-from typing_extensions import TypedDict
+from pydantic import TypeAdapter
+
+# Before Python 3.12 pydantic does not take the TypedDict of typing. All documents take it from here.
+from typing_extensions import TypedDict as TypedDict
+
+from pc2grid.geometry import SE2
 
 if TYPE_CHECKING:
-    from pc2grid.geometry import SE2
     from signature.localization import answer
 
+SCHEMA_VERSION = 1
+"""Of all documents. Within a version they only gain keys: a reader must ignore keys that it does not know."""
 Status = Literal["located", "ambiguous", "not_found"]
-Version = Literal[1]
 
 
 class Pose(TypedDict):
@@ -54,11 +59,13 @@ class Hypothesis(Pose, Labelled):
 
 
 class Moment(TypedDict):
-    """The answer as it stood after `path_m` of travel, with the best hypothesis if there was any."""
+    """The answer as it stood after `path_m` of travel, with the best hypothesis, in the map of `session`, if
+    there was any."""
 
     stamp_ns: int
     path_m: float
     status: Status
+    session: str | None
     x: float | None
     y: float | None
     yaw: float | None
@@ -91,23 +98,13 @@ class Sessions(TypedDict):
     sessions: list[str]
 
 
-class Excluded(TypedDict):
-    """The best place that the prior excludes."""
-
-    session: str | None
-    status: Status
-    x: float | None
-    y: float | None
-    yaw: float | None
-    confidence: float
-
-
 class PriorUse(TypedDict):
     """What became of the prior. status: used, or lapsed if registration was lost after the time that it is
-    about. excluded: null, unless nothing inside is certain and a place outside fits better."""
+    about. excluded: the best place that the prior excludes; null, unless nothing inside is certain and it
+    fits better."""
 
     status: Literal["used", "lapsed"]
-    excluded: Excluded | None
+    excluded: Moment | None
 
 
 class PoseInSpace(TypedDict):
@@ -137,12 +134,11 @@ class Result(Labelled):
     probability that the best hypothesis is right. hypotheses: best first. prior: null if nothing was known
     beforehand. in_space: null if the map or the query has no points."""
 
-    schema_version: Version
     status: Status
     session: str | None
     frame: str | None
     pose: StampedPose | None
-    T_map_odom: Pose | None
+    T_map_odom: SE2 | None
     confidence: float
     hypotheses: list[Hypothesis]
     history: list[Moment]
@@ -158,21 +154,29 @@ class AnswerDocument(Result):
     database: Sessions
 
 
+adapter = cache(TypeAdapter)
+"""What makes the JSON of a type, and its schema."""
+
+
+def plain(kind: type, document: Any) -> Any:
+    """A document of plain types: the frozen types in it become objects, with the digits that they declare."""
+    return {
+        "schema_version": SCHEMA_VERSION,
+        **adapter(kind).dump_python(document, mode="json", by_alias=True),
+    }
+
+
 def document(answer: answer.Answer) -> AnswerDocument:
     """An answer as plain types."""
-    pose = answer.T_map_base
-    stamped: StampedPose | None = None
-    if pose is not None and answer.covariance is not None:
-        stamped = {"stamp_ns": answer.stamp_ns, **_pose(pose), "covariance": answer.covariance.tolist()}
-    return {
-        "schema_version": 1,
+    excluded = None if answer.excluded is None else _moment(answer.excluded)
+    about: AnswerDocument = {
         "status": answer.status,
         "session": answer.session,
         "frame": answer.frame,
         "building": answer.label.building,
         "floor": answer.label.floor,
-        "pose": stamped,
-        "T_map_odom": None if answer.T_map_odom is None else _pose(answer.T_map_odom),
+        "pose": stamped_pose(answer),
+        "T_map_odom": answer.T_map_odom,
         "confidence": answer.confidence,
         "hypotheses": [
             {
@@ -189,30 +193,25 @@ def document(answer: answer.Answer) -> AnswerDocument:
             for h, submap_id, place in zip(answer.hypotheses, answer.submap_ids, answer.places, strict=True)
         ],
         "history": [_moment(moment) for moment in answer.history],
-        "prior": _prior(answer),
+        "prior": None if answer.prior is None else {"status": answer.prior, "excluded": excluded},
         "in_space": in_space_document(answer),
         "query": {"path_m": answer.path_m, "stamp_ns": answer.stamp_ns},
         "database": {"sessions": list(answer.sessions)},
         "timing_ms": answer.timing_ms,
     }
+    made: AnswerDocument = plain(AnswerDocument, about)
+    return made
 
 
-def _prior(answer: answer.Answer) -> PriorUse | None:
-    if answer.prior is None:
+def stamped_pose(answer: answer.Answer) -> StampedPose | None:
+    """The pose of the base; None unless it is located."""
+    if answer.T_map_base is None or answer.covariance is None:
         return None
-    moment = answer.excluded
-    if moment is None:
-        return {"status": answer.prior, "excluded": None}
-    x, y, yaw = _coordinates(moment.pose)
-    excluded: Excluded = {
-        "session": moment.session,
-        "status": moment.status,
-        "x": x,
-        "y": y,
-        "yaw": yaw,
-        "confidence": moment.confidence,
+    return {
+        "stamp_ns": answer.stamp_ns,
+        **_pose(answer.T_map_base),
+        "covariance": answer.covariance.tolist(),
     }
-    return {"status": answer.prior, "excluded": excluded}
 
 
 def in_space_document(answer: answer.Answer) -> PoseInSpace | None:
@@ -240,11 +239,13 @@ def in_space_document(answer: answer.Answer) -> PoseInSpace | None:
 
 
 def _moment(moment: answer.Moment) -> Moment:
-    x, y, yaw = _coordinates(moment.pose)
+    at = moment.pose
+    x, y, yaw = (None, None, None) if at is None else (at.x, at.y, at.yaw)
     return {
         "stamp_ns": moment.stamp_ns,
         "path_m": moment.path_m,
         "status": moment.status,
+        "session": moment.session,
         "x": x,
         "y": y,
         "yaw": yaw,
@@ -252,9 +253,5 @@ def _moment(moment: answer.Moment) -> Moment:
     }
 
 
-def _coordinates(pose: SE2 | None) -> tuple[float, float, float] | tuple[None, None, None]:
-    return (None, None, None) if pose is None else (float(pose.x), float(pose.y), float(pose.yaw))
-
-
 def _pose(pose: SE2) -> Pose:
-    return {"x": float(pose.x), "y": float(pose.y), "yaw": float(pose.yaw)}
+    return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}

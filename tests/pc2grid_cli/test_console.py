@@ -67,64 +67,47 @@ def test_a_terminal_gets_colours_unless_no_color_is_set() -> None:
 def test_a_terminal_gets_a_bar_with_rate_and_time_left() -> None:
     seen = on_a_terminal(WORKING, NO_COLOR="")
     assert COLOUR.search(seen)
-    assert re.search(r"\d+%", seen) and "x real time" in seen and re.search(r"\d s left", seen)
+    assert re.search(r"\d+%", seen) and "x real time" in seen and re.search(r"0:00:\d\d left", seen)
     plain = on_a_terminal(WORKING, NO_COLOR="1")
     assert not COLOUR.search(plain) and "x real time" in plain
 
 
-def test_a_pipe_gets_a_line_every_ten_seconds(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("shares", "lines"),
+    [
+        # A line every ten seconds.
+        (
+            {s: s / 50 for s in range(26)},
+            ["20%, 6.0x real time, 0:00:40 left", "40%, 6.0x real time, 0:00:30 left"],
+        ),
+        # The pace is measured from the first share: what has to be made ready before is no part of it.
+        ({40: 0.2, 41: 0.21, 50: 0.4}, ["20%", "40%, 6.0x real time, 0:00:30 left"]),
+        # It is that of the last half minute, so the time left goes up where the work becomes slower.
+        (
+            {0: 0.01, 10: 0.41, 20: 0.42, 30: 0.43, 40: 0.44},
+            [
+                "41%, 12.0x real time, 0:00:15 left",
+                "42%, 6.1x real time, 0:00:29 left",
+                "43%, 4.2x real time, 0:00:41 left",
+                "44%, 0.3x real time, 0:09:20 left",
+            ],
+        ),
+    ],
+)
+def test_a_pipe_gets_lines_with_the_pace_and_the_time_left(
+    shares: dict[int, float],
+    lines: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    now = 100.0
-    monkeypatch.setattr(console.time, "monotonic", lambda: now)
-    with console.Console().progress("map a.mcap", 300.0) as update:
-        for second in range(26):
-            now = 100.0 + second
-            update(second / 50)
-    assert capsys.readouterr().err.splitlines() == [
-        "pc2grid: map a.mcap: 20%, 6.0x real time, 40 s left",
-        "pc2grid: map a.mcap: 40%, 6.0x real time, 30 s left",
-    ]
-
-
-def said(
-    shares: dict[float, float], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> list[str]:
-    """What a pipe gets to read if at these seconds so much is done."""
+    """If at these seconds so much is done."""
     clock = [0.0]
     monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
     with console.Console().progress("map", 300.0) as update:
         for second, share in shares.items():
             clock[0] = second
             update(share)
-    return capsys.readouterr().err.splitlines()
-
-
-def test_nothing_is_said_of_the_time_left_before_it_can_be_known(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """Neither at a few per mille, nor from the start, which includes what has to be made ready first."""
-    assert said({0: 0.0, 10: 0.0007, 20: 0.02, 30: 0.04}, monkeypatch, capsys) == [
-        "pc2grid: map: 0%",
-        "pc2grid: map: 2%",
-        "pc2grid: map: 4%, 0.4x real time, 12 min 0 s left",
-    ]
-    assert said({40: 0.2, 41: 0.21, 50: 0.4}, monkeypatch, capsys) == [
-        "pc2grid: map: 20%",
-        "pc2grid: map: 40%, 6.0x real time, 30 s left",
-    ]
-    # A jump within a second is no pace.
-    assert said({9: 0.0, 10: 0.5}, monkeypatch, capsys) == ["pc2grid: map: 50%"]
-
-
-def test_the_time_left_goes_up_where_the_work_becomes_slower(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert said({0: 0.0, 10: 0.5, 20: 0.52, 30: 0.9}, monkeypatch, capsys) == [
-        "pc2grid: map: 50%, 15.0x real time, 10 s left",
-        "pc2grid: map: 52%, 7.8x real time, 18 s left",
-        "pc2grid: map: 90%, 9.0x real time, 3 s left",
-    ]
+    assert capsys.readouterr().err.splitlines() == [f"pc2grid: map: {line}" for line in lines]
 
 
 def terminal_of(monkeypatch: pytest.MonkeyPatch, *words: str) -> console.Console:

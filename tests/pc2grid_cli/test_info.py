@@ -84,7 +84,7 @@ def test_the_calibration_of_a_depth_camera_is_shown_as_used(tmp_path: Path) -> N
         messages.append(ros().image("/camera/depth/image_raw", T0 + i * STEP, pixels, "16UC1"))
         messages.append(ros().camera("/other/camera_info", T0 + i * STEP, 6, 4, 5.0))
     path = write_mcap(tmp_path / "depth.mcap", messages)
-    assert describe(path)["choice"]["camera_topic"] == "/camera/depth/camera_info"
+    assert describe(path).choice.camera_topic == "/camera/depth/camera_info"
     rows = [line.split() for line in runner.invoke(app, ["info", str(path)]).stdout.splitlines()]
     used = {row[0]: row[3:] for row in rows if row and row[0].startswith("/")}
     assert used["/camera/depth/camera_info"] == ["calibration"]
@@ -96,15 +96,15 @@ def test_a_log_that_convert_could_not_use_is_described_all_the_same(tmp_path: Pa
     two = [ros().cloud(topic, T0, [[1, 2, 3]]) for topic in ("/front", "/rear")]
     path = write_mcap(tmp_path / "two.mcap", two)
     found = describe(path)
-    assert found["choice"] is None
-    assert "several topics hold scans" in found["problem"]
+    assert found.choice is None
+    assert "several topics hold scans" in found.problem
     assert "convert cannot use this log" in runner.invoke(app, ["info", str(path)]).stdout
-    assert describe(path, topic="/rear")["choice"]["topic"] == "/rear"
+    assert describe(path, topic="/rear").choice.topic == "/rear"
 
 
 def test_absent_checksums_show_in_info(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", drive(), enable_crcs=False, enable_data_crcs=False)
-    assert any("no checksum" in w for w in describe(path)["warnings"])
+    assert any("no checksum" in w for w in describe(path).warnings)
 
 
 def test_damage_is_one_line_and_exit_1(log: Path) -> None:

@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from pc2grid.io.nav2_map import save_map
 from pc2grid.settings import dump_settings
-from pc2grid_cli.console import print_json
+from pc2grid_cli.console import print_result
 from pc2grid_cli.json_schemas import DOCUMENTS, schema
 from pc2grid_cli.main import app
 from signature.config import Config
@@ -143,5 +143,5 @@ def test_json_is_offered_where_there_is_a_schema_and_only_there() -> None:
 
 
 def test_what_is_not_known_is_null(capsys: pytest.CaptureFixture[str]) -> None:
-    print_json({"error_m": float("nan"), "ranges": (1.0, float("inf")), "count": 2})
+    print_result({"error_m": float("nan"), "ranges": (1.0, float("inf")), "count": 2})
     assert json.loads(capsys.readouterr().out) == {"error_m": None, "ranges": [1.0, None], "count": 2}

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pc2grid.display import probability
 from pc2grid.errors import (
     ConfigError,
     DatabaseError,
@@ -28,7 +27,6 @@ from pc2grid_cli import console
 from pc2grid_cli.main import app
 from pc2grid_cli.removed import REMOVED
 from signature.database.maintenance import store
-from signature.database.protocol import APPLICATION_ID
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import STEP, T0, drive, ros, write_mcap
 from tests.helpers.simulated_drives import office
@@ -195,10 +193,6 @@ def test_the_help_of_a_group_names_all_its_commands() -> None:
         assert re.search(rf"\b{name}\b", group.help) or (name == "paper" and "the paper's" in group.help)
 
 
-def test_the_mark_of_a_database_is_the_one_that_is_written(folder: Path) -> None:
-    assert (folder / "b.submaps").read_bytes()[68:72] == APPLICATION_ID.to_bytes(4, "big") == b"pcsm"
-
-
 def test_another_label_is_named(folder: Path) -> None:
     convert = ["convert", "office.yaml", "-o", "labelled.submaps"]
     assert CliRunner().invoke(app, [*convert, "--building", "fr079", "--floor", "0"]).exit_code == 0
@@ -215,13 +209,7 @@ def test_a_usage_error_is_one_readable_line(capsys: pytest.CaptureFixture[str]) 
     code = terminal.run(lambda: app(["simulate", "a.mcap"], standalone_mode=False, obj=terminal))
     assert code == console.USAGE
     line = capsys.readouterr().err.splitlines()[0]
-    assert "Choose from: lidar, depth, laser" in line and "\\n" not in line
-
-
-def test_a_probability_is_never_shown_as_certain() -> None:
-    values = (0.0, 0.009, 0.01, 0.5, 0.99, 0.991, 1.0)
-    shown = ["< 0.01", "< 0.01", "0.01", "0.50", "0.99", "> 0.99", "> 0.99"]
-    assert [probability(value) for value in values] == shown
+    assert "Choose from: lidar, laser, depth" in line and "\\n" not in line
 
 
 def test_text_is_calm_and_json_exact(folder: Path) -> None:

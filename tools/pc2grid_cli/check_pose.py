@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from pc2grid.display import probability
 from pc2grid.errors import one_line
@@ -15,20 +15,79 @@ from pc2grid.observer import Observer
 from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
+from pc2grid_cli.followed import Followed, Live, live
 from pc2grid_cli.known_pose import KnownPose, end_s
 from signature.files import about_log, query_config
+from signature.localization.answer_json import (
+    Labelled,
+    Pose,
+    QueryRecording,
+    StampedPose,
+    TypedDict,
+    plain,
+    stamped_pose,
+)
 from signature.localization.map_index import MapIndex
-from signature.localization.pose_check import check_pose
+from signature.localization.pose_check import CheckStatus, check_pose
 
 if TYPE_CHECKING:
     from pc2grid.clouds.planar_scan import PlanarScan
     from pc2grid.io import Log
     from pc2grid.model import RegisteredScan
-    from pc2grid_cli.followed import Followed
-    from pc2grid_cli.json_schemas import CheckedPoseJudgement, RelocalizeCheck, WatchCheck
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.localization.pose_check import PoseCheck
+
+
+class CheckedPose(Pose):
+    """The pose at the last scan, in the map frame."""
+
+    stamp_ns: int
+
+
+class BetterPlace(Labelled):
+    """Where the query is instead, with certainty."""
+
+    session: str | None
+    pose: StampedPose | None
+    confidence: float
+
+
+class CheckedAgainst(TypedDict):
+    """The database."""
+
+    path: str
+
+
+class CheckedPoseJudgement(TypedDict):
+    """What is said of a pose that the robot believes in.
+
+    status: fine, lost, or unsure. probability: that the pose is right; an upper bound unless it is fine.
+    off_m, off_rad: from the pose to the best fit near it, null if nothing fits there. comparable: false if
+    registration was lost after the time of the pose. better: null unless another place is certain.
+    """
+
+    status: CheckStatus
+    probability: float
+    session: str
+    pose: CheckedPose
+    off_m: float | None
+    off_rad: float | None
+    comparable: bool
+    better: BetterPlace | None
+    database: CheckedAgainst
+
+
+class RelocalizeCheck(CheckedPoseJudgement):
+    """`pc2grid relocalize --check` and `--check-topic`, with `--json`."""
+
+    query: QueryRecording
+
+
+class WatchCheck(CheckedPoseJudgement, Live):
+    """A line of `pc2grid watch --check-topic --json`. path_m: travel that the judgement rests on."""
+
+    path_m: float
 
 
 def check_log(
@@ -59,7 +118,8 @@ def check_log(
             index = MapIndex.of(database, config)
             checked = check_pose(counted(), index, T_map_base, stamp_ns=stamp_ns, session=known.session)
         about = about_log(path, log, checked, scans=scans, span=span)
-        return checked, {**_judgement(checked, database.location), "query": about}
+        document: RelocalizeCheck = {**_judgement(checked, database.location), "query": about}
+        return checked, plain(RelocalizeCheck, document)
 
 
 def _believed(log: Log, known: KnownPose, span: TimeSpan) -> tuple[SE2, int | None]:
@@ -72,24 +132,19 @@ def _believed(log: Log, known: KnownPose, span: TimeSpan) -> tuple[SE2, int | No
     return SE2(x_m, y_m, math.radians(yaw_deg)), None
 
 
-def live_document(checked: PoseCheck, drive: Followed, where: str) -> WatchCheck:
+def live_document(checked: PoseCheck, drive: Followed, where: str) -> Any:
     """The document of one check of a running robot's own pose."""
-    return {
+    document: WatchCheck = {
         **_judgement(checked, where),
+        **live(drive, checked.elapsed_s),
         "path_m": checked.path_m,
-        "scans": drive.report().scans_read,
-        "dropped": drive.counts.dropped,
-        "reconnected": drive.counts.reconnected,
-        "lag_s": drive.lag_s,
-        "elapsed_s": checked.elapsed_s,
     }
+    return plain(WatchCheck, document)
 
 
 def _judgement(checked: PoseCheck, where: str) -> CheckedPoseJudgement:
-    pose = checked.T_map_base
-    better = None if checked.better is None else checked.better.to_json()
+    pose, better = checked.T_map_base, checked.better
     return {
-        "schema_version": 1,
         "status": checked.status,
         "probability": checked.probability,
         "session": checked.session,
@@ -97,13 +152,14 @@ def _judgement(checked: PoseCheck, where: str) -> CheckedPoseJudgement:
         "off_m": checked.off_m,
         "off_rad": checked.off_rad,
         "comparable": not checked.lapsed,
-        "better": better
-        and {
-            "session": better["session"],
-            "building": better["building"],
-            "floor": better["floor"],
-            "pose": better["pose"],
-            "confidence": better["confidence"],
+        "better": None
+        if better is None
+        else {
+            "session": better.session,
+            "building": better.label.building,
+            "floor": better.label.floor,
+            "pose": stamped_pose(better),
+            "confidence": better.confidence,
         },
         "database": {"path": where},
     }
@@ -138,10 +194,7 @@ def _bound(checked: PoseCheck) -> str:
 
 def report_check(checked: PoseCheck, document: RelocalizeCheck, *, as_json: bool) -> int:
     """Print the judgement; returns the exit code: 0 if the pose is fine."""
-    if as_json:
-        console.print_json(document)
-    else:
-        print(as_text(checked), flush=True)
+    console.print_result(document if as_json else as_text(checked))
     for warning in document["query"]["warnings"]:
         console.warn(warning)
     return console.OK if checked.status == "fine" else console.UNSURE

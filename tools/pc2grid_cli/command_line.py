@@ -14,14 +14,14 @@ import sys
 from collections.abc import Iterable, Mapping
 from functools import cached_property
 from importlib import import_module
-from typing import Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from pc2grid.errors import ConfigError
-from pc2grid_cli.console import Console
+from pc2grid_cli import console
 from pc2grid_cli.options import DATABASE
 from pc2grid_cli.removed import REMOVED
 
@@ -37,14 +37,57 @@ _NEW_OBJECTS = 100_000
 when it needs them make about as many. `convert` leaves 2,000 objects in cycles in 150 s of a laser."""
 
 
+def _apply(context: typer.Context, option: typer.CallbackParam, value: int) -> None:
+    """Add what a global option says to what the console knows."""
+    terminal = console.of(context)
+    if option.name == "verbose":
+        terminal.verbose += value
+    elif value:
+        setattr(terminal, str(option.name), True)
+
+
+def _global_options(
+    verbose: Annotated[
+        int,
+        typer.Option(
+            "--verbose",
+            "-v",
+            count=True,
+            callback=_apply,
+            expose_value=False,
+            show_default=False,
+            help="print more; twice: still more",
+        ),
+    ] = 0,
+    quiet: Annotated[
+        bool,
+        typer.Option("--quiet", "-q", callback=_apply, expose_value=False, help="only warnings and errors"),
+    ] = False,
+    debug: Annotated[
+        bool,
+        typer.Option("--debug", callback=_apply, expose_value=False, help="tracebacks for errors"),
+    ] = False,
+) -> None:
+    """The options that may stand before and behind any command."""
+
+
+_made = typer.Typer(add_completion=False)
+_made.command()(_global_options)
+_GLOBAL = get_command(_made).params
+
+
 class Command(TyperCommand):
     """A command that takes the global options."""
 
+    def __init__(self, *arguments: Any, **about: Any) -> None:
+        super().__init__(*arguments, **about)
+        self.params += _GLOBAL
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Apply the global options."""
-        words = _read(self.params, ctx, args, until_command=False)
+        """Let an error say what to type."""
+        words = [*args]
         try:
-            return super().parse_args(ctx, list(words))
+            return super().parse_args(ctx, args)
         except Exception as error:  # its class is not public
             if type(error).__name__ == "MissingParameter":
                 error.suggestion = _with_option(self.params, ctx, getattr(error, "param", None), words)  # type: ignore[attr-defined]
@@ -95,11 +138,8 @@ class Group(TyperGroup):
 
     def __init__(self, **about: Any) -> None:
         super().__init__(**about)
+        self.params += _GLOBAL
         self.commands = {**{name: LateCommand(name, *of) for name, of in self.late.items()}, **self.commands}
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Apply the global options that stand before the command."""
-        return super().parse_args(ctx, _read(self.params, ctx, args, until_command=True))
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that the words name, with the words behind its name."""
@@ -128,29 +168,10 @@ def _with_option(params: Iterable[Any], ctx: typer.Context, missing: Any, words:
     *before, last = words
     if not last.endswith(".submaps") and not last.startswith(("postgresql://", "postgres://")):
         return None
-    if any(before[-1:] == [name] and not param.is_flag for param in params for name in param.opts):
+    if any(
+        before[-1:] == [name] and not (param.is_flag or param.count)
+        for param in params
+        for name in param.opts
+    ):
         return None  # it is the value of another option
     return shlex.join([*ctx.command_path.split(), *before, min(options, key=len), last])
-
-
-def _read(params: Iterable[Any], ctx: typer.Context, words: list[str], *, until_command: bool) -> list[str]:
-    """The words without global options.
-
-    Words that are the value of an option are left alone, and so are those behind `--`, and behind the name of
-    a command if `until_command`.
-    """
-    console = ctx.ensure_object(Console)
-    names = {name: param for param in params for name in param.opts if name.startswith("-")}
-    left: list[str] = []
-    position = 0
-    while position < len(words):
-        word = words[position]
-        if word == "--" or (until_command and not word.startswith("-")):
-            break
-        position += 1
-        if word in names and not names[word].is_flag and not names[word].count:
-            left += [word, *words[position : position + names[word].nargs]]
-            position += names[word].nargs
-        elif not console.apply(word):
-            left.append(word)
-    return left + words[position:]

@@ -10,11 +10,11 @@ from pc2grid.errors import ConfigError
 from pc2grid.settings import dump_settings
 from pc2grid_cli import console
 from pc2grid_cli.json_schemas import DOCUMENTS, schema
-from pc2grid_cli.options import Assignments, ConfigFile, Preset, PresetName, make_config
+from pc2grid_cli.options import Assignments, ConfigFile, Preset, make_config
 
 
 def config_dump_command(
-    config: ConfigFile = None, set_: Assignments = None, preset: Preset = PresetName.default
+    config: ConfigFile = None, set_: Assignments = None, preset: Preset = "default"
 ) -> None:
     """Print every setting with its value and meaning as TOML, ready for --config.
 
@@ -36,6 +36,6 @@ def config_schema_command(
     if name is None:
         print("\n".join(names))
     elif name in names:
-        console.print_json(schema(name))
+        console.print_result(schema(name))
     else:
         raise ConfigError(f"no schema {name!r}", hint=f"there are {', '.join(names)}")

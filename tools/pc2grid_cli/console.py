@@ -12,24 +12,25 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from datetime import timedelta
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from pc2grid.errors import one_line
 from pc2grid.observer import Observer
 
+if TYPE_CHECKING:
+    from rich.progress import Task
+
 OK, FAILED, USAGE, LOSSY, UNSURE, INTERRUPTED = 0, 1, 2, 3, 4, 130
 PIPE_CLOSED = 128 + signal.SIGPIPE
-_LEAST_S, _LEAST_SHARE = 2.0, 0.03
-"""Time and share of the work that must pass before the time left is estimated; chosen by hand."""
 _LINE_EVERY_S = 10.0
 """How often progress is printed where there is no terminal; chosen by hand."""
 _SENT_AGAIN_S = 0.05
 """How long after a signal whose exception was dropped it is sent again; chosen by hand."""
 _COMPILING = "compiling what runs for the first time here; later runs do not wait for it"
-_INTERRUPTED = "pc2grid: interrupted: each file is complete, or as it was before"
 
 
 class Console:
@@ -44,19 +45,6 @@ class Console:
         self.quiet = False
         self.debug = bool(os.environ.get("PC2GRID_DEBUG"))
         self.compiling = False
-        self._pace: _Pace | None = None
-
-    def apply(self, word: str) -> bool:
-        """Apply a word of the command line if it is a global option; returns whether it is one."""
-        if word in ("-v", "-vv", "--verbose"):
-            self.verbose += word.count("v") if word != "--verbose" else 1
-        elif word in ("-q", "--quiet"):
-            self.quiet = True
-        elif word == "--debug":
-            self.debug = True
-        else:
-            return False
-        return True
 
     def note(self, message: str, *, level: int = 0) -> None:
         """A line for the user, unless -q is given; one of level 1 is only printed with -v."""
@@ -72,33 +60,37 @@ class Console:
         if self.quiet:
             yield lambda share: None
             return
-        pace = self._pace = _Pace(recorded_s)
-        if not sys.stderr.isatty():
-            yield _plain_progress(what, pace)
-            return
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
+        from rich.progress import BarColumn, Progress, TextColumn
 
+        last_s, on_terminal = time.monotonic(), sys.stderr.isatty()
         columns = (
             TextColumn("{task.description}"),
             BarColumn(),
-            TaskProgressColumn(),
-            TextColumn("{task.fields[pace]}"),
+            TextColumn("{task.percentage:>3.0f}%{task.fields[pace]}"),
         )
-        with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-            task = bar.add_task(what, total=1.0, pace="")
-            yield lambda share: bar.update(task, completed=share, pace=pace.told(share))
+        stderr = Console(stderr=True)
+        with Progress(
+            *columns, console=stderr, transient=True, disable=not on_terminal, get_time=time.monotonic
+        ) as bar:
+            bar.add_task(what, pace="", total=1.0)
+            (task,) = bar.tasks
+
+            def update(share: float) -> None:
+                nonlocal last_s
+                bar.update(task.id, completed=share)
+                bar.update(task.id, pace=_pace(task, recorded_s))
+                if not on_terminal and time.monotonic() - last_s >= _LINE_EVERY_S:
+                    last_s = time.monotonic()
+                    print(f"pc2grid: {what}: {share:.0%}{task.fields['pace']}", file=sys.stderr)
+
+            yield update
 
     def compiling_begins(self) -> None:
         """Tell the user, once, that functions are compiled."""
         if not self.compiling:
             self.compiling = True
             self.note(_COMPILING)
-
-    def compiling_ends(self) -> None:
-        """Measure the pace again: the time for compiling is no measure for the rest of the work."""
-        if self._pace is not None:
-            self._pace.restart()
 
     def observer(self) -> ConsoleObserver:
         """Shows the news of some work on this console."""
@@ -136,24 +128,23 @@ class Console:
             result = command()
             sys.stdout.flush()
             return result if isinstance(result, int) else OK
-        except KeyboardInterrupt:
-            print(_INTERRUPTED, file=sys.stderr)
+        except BaseException as error:
+            return self._ended_by(error, stop.number)
+
+    def _ended_by(self, error: BaseException, signal_number: int | None) -> int:
+        """The exit code of a command that ended by an error or a signal; what is to be said is printed."""
+        if isinstance(error, KeyboardInterrupt) or signal_number == signal.SIGINT:
+            print("pc2grid: interrupted: each file is complete, or as it was before", file=sys.stderr)
             return INTERRUPTED
-        except BrokenPipeError:
-            return _pipe_closed()
-        except SystemExit as request:
-            if isinstance(request.__context__, BrokenPipeError):  # click turns it into exit code 1
-                return _pipe_closed()
-            raise
-        except Exception as error:
-            if stop.number == signal.SIGINT:
-                print(_INTERRUPTED, file=sys.stderr)
-                return INTERRUPTED
-            if stop.number is not None:
-                return 128 + stop.number
-            if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of typer's
-                return _report_usage(error)
-            return self.report_error(error)
+        if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):
+            return _pipe_closed()  # click turns it into SystemExit(1)
+        if isinstance(error, SystemExit):
+            raise error
+        if signal_number is not None:
+            return 128 + signal_number
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of typer's
+            return _report_usage(error)
+        return self.report_error(error)
 
 
 def of(context: typer.Context) -> Console:
@@ -166,19 +157,14 @@ def warn(message: str) -> None:
     print(f"pc2grid: warning: {one_line(message)}", file=sys.stderr)
 
 
-def print_json(document: Any) -> None:
-    """Print the document of a command to stdout."""
-    print(json_text(document), flush=True)
+def print_result(result: Any, indent: int | None = 1) -> None:
+    """Print the result of a command to stdout: a text, or a document as JSON; indent None: in one line."""
+    print(result if isinstance(result, str) else json_text(result, indent), flush=True)
 
 
-def print_json_line(document: Any) -> None:
-    """Print a document of a stream of them to stdout, as one line."""
-    print(json.dumps(_finite(document), ensure_ascii=False, allow_nan=False), flush=True)
-
-
-def json_text(document: Any) -> str:
+def json_text(document: Any, indent: int | None = 1) -> str:
     """A document as JSON. JSON has no NaN and no infinity: such a value becomes null."""
-    return json.dumps(_finite(document), indent=1, ensure_ascii=False, allow_nan=False)
+    return json.dumps(_finite(document), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
 def _finite(value: Any) -> Any:
@@ -198,12 +184,9 @@ class ConsoleObserver(Observer):
         self._console = console
         self._update: Callable[[float], None] | None = None
 
-    def step(self, what: str, recorded_s: float | None = None) -> contextlib.AbstractContextManager[None]:
-        """Shows the progress of a step."""
-        return self._shown(what, recorded_s)
-
     @contextlib.contextmanager
-    def _shown(self, what: str, recorded_s: float | None) -> Iterator[None]:
+    def step(self, what: str, recorded_s: float | None = None) -> Iterator[None]:
+        """Shows the progress of a step."""
         with self._console.progress(what, recorded_s) as self._update, _compiling_noted(self._console):
             yield
         self._update = None
@@ -232,54 +215,22 @@ def _compiling_noted(console: Console) -> Iterator[None]:
             console.compiling_begins()
 
         def on_end(self, event: Any) -> None:
-            console.compiling_ends()
+            """Nothing more is said."""
 
     with event.install_listener("numba:compile", Note()):
         yield
 
 
-def _plain_progress(what: str, pace: _Pace) -> Callable[[float], None]:
-    last = time.monotonic()
+def _pace(task: Task, recorded_s: float | None) -> str:
+    """How fast the work goes, and how long the rest takes at that pace; nothing while that is not known.
 
-    def update(share: float) -> None:
-        nonlocal last
-        told = pace.told(share)
-        if time.monotonic() - last >= _LINE_EVERY_S:
-            last = time.monotonic()
-            print(f"pc2grid: {what}: {share:.0%}{', ' if told else ''}{told}", file=sys.stderr)
-
-    return update
-
-
-class _Pace:
-    """Estimates how fast the work goes and how long the rest takes at that pace."""
-
-    def __init__(self, recorded_s: float | None) -> None:
-        self._recorded_s = recorded_s
-        self._first: tuple[float, float] | None = None
-
-    def restart(self) -> None:
-        """Measure from the next share on."""
-        self._first = None
-
-    def told(self, share: float) -> str:
-        """Pace and time left in words; nothing while too little is done to estimate them.
-
-        The pace is measured from the first share reported, because the preparations before are not part of
-        it. The time left goes up where the work turns out to be slower than before.
-        """
-        now = time.monotonic()
-        begin, done_before = self._first = self._first or (now, share)
-        spent_s, done = now - begin, share - done_before
-        if spent_s < _LEAST_S or done < _LEAST_SHARE:
-            return ""
-        rate = f"{done * self._recorded_s / spent_s:.1f}x real time, " if self._recorded_s else ""
-        return f"{rate}{_duration(spent_s * (1.0 - share) / done)} left"
-
-
-def _duration(seconds: float) -> str:
-    minutes, rest = divmod(round(seconds), 60)
-    return f"{minutes} min {rest} s" if minutes else f"{rest} s"
+    The pace is that of the last half minute, as rich measures it. It begins with the first share reported,
+    because the preparations before are not part of it.
+    """
+    if not task.speed or task.time_remaining is None:
+        return ""
+    rate = f", {task.speed * recorded_s:.1f}x real time" if recorded_s else ""
+    return f"{rate}, {timedelta(seconds=task.time_remaining)} left"
 
 
 def _pipe_closed() -> int:

@@ -17,14 +17,31 @@ from pc2grid.model import SessionMap
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
-from pc2grid_cli.json_schemas import Convert, Converted, JoinedSession, plain
-from pc2grid_cli.session_documents import joined_document, session_document
+from pc2grid_cli.session_documents import (
+    Converted,
+    JoinedSession,
+    OfDatabase,
+    joined_document,
+    session_document,
+)
 from signature import conversion_jobs
 from signature.config import Config
 from signature.conversion_jobs import Job
 from signature.database import Label, maintenance, open_database
 from signature.database.protocol import Entry
+from signature.localization.answer_json import plain
 from signature.localization.joining.building import join_sessions
+
+
+class Convert(OfDatabase):
+    """`pc2grid convert --json`. unchanged: sessions that were stored already; failed: inputs left out.
+    joined: where those of the new sessions lie in a building that were joined with others."""
+
+    lossy: bool
+    sessions: list[Converted]
+    unchanged: list[str]
+    failed: list[str]
+    joined: list[JoinedSession]
 
 
 def jobs_of(
@@ -70,7 +87,6 @@ class Done:
     def document(self, database: str) -> Any:
         """What `--json` prints."""
         document: Convert = {
-            "schema_version": 1,
             "database": database,
             "lossy": self.lossy,
             "sessions": self.sessions,
@@ -238,7 +254,7 @@ def conclude(output: str, done: Done, count: int, *, json: bool) -> None:
     """Print what there is now, and what is to be said of it; end with the exit code."""
     where = maintenance.shown(output)
     if json:
-        console.print_json(done.document(where))
+        console.print_result(done.document(where))
     elif Path(output).is_file():
         print(f"{where}: {Path(output).stat().st_size / 1e6:.1f} MB")
     for warning in done.warnings:

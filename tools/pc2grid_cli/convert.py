@@ -58,7 +58,7 @@ def convert_command(
     jobs: options.JobCount = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
-    preset: options.Preset = options.PresetName.default,
+    preset: options.Preset = "default",
     force: options.Force = False,
     recover: options.Recover = False,
     strict: options.Strict = False,

@@ -11,13 +11,33 @@ import typer
 from pc2grid.display import counted
 from pc2grid.errors import DatabaseError, one_line
 from pc2grid_cli import console
-from pc2grid_cli.json_schemas import DbCheck, DbInfo, DbWrite, StoredInfo, plain
 from pc2grid_cli.options import DATABASE, AsJson, Database, Force, WrittenDatabase
-from pc2grid_cli.session_documents import precision_summary
+from pc2grid_cli.session_documents import OfDatabase, StoredInfo, stored_document
 from signature.database import Problem, SessionInfo, open_database
 from signature.database.maintenance import check, copy, merge, remove, rename, shown, split
+from signature.localization.answer_json import plain
 
 _Sessions = Annotated[list[str], typer.Argument(metavar="SESSION...", help="which of its sessions")]
+
+
+class DbInfo(OfDatabase):
+    """`pc2grid db info --json`."""
+
+    sessions: list[StoredInfo]
+
+
+class DbCheck(OfDatabase):
+    """`pc2grid db check --json`; no problems: sound."""
+
+    problems: list[Problem]
+
+
+class DbWrite(OfDatabase):
+    """`pc2grid db merge`, `copy`, `split`, `rename` and `remove` with `--json`. sessions: how many are in
+    the database now; left_out: damage that was not copied."""
+
+    sessions: int
+    left_out: list[Problem]
 
 
 def db_info_command(database: Database, json: AsJson = False) -> None:
@@ -27,19 +47,10 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
     """
     with open_database(database) as opened:
         sessions, where = opened.sessions(), opened.location
-    if json:
-        document: DbInfo = {
-            "schema_version": 1,
-            "database": where,
-            "sessions": [_document(session) for session in sessions],
-        }
-        console.print_json(plain(DbInfo, document))
-        return
-    print(
-        f"{where}: {counted(len(sessions), 'session')}, {counted(sum(s.submaps for s in sessions), 'submap')}"
-    )
-    for session in sessions:
-        print(one_line(_line(session)))
+    about: DbInfo = {"database": where, "sessions": [stored_document(session) for session in sessions]}
+    submaps = counted(sum(session.submaps for session in sessions), "submap")
+    lines = [f"{where}: {counted(len(sessions), 'session')}, {submaps}", *map(_line, sessions)]
+    console.print_result(plain(DbInfo, about) if json else "\n".join(map(one_line, lines)))
 
 
 def _line(s: SessionInfo) -> str:
@@ -55,48 +66,16 @@ def _line(s: SessionInfo) -> str:
     return line
 
 
-def _document(s: SessionInfo) -> StoredInfo:
-    return {
-        "name": s.name,
-        "sensor": s.sensor,
-        "building": s.provenance.label.building,
-        "floor": s.provenance.label.floor,
-        "source": s.provenance.source,
-        "digest": s.digest,
-        "submaps": s.submaps,
-        "resolution_m": s.resolution_m,
-        "area_m2": s.area_m2,
-        "path_m": s.path_m,
-        "duration_s": s.duration_s,
-        "scans": s.scans,
-        "lossy": s.lossy,
-        "consistency": s.consistency,
-        "odometry": s.odometry,
-        "precision": precision_summary(s.precision),
-        "warnings": list(s.warnings),
-        "versions": dict(s.provenance.versions),
-        "config": s.provenance.config.model_dump(mode="json"),
-    }
-
-
 def db_check_command(database: Database, json: AsJson = False) -> None:
     """Read everything in a database and list all damage; exit code 1 if there is any.
 
     Example: pc2grid db check building.submaps
     """
     problems = check(database)
-    if json:
-        document: DbCheck = {
-            "schema_version": 1,
-            "database": shown(database),
-            "problems": list(problems),
-        }
-        console.print_json(plain(DbCheck, document))
-    elif not problems:
-        print(f"{shown(database)}: sound")
-    else:
-        for problem in problems:
-            print(one_line(f"{problem.where}: {problem.what}"))
+    about: DbCheck = {"database": shown(database), "problems": list(problems)}
+    damage = [one_line(f"{problem.where}: {problem.what}") for problem in problems]
+    text = "\n".join(damage) or f"{shown(database)}: sound"
+    console.print_result(plain(DbCheck, about) if json else text)
     if problems:
         raise typer.Exit(console.FAILED)
 
@@ -112,10 +91,7 @@ def db_merge_command(
     Example: pc2grid db merge monday.submaps tuesday.submaps -o week.submaps
     """
     count = merge(databases, output, overwrite=force)
-    if json:
-        console.print_json(plain(DbWrite, written(output)))
-    else:
-        print(f"{shown(output)}: {counted(count, 'session')}")
+    _tell(output, f"{shown(output)}: {counted(count, 'session')}", json)
 
 
 def db_copy_command(
@@ -132,10 +108,7 @@ def db_copy_command(
     problems = copy(database, output, recover=recover, overwrite=force)
     for problem in problems:
         console.warn(f"left out: {problem.where}: {problem.what}")
-    if json:
-        console.print_json(plain(DbWrite, written(output, problems)))
-    else:
-        print(f"{shown(output)}: {_size(output)}")
+    _tell(output, f"{shown(output)}: {_size(output)}", json, problems)
     if problems:
         raise typer.Exit(console.LOSSY)
 
@@ -143,9 +116,11 @@ def db_copy_command(
 def _size(output: str) -> str:
     """The size of a copy: of a file in bytes, of anything else in sessions."""
     path = Path(output)
-    if path.is_file():
-        return f"{path.stat().st_size / 1e6:.1f} MB"
-    with open_database(output) as opened:
+    return f"{path.stat().st_size / 1e6:.1f} MB" if path.is_file() else _sessions(output)
+
+
+def _sessions(database: str) -> str:
+    with open_database(database) as opened:
         return counted(len(opened.sessions()), "session")
 
 
@@ -161,10 +136,7 @@ def db_split_command(
     Example: pc2grid db split building.submaps monday -o monday.submaps
     """
     count = split(database, sessions, output, overwrite=force)
-    if json:
-        console.print_json(plain(DbWrite, written(output)))
-    else:
-        print(f"{shown(output)}: {counted(count, 'session')}")
+    _tell(output, f"{shown(output)}: {counted(count, 'session')}", json)
 
 
 def db_rename_command(
@@ -178,10 +150,7 @@ def db_rename_command(
     Example: pc2grid db rename building.submaps monday first-floor
     """
     rename(database, old, new)
-    if json:
-        console.print_json(plain(DbWrite, written(database)))
-    else:
-        print(one_line(f"{shown(database)}: {old} is now {new}"))
+    _tell(database, one_line(f"{shown(database)}: {old} is now {new}"), json)
 
 
 def db_remove_command(
@@ -197,11 +166,7 @@ def db_remove_command(
     if not force:
         _refuse_all(database, sessions)
     remove(database, sessions)
-    document = written(database)
-    if json:
-        console.print_json(plain(DbWrite, document))
-    else:
-        print(f"{document['database']}: {counted(document['sessions'], 'session')} left")
+    _tell(database, f"{shown(database)}: {_sessions(database)} left", json)
 
 
 def _refuse_all(database: str, sessions: list[str]) -> None:
@@ -215,13 +180,9 @@ def _refuse_all(database: str, sessions: list[str]) -> None:
             )
 
 
-def written(output: str, left_out: Sequence[Problem] = ()) -> DbWrite:
-    """The document about a database that was written."""
+def _tell(output: str, text: str, json: bool, left_out: Sequence[Problem] = ()) -> None:
+    """Print a text or the document about a database that was written."""
     with open_database(output) as opened:
         number, where = len(opened.sessions()), opened.location
-    return {
-        "schema_version": 1,
-        "database": where,
-        "sessions": number,
-        "left_out": list(left_out),
-    }
+    about: DbWrite = {"database": where, "sessions": number, "left_out": list(left_out)}
+    console.print_result(plain(DbWrite, about) if json else text)

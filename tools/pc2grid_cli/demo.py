@@ -14,10 +14,11 @@ from pc2grid.display import counted
 from pc2grid.geometry import wrap_angle
 from pc2grid.io.atomic import require_writable
 from pc2grid.io.trajectory import read_tum
+from pc2grid.model import SensorKind
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.config import LidarConfig
 from pc2grid_cli import console
-from pc2grid_cli.locate import find_log
+from pc2grid_cli.locate import find
 from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.relocalize import as_text
@@ -53,20 +54,17 @@ def demo_command(
         require_writable(path, force)
 
     terminal.note("1/4 simulate a robot with a lidar, and days later one with a depth camera")
-    with terminal.progress("simulate lidar") as update:
-        # Half of the rate and columns of a VLP-16: enough for an indoor map, and the demo stays short.
-        mapper = SimulationConfig(
-            length_m=MAP_LENGTH_M,
-            seed=1,
-            building_seed=BUILDING_SEED,
-            lidar=LidarConfig(rate_hz=5.0, columns=450),
-        )
-        simulate_session(lidar, sensor="lidar", grid=None, config=mapper, progress=update, overwrite=force)
-    with terminal.progress("simulate depth") as update:
-        visitor = SimulationConfig(
-            length_m=QUERY_LENGTH_M, seed=12, start_m=QUERY_START_M, building_seed=BUILDING_SEED
-        )
-        simulate_session(depth, sensor="depth", grid=None, config=visitor, progress=update, overwrite=force)
+    # Half of the rate and columns of a VLP-16: enough for an indoor map, and the demo stays short.
+    short = LidarConfig(rate_hz=5.0, columns=450)
+    mapper = SimulationConfig(length_m=MAP_LENGTH_M, seed=1, building_seed=BUILDING_SEED, lidar=short)
+    visitor = SimulationConfig(
+        length_m=QUERY_LENGTH_M, seed=12, start_m=QUERY_START_M, building_seed=BUILDING_SEED
+    )
+    drives: tuple[tuple[SensorKind, Path, SimulationConfig], ...]
+    drives = (("lidar", lidar, mapper), ("depth", depth, visitor))
+    for sensor, path, drive in drives:
+        with terminal.progress(f"simulate {sensor}") as update:
+            simulate_session(path, sensor=sensor, config=drive, progress=update, overwrite=force)
 
     terminal.note("2/4 convert the lidar's recording into a database")
     config = Config()
@@ -76,7 +74,7 @@ def demo_command(
     terminal.note("3/4 relocalize the depth camera's recording in it")
     truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
     with open_database(database) as opened:
-        found = find_log(depth, opened, config, observer=terminal.observer())
+        found = find(depth, opened, config, observer=terminal.observer())
         answer = found.answer
         # The frame of the database is the first pose of the lidar robot; the truth is in that of the plan.
         T_map_plan = next(truth_map.poses()).inverse()

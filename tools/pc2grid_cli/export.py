@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,26 +21,36 @@ from pc2grid.io.trajectory import write_trajectory
 from pc2grid.model import THING, MapOf, OccupancyGrid
 from pc2grid_cli import console
 from pc2grid_cli.foxglove import write_session
-from pc2grid_cli.options import AsJson, Building, Database, Floor, Force, Frame, FrameName
+from pc2grid_cli.options import (
+    AsJson,
+    Building,
+    Database,
+    Floor,
+    Force,
+    Frame,
+    Plot,
+    Report,
+    TrajectoryFile,
+)
 from pc2grid_cli.output_files import check_file, map_stem
+from pc2grid_cli.session_documents import OfDatabase
 from signature.database import open_database
+from signature.localization.answer_json import plain
 from signature.localization.joining.building_map import floors_of, map_of
 from signature.localization.shown.picture import draw_session
 from signature.localization.shown.report import write_report
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
-    from pc2grid_cli.json_schemas import Export
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame, SessionInfo
 
 
-class MapOfName(str, enum.Enum):
-    """What a map shows."""
+class Export(OfDatabase):
+    """`pc2grid export --json`; session is null if only a report was written."""
 
-    everything = "everything"
-    walls = "walls"
-    raw = "raw"
+    session: str | None
+    written: list[str]
 
 
 _SHOWN: dict[MapOf, str] = {
@@ -51,68 +60,58 @@ _SHOWN: dict[MapOf, str] = {
 }
 
 
-class TrajectoryKind(str, enum.Enum):
-    """Formats of trajectories."""
-
-    tum = "tum"
-    kitti = "kitti"
-
-
-_FORMATS: dict[TrajectoryKind, Literal["tum", "kitti"]] = {
-    TrajectoryKind.tum: "tum",
-    TrajectoryKind.kitti: "kitti",
-}
+TrajectoryFormat = Literal["tum", "kitti"]
+_Map = Annotated[Path | None, typer.Option("--map", metavar="STEM", help="STEM.yaml and STEM.pgm for nav2")]
+_MapOf = Annotated[
+    MapOf | None,
+    typer.Option(
+        "--map-of",
+        help="of --map and --mcap; default: everything that stands there is an obstacle; walls: furniture"
+        " is unknown; raw: percent, which nav2 takes for free below 100",
+    ),
+]
+_Format = Annotated[
+    TrajectoryFormat | None,
+    typer.Option("--format", help="of the trajectory; default: kitti for OUT.kitti, else tum"),
+]
+_Cloud = Annotated[
+    Path | None,
+    typer.Option(
+        "--cloud",
+        metavar="OUT.ply|.pcd",
+        help="the 3D points that convert --points kept, else the walls at z = 0",
+    ),
+]
+_Graph = Annotated[
+    Path | None,
+    typer.Option("--graph", metavar="OUT.graphml", help="junctions, ends, and the ways between"),
+]
+_G2o = Annotated[
+    Path | None, typer.Option("--g2o", metavar="OUT.g2o", help="the pose graph: steps and loops")
+]
+_Mcap = Annotated[
+    Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove, rerun")
+]
+_Session = Annotated[str | None, typer.Option("--session", help="which, if there are several")]
 
 
 def export_command(
     context: typer.Context,
     database: Database,
-    map_: Annotated[
-        Path | None, typer.Option("--map", metavar="STEM", help="STEM.yaml and STEM.pgm for nav2")
-    ] = None,
-    map_of_: Annotated[
-        MapOfName | None,
-        typer.Option(
-            "--map-of",
-            help="of --map and --mcap; default: everything that stands there is an obstacle; walls: furniture"
-            " is unknown; raw: percent, which nav2 takes for free below 100",
-        ),
-    ] = None,
-    trajectory: Annotated[
-        Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="poses of the base, for evo")
-    ] = None,
-    format_: Annotated[
-        TrajectoryKind | None,
-        typer.Option("--format", help="of the trajectory; default: kitti for OUT.kitti, else tum"),
-    ] = None,
-    cloud: Annotated[
-        Path | None,
-        typer.Option(
-            "--cloud",
-            metavar="OUT.ply|.pcd",
-            help="the 3D points that convert --points kept, else the walls at z = 0",
-        ),
-    ] = None,
-    graph: Annotated[
-        Path | None,
-        typer.Option("--graph", metavar="OUT.graphml", help="junctions, ends, and the ways between"),
-    ] = None,
-    g2o: Annotated[
-        Path | None, typer.Option("--g2o", metavar="OUT.g2o", help="the pose graph: steps and loops")
-    ] = None,
-    mcap: Annotated[
-        Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove, rerun")
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the map")
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", metavar="OUT.html", help="a page to look into the database")
-    ] = None,
-    session: Annotated[str | None, typer.Option("--session", help="which, if there are several")] = None,
+    map_: _Map = None,
+    map_of_: _MapOf = None,
+    trajectory: TrajectoryFile = None,
+    format_: _Format = None,
+    cloud: _Cloud = None,
+    graph: _Graph = None,
+    g2o: _G2o = None,
+    mcap: _Mcap = None,
+    plot: Plot = None,
+    report: Report = None,
+    session: _Session = None,
     building: Building = None,
     floor: Floor = None,
-    frame: Frame = FrameName.building,
+    frame: Frame = "building",
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -126,10 +125,10 @@ def export_command(
     """
     terminal = console.of(context)
     outputs = _Outputs(
-        map_stem=None if map_ is None else map_stem(map_),
-        map_of=(map_of_ or MapOfName.everything).value,
+        map_stem=map_ and map_stem(map_),
+        map_of=map_of_ or "everything",
         trajectory=trajectory,
-        trajectory_format=None if format_ is None else _FORMATS[format_],
+        trajectory_format=format_,
         cloud=cloud,
         graph=graph,
         g2o=g2o,
@@ -138,35 +137,24 @@ def export_command(
         report=report,
         force=force,
     )
-    if map_of_ is not None and map_ is None and mcap is None:
-        raise ConfigError("--map-of: no map is written", hint="name --map or --mcap, too")
+    outputs.check(map_of_)
     extras.require(extras.of_addresses(database))
-    outputs.check()
     with open_database(database) as opened:
-        where = opened.location
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
-        frames = opened.frames() if frame is FrameName.building else {}
-        whole = session is None and outputs.of_building_only() and len(floors_of(opened, frames)) == 1
-        name = _session_name(opened, session) if outputs.of_session() and not whole else None
-        if whole:
-            _write_building(outputs, opened, floors_of(opened, frames)[0], frames, terminal)
-        elif name is not None:
-            _write_session(outputs, opened, name, frames.get(name), terminal)
-        if report is not None:
-            write_report(report, opened)
+        frames = opened.frames() if frame == "building" else {}
+        name = _write(outputs, opened, session, frames, terminal)
+        about: Export = {
+            "database": opened.location,
+            "session": name,
+            "written": [str(path) for path in outputs.written()],
+        }
     if outputs.map_of != "everything":
         terminal.note(f"--map-of {outputs.map_of}: {_SHOWN[outputs.map_of]}")
     for path in outputs.written():
         terminal.note(f"wrote {path}")
     if json:
-        document: Export = {
-            "schema_version": 1,
-            "database": where,
-            "session": name,
-            "written": [str(path) for path in outputs.written()],
-        }
-        console.print_json(document)
+        console.print_result(plain(Export, about))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,7 +164,7 @@ class _Outputs:
     map_stem: Path | None
     map_of: MapOf
     trajectory: Path | None
-    trajectory_format: Literal["tum", "kitti"] | None
+    trajectory_format: TrajectoryFormat | None
     cloud: Path | None
     graph: Path | None
     g2o: Path | None
@@ -208,8 +196,13 @@ class _Outputs:
         """All files, in the order in which they are listed for the user."""
         return self.files() + ([] if self.report is None else [self.report])
 
-    def check(self) -> None:
-        """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written."""
+    def check(self, map_of: MapOf | None) -> None:
+        """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written.
+
+        map_of : as it was given.
+        """
+        if map_of is not None and self.map_stem is None and self.mcap is None:
+            raise ConfigError("--map-of: no map is written", hint="name --map or --mcap, too")
         if not self.of_session() and self.report is None:
             raise ConfigError(
                 "nothing to export",
@@ -220,6 +213,27 @@ class _Outputs:
             check_file(option, getattr(self, option), self.force, any_suffix=named)
         for path in self.map_files():
             check_file("map", path, self.force)
+
+
+def _write(
+    outputs: _Outputs,
+    database: SubmapDatabase,
+    session: str | None,
+    frames: Mapping[str, BuildingFrame],
+    terminal: console.Console,
+) -> str | None:
+    """Write all files. Returns the session that was written; None if it was a whole building, or none."""
+    floors = floors_of(database, frames)
+    whole = session is None and outputs.of_building_only() and len(floors) == 1
+    name = None
+    if whole:
+        _write_building(outputs, database, floors[0], frames, terminal)
+    elif outputs.of_session():
+        name = _session_name(database, session)
+        _write_session(outputs, database, name, frames.get(name), terminal)
+    if outputs.report is not None:
+        write_report(outputs.report, database)
+    return name
 
 
 def _session_name(database: SubmapDatabase, named: str | None) -> str:

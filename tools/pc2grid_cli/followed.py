@@ -5,13 +5,15 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from pc2grid.io import open_log
 from pc2grid.io.live.feed import News
 from pc2grid.io.live.inbox import FeedCounts
+from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.targets import is_robot, open_live
 from pc2grid.io.map_pose import BelievedPose
+from signature.localization.answer_json import TypedDict
 
 if TYPE_CHECKING:
     from pc2grid.config import ReadConfig
@@ -21,59 +23,16 @@ if TYPE_CHECKING:
     from pc2grid.model import ReadReport, Scan
 
 
-class Followed(Protocol):
-    """Scans, part after part, and what is known of how they come.
+class Live(TypedDict):
+    """How a running robot is followed. scans: used so far. dropped: left out because the computer is too
+    slow. reconnected: lost connections made again. lag_s, elapsed_s: seconds from a scan's arrival to its
+    use, and for this estimate."""
 
-    on_poll : called several times a second while scans are awaited.
-    """
-
-    on_poll: Callable[[], bool]
-
-    @property
-    def name(self) -> str:
-        """For the user."""
-        ...
-
-    @property
-    def realtime(self) -> bool:
-        """Whether scans are lost that are not used in time."""
-        ...
-
-    @property
-    def counts(self) -> FeedCounts:
-        """Of messages that came and that were lost."""
-        ...
-
-    @property
-    def news(self) -> News:
-        """What the user should know."""
-        ...
-
-    @property
-    def lag_s(self) -> float:
-        """Time from the arrival of the last scan to the end of its use."""
-        ...
-
-    @property
-    def believed(self) -> MapPose | None:
-        """The newest pose by the robot's own localization, on the topic given to `listen_to_pose`."""
-        ...
-
-    def choose(self) -> Choice:
-        """See `Log.choose`."""
-        ...
-
-    def parts(self) -> Iterator[Iterator[Scan]]:
-        """The scans; those of one part belong together."""
-        ...
-
-    def report(self) -> ReadReport:
-        """See `Log.report`."""
-        ...
-
-    def listen_to_pose(self, topic: str) -> None:
-        """Keep `believed` up to date. Raises TopicError if it is known that there is no such topic."""
-        ...
+    scans: int
+    dropped: int
+    reconnected: int
+    lag_s: float
+    elapsed_s: float
 
 
 @contextlib.contextmanager
@@ -106,21 +65,21 @@ class WholeRecording:
         self._next: RawMessage | None = None
 
     def choose(self) -> Choice:
-        """See Followed."""
+        """See LiveLog."""
         return self._log.choose()
 
     def parts(self) -> Iterator[Iterator[Scan]]:
-        """See Followed."""
+        """See LiveLog."""
         yield self._log.scans()
         if self._pose is not None and self._pose.problem is not None:
             self.news.tell(str(self._pose.problem))
 
     def report(self) -> ReadReport:
-        """See Followed."""
+        """See LiveLog."""
         return self._log.report()
 
     def listen_to_pose(self, topic: str) -> None:
-        """See Followed."""
+        """See LiveLog."""
         self._pose = BelievedPose(topic)
         self._pose.find(self._log.info.topics, self.choose().base_frame)
         self._messages = self._log.messages(self._pose.topics)
@@ -135,3 +94,18 @@ class WholeRecording:
             self._pose.take(self._next)
             self._next = next(self._messages, None)
         return self._pose.newest
+
+
+Followed = LiveLog | WholeRecording
+"""Scans, part after part, and what is known of how they come."""
+
+
+def live(drive: Followed, elapsed_s: float) -> Live:
+    """How it is followed so far. elapsed_s : time that the estimate took."""
+    return {
+        "scans": drive.report().scans_read,
+        "dropped": drive.counts.dropped,
+        "reconnected": drive.counts.reconnected,
+        "lag_s": drive.lag_s,
+        "elapsed_s": elapsed_s,
+    }

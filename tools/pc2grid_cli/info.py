@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import dataclass, fields
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -17,23 +18,58 @@ from rich.table import Table
 from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io import open_log
+from pc2grid.io.message_source import Choice, LogInfo
 from pc2grid.io.topics import TF, camera_info_topic
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.sensor_model import SENSOR_MODELS
-from pc2grid_cli.console import LOSSY, print_json, warn
+from pc2grid_cli.console import LOSSY, print_result, warn
 from pc2grid_cli.db import db_info_command
 from pc2grid_cli.options import AsJson, Assignments, Recover, Topic, make_config
 from signature.database.maintenance import is_database
+from signature.localization.answer_json import TypedDict, plain
 
 if TYPE_CHECKING:
-    from pc2grid.io.message_source import LogInfo
     from pc2grid.mapping.drawn_map import DrawnMap
-    from pc2grid_cli.json_schemas import ChosenTopics, Info, InfoMap
 
 _WIDEST = 1000
 """Characters of the widest table of topics."""
 _TRIED_SCANS = 10
 """So many scans are read, to say what convert would say of them."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChosenTopics(Choice):
+    """What `convert` would use, and why. camera_topic: the calibration of depth images; else null."""
+
+    camera_topic: str | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Info(LogInfo):
+    """`pc2grid info --json`. choice is null, and problem says why, if `convert` could not use the log."""
+
+    choice: ChosenTopics | None
+    problem: str | None
+    bytes_lost: int
+
+
+class InfoMap(TypedDict):
+    """`pc2grid info MAP --json`. origin_m: x, y of the lower left corner; free_m2, occupied_m2: areas.
+    Of a cloud or mesh, voxels: points of which it was drawn, one a voxel, floor_z_m, tilt_deg: height and
+    tilt of the floor in the file; 0 for a nav2 map."""
+
+    path: str
+    format: str
+    warnings: list[str]
+    width: int
+    height: int
+    resolution_m: float
+    origin_m: list[float]
+    free_m2: float
+    occupied_m2: float
+    voxels: int
+    floor_z_m: float
+    tilt_deg: float
 
 
 def info_command(
@@ -57,19 +93,16 @@ def info_command(
         return
     if is_drawn_map(Path(log)):
         of_map = describe_map(Path(log), set_)
-        if json:
-            print_json(of_map)
-        else:
-            print(one_line(_map_as_text(of_map)))
+        print_result(plain(InfoMap, of_map) if json else one_line(_map_as_text(of_map)))
         for warning in of_map["warnings"]:
             warn(warning)
         return
-    document = describe(Path(log), topic=topic, recover=recover, assignments=set_)
+    info = describe(Path(log), topic=topic, recover=recover, assignments=set_)
     if json:
-        print_json(document)
+        print_result(plain(Info, info))
     else:
-        _show(document)
-    if document["bytes_lost"]:
+        _show(info)
+    if info.bytes_lost:
         raise typer.Exit(LOSSY)
 
 
@@ -81,7 +114,6 @@ def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
     height, width = grid.cells.shape
     cell_m2 = grid.resolution_m**2
     return {
-        "schema_version": 1,
         "path": str(path),
         "format": drawn.kind,
         "width": width,
@@ -103,12 +135,6 @@ def _floor_z_m(drawn: DrawnMap) -> float:
     height, width = drawn.grid.cells.shape
     middle = drawn.grid.to_point(np.array([(height // 2, width // 2)]))[0]
     return float(transform_points(invert_pose(drawn.T_map_file), np.array([[*middle, 0.0]]))[0, 2])
-
-
-def _camera_topic(log: LogInfo, images: str) -> str:
-    """The topic with the calibration of the camera whose depth images are used."""
-    image = next(topic for topic in log.topics if topic.topic == images)
-    return camera_info_topic(image, log.topics).topic
 
 
 def _map_as_text(d: InfoMap) -> str:
@@ -133,61 +159,45 @@ def describe(
     """
     config = make_config(None, assignments, topic=topic)
     with open_log(path, config.read, recover=recover) as log:
-        found = log.info
         choice: ChosenTopics | None = None
         problem: str | None = None
         try:
-            chosen = log.choose()
+            choice = _chosen(log.choose(), log.info)
             for _ in itertools.islice(log.scans(), _TRIED_SCANS):
                 pass
         except Pc2GridError as error:
-            problem = error.in_short
-        else:
-            choice = {
-                "topic": chosen.topic,
-                "sensor": chosen.sensor,
-                "odometry_topic": chosen.odometry_topic,
-                "imu_topic": chosen.imu_topic,
-                "camera_topic": _camera_topic(found, chosen.topic)
-                if SENSOR_MODELS[chosen.sensor].image
-                else None,
-                "base_frame": chosen.base_frame,
-                "sensor_frame": chosen.sensor_frame or "",
-                "reason": chosen.reason,
-            }
+            choice, problem = None, error.in_short
         report = log.report()
-        return {
-            "schema_version": 1,
-            "path": str(found.path),
-            "format": found.format,
-            "size_bytes": found.size_bytes,
-            "start_ns": found.start_ns,
-            "end_ns": found.end_ns,
-            "duration_s": found.duration_s,
-            "message_count": found.message_count,
-            "topics": [
-                {"topic": t.topic, "type": t.type, "encoding": t.encoding, "message_count": t.message_count}
-                for t in found.topics
-            ],
-            "choice": choice,
-            "problem": problem,
-            "bytes_lost": report.bytes_lost,
-            "warnings": list(dict.fromkeys((*found.warnings, *report.warnings))),
-        }
+        warnings = tuple(dict.fromkeys((*log.info.warnings, *report.warnings)))
+        found = _fields(log.info) | {"warnings": warnings}
+        return Info(**found, choice=choice, problem=problem, bytes_lost=report.bytes_lost)
 
 
-def _show(document: Info) -> None:
+def _chosen(choice: Choice, log: LogInfo) -> ChosenTopics:
+    """What would be used, with the topic of the calibration of the camera whose depth images are used."""
+    images = [
+        topic for topic in log.topics if topic.topic == choice.topic and SENSOR_MODELS[choice.sensor].image
+    ]
+    camera = camera_info_topic(images[0], log.topics).topic if images else None
+    named = _fields(choice) | {"sensor_frame": choice.sensor_frame or ""}
+    return ChosenTopics(**named, camera_topic=camera)
+
+
+def _fields(of: Choice | LogInfo) -> dict[str, Any]:
+    return {field.name: getattr(of, field.name) for field in fields(of)}
+
+
+def _show(info: Info) -> None:
     def escape(text: str) -> str:
         # Names come from the log, and may hold control sequences for a terminal.
         return markup.escape(one_line(text))
 
     console = Console()
-    choice = document["choice"]
-    count = document["message_count"]
-    console.print(f"[bold]{escape(document['path'])}[/bold]", soft_wrap=True, highlight=False)
+    choice, count = info.choice, info.message_count
+    console.print(f"[bold]{escape(str(info.path))}[/bold]", soft_wrap=True, highlight=False)
     console.print(
-        f"{document['format']}, {document['size_bytes'] / 1e6:.1f} MB, {document['duration_s']:.1f} s from "
-        f"{_when(document['start_ns'])}, {'?' if count is None else count} messages",
+        f"{info.format}, {info.size_bytes / 1e6:.1f} MB, {info.duration_s:.1f} s from "
+        f"{_when(info.start_ns)}, {'?' if count is None else count} messages",
         soft_wrap=True,
         highlight=False,
     )
@@ -196,21 +206,21 @@ def _show(document: Info) -> None:
         table.add_column(name, justify="right" if name == "messages" else "left", overflow="fold")
     uses: dict[str | None, str] = {}
     if choice is not None:
-        uses = {t["topic"]: "transforms" for t in document["topics"] if t["type"] in TF}
-        uses |= {choice["camera_topic"]: "calibration", choice["imu_topic"]: "gravity"}
-        uses |= {choice["odometry_topic"]: "odometry", choice["topic"]: f"scans ({choice['sensor']})"}
-    for topic in document["topics"]:
-        number = "?" if topic["message_count"] is None else str(topic["message_count"])
-        table.add_row(escape(topic["topic"]), escape(topic["type"]), number, uses.get(topic["topic"], ""))
+        uses = {t.topic: "transforms" for t in info.topics if t.type in TF}
+        uses |= {choice.camera_topic: "calibration", choice.imu_topic: "gravity"}
+        uses |= {choice.odometry_topic: "odometry", choice.topic: f"scans ({choice.sensor})"}
+    for topic in info.topics:
+        number = "?" if topic.message_count is None else str(topic.message_count)
+        table.add_row(escape(topic.topic), escape(topic.type), number, uses.get(topic.topic, ""))
     # As wide as the names are: a terminal wraps long lines better than a table breaks names.
     Console(width=_WIDEST).print(table)
     if choice is not None:
-        console.print(f"convert uses {escape(choice['topic'])}: {escape(choice['reason'])}", soft_wrap=True)
-        frames = f"base frame {choice['base_frame']}, scans in frame {choice['sensor_frame'] or '(unnamed)'}"
+        console.print(f"convert uses {escape(choice.topic)}: {escape(choice.reason)}", soft_wrap=True)
+        frames = f"base frame {choice.base_frame}, scans in frame {choice.sensor_frame or '(unnamed)'}"
         console.print(escape(frames), soft_wrap=True, highlight=False)
     else:
-        console.print(f"convert cannot use this log: {escape(str(document['problem']))}", soft_wrap=True)
-    for warning in document["warnings"]:
+        console.print(f"convert cannot use this log: {escape(str(info.problem))}", soft_wrap=True)
+    for warning in info.warnings:
         console.print(f"note: {escape(warning)}", soft_wrap=True, highlight=False)
 
 

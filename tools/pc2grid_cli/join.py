@@ -12,24 +12,53 @@ import typer
 
 from pc2grid.display import counted, probability
 from pc2grid.errors import ConfigError, one_line
+from pc2grid.geometry import SE2
 from pc2grid_cli import console
-from pc2grid_cli.json_schemas import ComparedSessions, DbJoin, plain
-from pc2grid_cli.options import AsJson, Database, Force
+from pc2grid_cli.options import AsJson, Database, Force, Plot
 from pc2grid_cli.output_files import check_file
-from pc2grid_cli.session_documents import joined_document
+from pc2grid_cli.session_documents import JoinedSession, OfDatabase, joined_document
 from pc2grid_cli.tables import show, table
 from signature.bend import largest_m
 from signature.database import SubmapDatabase, maintenance, open_database
+from signature.localization.answer_json import TypedDict, plain
 from signature.localization.joining.building import Joined, join_sessions
+from signature.localization.joining.join import JoinStatus
 from signature.localization.joining.pairing import SessionPair
 from signature.localization.shown.picture import draw_building
 
 if TYPE_CHECKING:
-    from pc2grid.geometry import SE2
     from signature.database.protocol import BuildingFrame
-    from signature.localization.answer_json import Pose
 
 _SAID = {"joined": "joined", "ambiguous": "ambiguous", "different": "not the same building"}
+
+
+class ComparedSessions(TypedDict):
+    """Two sessions that were compared. status: joined, ambiguous, or different: nothing says that they show
+    one building. accepted: the join counts; other pairs and labels do not contradict it. T_target_source:
+    null if the status is `different`; covariance: (3, 3) of its x, y, yaw. probability: that it is right.
+    agreement: of the walls where both know the ground, 0..1. common_m2: free ground that both know. nodes: of
+    the junction graphs, that agree on it."""
+
+    target: str
+    source: str
+    status: JoinStatus
+    accepted: bool
+    T_target_source: SE2 | None
+    covariance: list[list[float]] | None
+    probability: float
+    agreement: float
+    common_m2: float
+    nodes: int
+
+
+class DbJoin(OfDatabase):
+    """`pc2grid db join --json`. stored: false with --dry-run. sessions: those that were joined. alone: the
+    names of the others."""
+
+    stored: bool
+    pairs: list[ComparedSessions]
+    sessions: list[JoinedSession]
+    alone: list[str]
 
 
 def db_join_command(
@@ -44,9 +73,7 @@ def db_join_command(
         ),
     ] = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="only say it; nothing is stored")] = False,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", metavar="OUT.png", help="the maps of a building over each other")
-    ] = None,
+    plot: Plot = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -72,7 +99,7 @@ def db_join_command(
     if not dry_run:
         store(database, found, names)
     if json:
-        console.print_json(plain(DbJoin, _document(maintenance.shown(database), found, names, dry_run)))
+        console.print_result(plain(DbJoin, _document(maintenance.shown(database), found, names, dry_run)))
     else:
         report(found, names, dry_run=dry_run)
 
@@ -146,7 +173,6 @@ def draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
 
 def _document(where: str, found: Joined, names: list[str], dry_run: bool) -> DbJoin:
     return {
-        "schema_version": 1,
         "database": where,
         "stored": not dry_run,
         "pairs": [_compared(pair) for pair in found.pairs],
@@ -163,14 +189,10 @@ def _compared(pair: SessionPair) -> ComparedSessions:
         "source": pair.source,
         "status": join.status,
         "accepted": pair.accepted,
-        "T_target_source": _pose(join.T_target_source) if known else None,
+        "T_target_source": join.T_target_source if known else None,
         "covariance": join.covariance.tolist() if known else None,
         "probability": join.probability,
         "agreement": join.agreement,
         "common_m2": join.common_m2,
         "nodes": join.nodes,
     }
-
-
-def _pose(pose: SE2) -> Pose:
-    return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}

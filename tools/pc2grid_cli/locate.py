@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pc2grid.io import open_log
-from pc2grid.mapping.drawn_map import load_drawn_map
+from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
+from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose
 from signature.files import about_log, about_map, locate_log, open_places, query_config
 from signature.localization.answer import NO_POSES, Answer
@@ -32,15 +33,18 @@ def searched(
 ) -> Iterator[tuple[SubmapDatabase, list[str]]]:
     """A database, or a map as one, to look in; only the sessions of a building and floor if they are given.
 
-    Yields it, and what is damaged in it and left out.
+    Yields it, and what is damaged in it and left out, of which the user is warned.
     """
     with open_places(database) as opened:
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
-        yield opened, [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
+        left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
+        for damage in left_out:
+            console.warn(f"{opened.location}: damaged and left out: {damage}")
+        yield opened, left_out
 
 
-def find_log(
+def find(
     path: Path,
     database: SubmapDatabase,
     config: Config,
@@ -52,10 +56,12 @@ def find_log(
     known: KnownPose = KnownPose(),
     index: MapIndex | None = None,
 ) -> Found:
-    """Locate a recording, or the part of it that `span` names.
+    """Locate a map, or a recording, or the part of it that `span` names.
 
     see : see `signature.files.locate_log`. index : of the database, if it is prepared.
     """
+    if is_drawn_map(path):
+        return find_map(path, database, config, index)
     config = query_config(database, config)
     with open_log(path, config.read, recover=recover) as log:
         prior = known.prior(log, span)

@@ -74,23 +74,12 @@ def _say_version(wanted: bool) -> None:
 
 @app.callback()
 def options(
-    context: typer.Context,
-    verbose: Annotated[
-        int, typer.Option("--verbose", "-v", count=True, help="print more; twice: still more")
-    ] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="only warnings and errors")] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="tracebacks for errors")] = False,
     version: Annotated[
         bool,
         typer.Option("--version", callback=_say_version, is_eager=True, help="print the version and stop"),
     ] = False,
 ) -> None:
     """Recordings to a submap database, and where in it a later recording was made."""
-    # Most of them were applied when the words were read; what arrives here stood in a word such as -vvv.
-    terminal = console.of(context)
-    terminal.verbose += verbose
-    terminal.quiet = terminal.quiet or quiet
-    terminal.debug = terminal.debug or debug
 
 
 app.add_typer(

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import enum
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -20,30 +18,9 @@ Assignments = Annotated[
 ]
 
 
-class SensorName(str, enum.Enum):
-    """The three kinds of sensor."""
-
-    lidar = "lidar"
-    depth = "depth"
-    laser = "laser"
-
-
-class PresetName(str, enum.Enum):
-    """Named settings."""
-
-    default = "default"
-    paper = "paper"
-
-
-class FrameName(str, enum.Enum):
-    """Which frame poses are in."""
-
-    building = "building"
-    session = "session"
-
-
+PresetName = Literal["default", "paper"]
 Frame = Annotated[
-    FrameName,
+    Literal["building", "session"],
     typer.Option(
         "--frame", help="of poses: of the building, if sessions are joined (db join); or of the map"
     ),
@@ -85,6 +62,31 @@ Database = Annotated[str, typer.Argument(metavar=DATABASE, help="the database")]
 SearchedDatabase = Annotated[
     str, typer.Option("--database", "-d", metavar=f"{DATABASE}|MAP", help="where to look; a map is converted")
 ]
+Near = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option(
+        "--near",
+        metavar="X Y RADIUS",
+        help="it is, or starts, within RADIUS metres of X, Y of the map",
+    ),
+]
+CheckTopic = Annotated[
+    str | None,
+    typer.Option(
+        "--check-topic",
+        metavar="TOPIC",
+        help="judge the pose that the robot believes in, on /amcl_pose or /tf: fine, lost or unsure",
+    ),
+]
+KnownSession = Annotated[
+    str | None,
+    typer.Option("--session", metavar="NAME", help="whose map frame these poses are in, of several"),
+]
+TrajectoryFile = Annotated[
+    Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="poses of the base, for evo")
+]
+Plot = Annotated[Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of it")]
+Report = Annotated[Path | None, typer.Option("--report", metavar="OUT.html", help="a page to look into it")]
 Building = Annotated[
     str | None, typer.Option("--building", metavar="NAME", help="look only in sessions labelled so")
 ]
@@ -103,23 +105,19 @@ def make_config(
     imu: str | None = None,
     assume_identity: bool = False,
     points_voxel_m: float | None = None,
-    preset: PresetName = PresetName.default,
+    preset: PresetName = "default",
 ) -> Config:
     """Flags override --set, which overrides the file, which overrides the preset. Raises ConfigError."""
     from pc2grid.settings import load_settings
     from signature.config import Config
 
-    base = Config.paper() if preset is PresetName.paper else None
+    base = Config.paper() if preset == "paper" else None
     config = load_settings(Config, file, assignments or (), preset=base)
-    read = {"topic": topic, "odometry": odometry, "imu": imu, "assume_identity": assume_identity or None}
-    kept = {"points_voxel_m": points_voxel_m}
-    return _changed(config, {"read": read, "projection": kept})
-
-
-def _changed(config: Config, flags: Mapping[str, Mapping[str, object]]) -> Config:
-    """The configuration with the settings of these sections replaced; None leaves a setting as it is."""
-    sections = {}
-    for name, settings in flags.items():
-        given = {key: value for key, value in settings.items() if value is not None}
-        sections[name] = getattr(config, name).model_copy(update=given)
+    given = {"topic": topic, "odometry": odometry, "imu": imu, "assume_identity": assume_identity or None}
+    read = {name: value for name, value in given.items() if value is not None}
+    kept = {} if points_voxel_m is None else {"points_voxel_m": points_voxel_m}
+    sections = {
+        "read": config.read.model_copy(update=read),
+        "projection": config.projection.model_copy(update=kept),
+    }
     return config.model_copy(update=sections)

@@ -7,7 +7,7 @@ import math
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 import typer
@@ -19,7 +19,6 @@ from pc2grid.io.nav2_map import is_map_file
 from pc2grid.io.trajectory import write_trajectory
 from pc2grid.mapping.drawn_map import is_drawn_map
 from pc2grid.mapping.precision import PRECISION
-from pc2grid.observer import Observer
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
@@ -27,18 +26,18 @@ from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import check_log, report_check
 from pc2grid_cli.foxglove import write_answer, write_located_map
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import find_log, find_map, in_map, searched
+from pc2grid_cli.locate import find, in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file
 from pc2grid_cli.windows import Window, find_all, show, windows_of
 from signature.database.maintenance import is_database
+from signature.localization.answer_json import QueryRecording, Result, Sessions
 from signature.localization.in_building import answer_in_building
 from signature.localization.shown.picture import draw_answer, draw_answers
 from signature.localization.shown.report import Found, write_report
 
 if TYPE_CHECKING:
-    from pc2grid.model import ReadReport, Trajectory
-    from pc2grid_cli.json_schemas import Relocalize
+    from pc2grid.model import Trajectory
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame
@@ -46,7 +45,28 @@ if TYPE_CHECKING:
     from signature.localization.hypotheses import Hypothesis
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+class Searched(Sessions):
+    """Where it was looked for. left_out: damage that was not used."""
+
+    path: str
+    left_out: list[str]
+
+
+class Relocalize(Result):
+    """`pc2grid relocalize --json`. T_map_odom puts the query's own frame into the map. confidence: the
+    probability that the best hypothesis is right. hypotheses: best first. map_sigma_m: standard deviation of
+    the map itself there, relative to the rest of it; the covariance of the pose is about the walls around."""
+
+    query: QueryRecording
+    database: Searched
+    map_sigma_m: float | None
+
+
+_FILES = ("trajectory", "initialpose", "output", "plot", "report")
+"""The options that name files."""
+
+
+@dataclass(frozen=True, slots=True)
 class _Outputs:
     """What the command writes, beside the answer on stdout."""
 
@@ -59,7 +79,7 @@ class _Outputs:
 
     def check(self) -> None:
         """Raises OutputError if a file cannot be written, or exists and must not be replaced."""
-        for option in ("trajectory", "initialpose", "output", "plot", "report"):
+        for option in _FILES:
             check_file(option, getattr(self, option), self.force)
 
     def of_answer(self) -> list[Path]:
@@ -73,79 +93,66 @@ class _Outputs:
 
     def refuse(self, reason: str, hint: str, *, but: tuple[str, ...] = ()) -> None:
         """Raises ConfigError if there is any file, but for these."""
-        files = ("trajectory", "initialpose", "output", "plot", "report")
-        given = [f"--{option}" for option in files if option not in but and getattr(self, option) is not None]
+        given = [option for option in _FILES if option not in but and getattr(self, option) is not None]
         if given:
-            raise ConfigError(f"{given[0]}: {reason}", hint=hint)
+            raise ConfigError(f"--{given[0]}: {reason}", hint=hint)
+
+
+_Logs = Annotated[
+    list[Path],
+    typer.Argument(metavar="LOG|MAP...", help="recordings or maps to locate: .yaml, .pcd, .ply, a mesh"),
+]
+_NearPose = Annotated[
+    str | None,
+    typer.Option(
+        "--near-pose",
+        metavar="FILE|TOPIC",
+        help="the robot is where this pose with covariance says: /initialpose in the log, or in a file",
+    ),
+]
+_Check = Annotated[
+    tuple[float, float, float] | None,
+    typer.Option("--check", metavar="X Y YAW_DEG", help="is this pose at the last scan right?"),
+]
+_Every = Annotated[
+    float | None,
+    typer.Option(
+        "--every", metavar="S", min=0.1, help="locate a window every S seconds, as long as --duration, else S"
+    ),
+]
+_InitialPose = Annotated[
+    Path | None,
+    typer.Option("--initialpose", metavar="OUT.json", help="the pose as nav2 takes it"),
+]
+_Output = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="OUT.mcap", help="map, pose, path for Foxglove, rerun"),
+]
 
 
 def relocalize_command(
     context: typer.Context,
-    logs: Annotated[
-        list[Path],
-        typer.Argument(metavar="LOG|MAP...", help="recordings or maps to locate: .yaml, .pcd, .ply, a mesh"),
-    ],
+    logs: _Logs,
     database: options.SearchedDatabase,
     building: options.Building = None,
     floor: options.Floor = None,
-    near: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(
-            "--near", metavar="X Y RADIUS", help="the robot is within RADIUS metres of X, Y of the map"
-        ),
-    ] = None,
-    near_pose: Annotated[
-        str | None,
-        typer.Option(
-            "--near-pose",
-            metavar="FILE|TOPIC",
-            help="the robot is where this pose with covariance says: /initialpose in the log, or in a file",
-        ),
-    ] = None,
-    check: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option("--check", metavar="X Y YAW_DEG", help="is this pose at the last scan right?"),
-    ] = None,
-    check_topic: Annotated[
-        str | None,
-        typer.Option("--check-topic", metavar="TOPIC", help="the same, of the last on /amcl_pose or /tf"),
-    ] = None,
-    session: Annotated[
-        str | None,
-        typer.Option("--session", metavar="NAME", help="whose map frame these poses are in, of several"),
-    ] = None,
+    near: options.Near = None,
+    near_pose: _NearPose = None,
+    check: _Check = None,
+    check_topic: options.CheckTopic = None,
+    session: options.KnownSession = None,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
     imu: options.ImuTopic = None,
     start: options.Start = 0.0,
     duration: options.Duration = None,
-    every: Annotated[
-        float | None,
-        typer.Option(
-            "--every",
-            metavar="S",
-            min=0.1,
-            help="locate a window every S seconds, as long as --duration, else S",
-        ),
-    ] = None,
-    trajectory: Annotated[
-        Path | None, typer.Option("--trajectory", metavar="OUT.tum", help="the query's poses in the map")
-    ] = None,
-    initialpose: Annotated[
-        Path | None,
-        typer.Option("--initialpose", metavar="OUT.json", help="the pose in the form that nav2 takes"),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option("--output", "-o", metavar="OUT.mcap", help="map, pose, path for Foxglove, rerun"),
-    ] = None,
-    plot: Annotated[
-        Path | None, typer.Option("--plot", metavar="OUT.png", help="a picture of the answer")
-    ] = None,
-    report: Annotated[
-        Path | None, typer.Option("--report", metavar="OUT.html", help="a page to look into the answer")
-    ] = None,
-    frame: options.Frame = options.FrameName.building,
+    every: _Every = None,
+    trajectory: options.TrajectoryFile = None,
+    initialpose: _InitialPose = None,
+    output: _Output = None,
+    plot: options.Plot = None,
+    report: options.Report = None,
+    frame: options.Frame = "building",
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     force: options.Force = False,
@@ -163,73 +170,27 @@ def relocalize_command(
 
     Example: pc2grid relocalize tuesday.mcap --database building.submaps
     """
-    outputs = _Outputs(
-        trajectory=trajectory,
-        initialpose=initialpose,
-        output=output,
-        plot=plot,
-        report=report,
-        force=force,
-    )
+    outputs = _Outputs(trajectory, initialpose, output, plot, report, force=force)
     known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
     several = every is not None or len(logs) > 1
     _check_options(logs, database, outputs, known, several=several)
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
     )
-    span, terminal = TimeSpan(start, duration), console.of(context)
-    windows = windows_of(logs, every, span, settings, recover=recover)
-    log, observer = logs[0], terminal.observer()
+    windows = windows_of(logs, every, TimeSpan(start, duration), settings, recover=recover)
     with searched(database, building, floor) as (opened, left_out):
-        where = opened.location
-        for damage in left_out:
-            console.warn(f"{where}: damaged and left out: {damage}")
-        frames = opened.frames() if frame is options.FrameName.building else {}
+        frames = opened.frames() if frame == "building" else {}
+        told = _Told(opened, frames, left_out, strict=strict, as_json=json)
+        given: Any = {"known": known, "recover": recover, "observer": console.of(context).observer()}
         if known.is_check:
-            checked, document = check_log(
-                log,
-                opened,
-                settings,
-                known,
-                span=span,
-                recover=recover,
-                observer=observer,
-            )
-            raise typer.Exit(report_check(checked, document, as_json=json))
-        if several:
-            found_in_turn = find_all(windows, opened, settings, known, recover=recover, observer=observer)
-            code = _tell_all(found_in_turn, opened, frames, left_out, plot=plot, strict=strict, as_json=json)
-            if plot is not None:
-                terminal.note(f"wrote {plot}")
-            raise typer.Exit(code)
-        found, located = _find(
-            log,
-            opened,
-            settings,
-            span=span,
-            recover=recover,
-            observer=observer,
-            known=known,
-        )
-        # Printed first: a file that cannot be written must not cost the answer.
-        stated = answer_in_building(found.answer, frames)
-        _print(found, stated, where, left_out, map_sigma_m(found.answer, opened), as_json=json)
-        _write(outputs, opened, found, stated, located, settings)
-        for path in outputs.written(located=located is not None):
-            terminal.note(f"wrote {path}")
-        _warn_of_missing_points(found, opened)
-        _warn_of_unjoined(found.answer, opened)
-    if located is None:
-        for path in outputs.of_answer():
-            console.warn(f"{path}: not written, there is no answer to put into it")
-    for warning in found.about["warnings"]:
-        console.warn(warning)
-    _warn_of_prior(stated)
-    lossy = _warn_of_losses(log, found.report, strict) or bool(left_out)
-    if found.answer.status != "located":
-        raise typer.Exit(console.UNSURE)
-    if lossy:
-        raise typer.Exit(console.LOSSY)
+            judged = check_log(logs[0], opened, settings, span=windows[0].span, **given)
+            code = report_check(*judged, as_json=json)
+        elif several:
+            code = _tell_all(find_all(windows, opened, settings, **given), told, plot)
+        else:
+            found = find(logs[0], opened, settings, span=windows[0].span, **given)
+            code = _tell_one(found, told, outputs, settings, console.of(context))
+    raise typer.Exit(code)
 
 
 def _check_options(
@@ -241,7 +202,9 @@ def _check_options(
     if several:
         outputs.refuse("is of one query", "leave it out, or give one recording and no --every", but=("plot",))
     for log in logs:
-        _check_options_for_maps(log, outputs)
+        if is_drawn_map(log):
+            of_map = ("output", "plot", "report")
+            outputs.refuse("there is no robot in a map", "--json and --output have its pose", but=of_map)
         known.validate(is_map=is_map_file(log))
         _check_not_swapped(log, database)
     if known.is_check:
@@ -250,12 +213,98 @@ def _check_options(
             raise ConfigError("--check: judges one pose", hint="give one recording, and no --every")
 
 
-def _warn_of_losses(log: Path, report: ReadReport | None, strict: bool) -> bool:
+@dataclass(frozen=True, slots=True)
+class _Told:
+    """What of the options and of the database decides how answers are told.
+
+    frames : of the buildings that poses are in, by session. left_out : damage of the database.
+    """
+
+    database: SubmapDatabase
+    frames: Mapping[str, BuildingFrame]
+    left_out: list[str]
+    strict: bool
+    as_json: bool
+
+    def document(self, found: Found, stated: Answer) -> Relocalize:
+        """What `--json` prints. stated : the answer as it is given."""
+        sigma_m = map_sigma_m(found.answer, self.database)
+        return {
+            **stated.to_json(),
+            "query": found.about,
+            "database": {
+                "sessions": [*stated.sessions],
+                "path": self.database.location,
+                "left_out": self.left_out,
+            },
+            "map_sigma_m": None if sigma_m is None else round(sigma_m, 3),
+        }
+
+    def code(self, all_found: Sequence[Found], *, failed: bool = False) -> int:
+        """The exit code. Data that was lost is warned of. failed : a query could not be read."""
+        losses = [_warn_of_losses(found, self.strict) for found in all_found]
+        if not all_found:
+            return console.FAILED
+        if all(found.answer.status != "located" for found in all_found):
+            return console.UNSURE
+        return console.LOSSY if any(losses) or self.left_out or failed else console.OK
+
+
+def _tell_one(
+    found: Found, told: _Told, outputs: _Outputs, settings: Config, terminal: console.Console
+) -> int:
+    """Print the answer to one query, and write what shows it; returns the exit code."""
+    stated = answer_in_building(found.answer, told.frames)
+    located = in_map(found.poses, found.answer)
+    # Printed first: a file that cannot be written must not cost the answer.
+    text = as_text(stated, is_map=found.drawn is not None)
+    text += _about_map(map_sigma_m(found.answer, told.database))
+    console.print_result(told.document(found, stated) if told.as_json else text)
+    _write(outputs, told.database, found, stated, located, settings)
+    for path in outputs.written(located=located is not None):
+        terminal.note(f"wrote {path}")
+    _warn_of_missing_points(found, told.database)
+    _warn_of_unjoined(found.answer, told.database)
+    for path in outputs.of_answer() if located is None else ():
+        console.warn(f"{path}: not written, there is no answer to put into it")
+    for warning in found.about["warnings"]:
+        console.warn(warning)
+    _warn_of_prior(stated)
+    return told.code([found])
+
+
+def _tell_all(found_in_turn: Generator[tuple[Window, Found | None]], told: _Told, plot: Path | None) -> int:
+    """Print the answers to several queries, and draw them; returns the exit code.
+
+    The documents are printed one by one, the table at the end, also if the work is interrupted."""
+    rows: list[tuple[Window, Answer | None]] = []
+    all_found: list[Found] = []
+    with contextlib.ExitStack() as stack:
+        if not told.as_json:
+            stack.callback(show, rows)
+        for window, found in stack.enter_context(contextlib.closing(found_in_turn)):
+            if found is None:
+                rows.append((window, None))
+                continue
+            all_found.append(found)
+            stated = answer_in_building(found.answer, told.frames)
+            rows.append((window, stated))
+            if told.as_json:
+                console.print_result(told.document(found, stated), indent=None)
+    if plot is not None:
+        draw_answers(plot, told.database, all_found)
+    for warning in dict.fromkeys(f"{f.about['source']}: {w}" for f in all_found for w in f.about["warnings"]):
+        console.warn(warning)
+    return told.code(all_found, failed=len(all_found) < len(rows))
+
+
+def _warn_of_losses(found: Found, strict: bool) -> bool:
     """Say what of the recording was lost; whether that is to end with exit code 3."""
+    report = found.report
     if report is None:
         return False
     if report.lossy:
-        console.warn(f"{log.name}: {data_loss.sentence(report)}")
+        console.warn(f"{found.about['source']}: {data_loss.sentence(report)}")
     return data_loss.ends_with_3(report, strict)
 
 
@@ -266,42 +315,6 @@ def _check_not_swapped(log: Path, database: str) -> None:
             f"{log}: a submap database, where a recording or a map is expected",
             hint=f"are they swapped? pc2grid relocalize {database} -d {log}",
         )
-
-
-def _check_options_for_maps(log: Path, outputs: _Outputs) -> None:
-    """Raises ConfigError for options that need a robot, if the query is a map."""
-    given = {"--trajectory": outputs.trajectory, "--initialpose": outputs.initialpose}
-    for option, value in given.items():
-        if value is not None and is_drawn_map(log):
-            raise ConfigError(
-                f"{option}: there is no robot in a map", hint="--json and --output have its pose"
-            )
-
-
-def _find(
-    log: Path,
-    database: SubmapDatabase,
-    settings: Config,
-    *,
-    span: TimeSpan,
-    recover: bool,
-    observer: Observer,
-    known: KnownPose,
-) -> tuple[Found, Trajectory | None]:
-    """The answer, and the query's poses in the map."""
-    if is_drawn_map(log):
-        found = find_map(log, database, settings)
-        return found, in_map(found.poses, found.answer)
-    found = find_log(
-        log,
-        database,
-        settings,
-        span=span,
-        recover=recover,
-        observer=observer,
-        known=known,
-    )
-    return found, in_map(found.poses, found.answer)
 
 
 def _write(
@@ -357,75 +370,6 @@ def _about_map(sigma_m: float | None) -> str:
     return (
         f"\n  the map itself may be off by {sigma_m:.1f} m here (standard deviation), see `pc2grid db info`"
     )
-
-
-def _print(
-    found: Found,
-    stated: Answer,
-    where: str,
-    left_out: list[str],
-    sigma_m: float | None,
-    *,
-    as_json: bool,
-) -> None:
-    """The answer on stdout. stated : as it is given. sigma_m : of the map where the query is."""
-    if as_json:
-        console.print_json(_document(found, stated, where, left_out, sigma_m))
-    else:
-        text = as_text(stated, is_map=found.drawn is not None)
-        print(text + _about_map(sigma_m), flush=True)
-
-
-def _document(
-    found: Found, stated: Answer, where: str, left_out: list[str], sigma_m: float | None
-) -> Relocalize:
-    """What `--json` prints; see `_print`."""
-    answer = stated.to_json()
-    return {
-        **answer,
-        "query": found.about,
-        "database": {**answer["database"], "path": where, "left_out": left_out},
-        "map_sigma_m": None if sigma_m is None else round(sigma_m, 3),
-    }
-
-
-def _tell_all(
-    found_in_turn: Generator[tuple[Window, Found | None]],
-    database: SubmapDatabase,
-    frames: Mapping[str, BuildingFrame],
-    left_out: list[str],
-    *,
-    plot: Path | None,
-    strict: bool,
-    as_json: bool,
-) -> int:
-    """Print the answers to several queries, and draw them; returns the exit code.
-
-    The documents are printed one by one, the table at the end, also if the work is interrupted."""
-    told: list[tuple[Window, Answer | None]] = []
-    all_found: list[Found] = []
-    with contextlib.ExitStack() as stack:
-        if not as_json:
-            stack.callback(show, told)
-        for window, found in stack.enter_context(contextlib.closing(found_in_turn)):
-            stated = None if found is None else answer_in_building(found.answer, frames)
-            told.append((window, stated))
-            if found is not None and stated is not None:
-                all_found.append(found)
-                if as_json:
-                    sigma_m = map_sigma_m(found.answer, database)
-                    document = _document(found, stated, database.location, left_out, sigma_m)
-                    console.print_json_line(document)
-    if plot is not None:
-        draw_answers(plot, database, all_found)
-    for warning in dict.fromkeys(f"{f.about['source']}: {w}" for f in all_found for w in f.about["warnings"]):
-        console.warn(warning)
-    losses = [_warn_of_losses(Path(f.about["source"]), f.report, strict) for f in all_found]
-    if not all_found:
-        return console.FAILED
-    if all(found.answer.status != "located" for found in all_found):
-        return console.UNSURE
-    return console.LOSSY if any(losses) or left_out or len(all_found) < len(told) else console.OK
 
 
 def _warn_of_prior(answer: Answer) -> None:

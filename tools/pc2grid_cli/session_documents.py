@@ -1,19 +1,90 @@
-"""The description of a session map in the JSON documents of `convert` and `db info`."""
+"""The description of a session in the JSON documents of `convert`, `db info` and `db join`."""
 
 from __future__ import annotations
 
 import statistics
+from typing import Any
 
-from pc2grid.model import Precision, SessionMap
-from pc2grid_cli.json_schemas import Converted, JoinedSession, PrecisionSummary
+from pc2grid.geometry import SE2
+from pc2grid.model import (
+    Consistency,
+    OdometryCheck,
+    Precision,
+    ReadReport,
+    SessionMap,
+    ThreeDigits,
+    UncertainStretch,
+)
 from signature.bend import largest_m
-from signature.database import Provenance
-from signature.database.protocol import BuildingFrame
+from signature.database import Provenance, SessionInfo
+from signature.database.protocol import BuildingFrame, Covariance
+from signature.localization.answer_json import Labelled, TypedDict
+
+
+class OfDatabase(TypedDict):
+    """A document about a database: its path, or its URL without a password."""
+
+    database: str
+
+
+class PrecisionSummary(TypedDict):
+    """How exactly the places of a map lie to each other: standard deviations of a position in the least
+    certain direction. median_m: half of the places are known better. worst_m: the largest. loose: stretches
+    where it is too large to rely on, the least certain first."""
+
+    median_m: ThreeDigits
+    worst_m: ThreeDigits
+    loose: list[UncertainStretch]
+
+
+class Mapped(Labelled):
+    """A session. digest: sha256 of what it was made from, hex. area_m2: free space. consistency, odometry,
+    precision: null for an imported map."""
+
+    source: str
+    digest: str
+    sensor: str
+    scans: int
+    path_m: float
+    duration_s: float
+    area_m2: float
+    submaps: int
+    consistency: Consistency | None
+    odometry: OdometryCheck | None
+    precision: PrecisionSummary | None
+
+
+class Converted(Mapped):
+    """What became of one input."""
+
+    session: str
+    report: ReadReport
+
+
+class StoredInfo(Mapped):
+    """A session of a database, with the versions and settings that made it."""
+
+    name: str
+    resolution_m: float
+    lossy: bool
+    warnings: list[str]
+    versions: dict[str, str]
+    config: dict[str, Any]
+
+
+class JoinedSession(TypedDict):
+    """Where a session lies in its building. frame: name of the building's frame. bent_m: how far the map is
+    bent there at most, where another session straightens it."""
+
+    session: str
+    frame: str
+    T_building_session: SE2
+    covariance: Covariance
+    bent_m: float
 
 
 def session_document(session: SessionMap, origin: Provenance) -> Converted:
     """The session made of one input, as the JSON document describes it."""
-    report = session.report
     return {
         "session": session.session,
         "building": origin.label.building,
@@ -29,25 +100,42 @@ def session_document(session: SessionMap, origin: Provenance) -> Converted:
         "consistency": session.consistency,
         "odometry": session.odometry,
         "precision": precision_summary(session.precision),
-        "report": {
-            "scans_read": report.scans_read,
-            "points_dropped": report.points_dropped,
-            "scans_skipped": report.scans_skipped,
-            "bytes_lost": report.bytes_lost,
-            "warnings": list(report.warnings),
-            "lossy": report.lossy,
-        },
+        "report": session.report,
+    }
+
+
+def stored_document(s: SessionInfo) -> StoredInfo:
+    """A session of a database, as the JSON document describes it."""
+    return {
+        "name": s.name,
+        "sensor": s.sensor,
+        "building": s.provenance.label.building,
+        "floor": s.provenance.label.floor,
+        "source": s.provenance.source,
+        "digest": s.digest,
+        "submaps": s.submaps,
+        "resolution_m": s.resolution_m,
+        "area_m2": s.area_m2,
+        "path_m": s.path_m,
+        "duration_s": s.duration_s,
+        "scans": s.scans,
+        "lossy": s.lossy,
+        "consistency": s.consistency,
+        "odometry": s.odometry,
+        "precision": precision_summary(s.precision),
+        "warnings": list(s.warnings),
+        "versions": dict(s.provenance.versions),
+        "config": s.provenance.config.model_dump(mode="json"),
     }
 
 
 def joined_document(session: str, frame: BuildingFrame) -> JoinedSession:
     """Where a session lies in its building, as `convert` and `db join` describe it."""
-    T = frame.T_building_session
     return {
         "session": session,
         "frame": frame.name,
-        "T_building_session": {"x": T.x, "y": T.y, "yaw": T.yaw},
-        "covariance": [list(row) for row in frame.covariance],
+        "T_building_session": frame.T_building_session,
+        "covariance": frame.covariance,
         "bent_m": round(largest_m(frame.bend), 3),
     }
 

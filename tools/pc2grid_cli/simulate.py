@@ -10,12 +10,12 @@ from pydantic import ValidationError
 
 from pc2grid.errors import ConfigError
 from pc2grid.io.atomic import require_writable
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.simulate import Building, SimulatedSession, SimulationConfig, load_building, simulate_session
 from pc2grid.simulate.config import OdometryConfig
 from pc2grid_cli import console
-from pc2grid_cli.json_schemas import Simulate
-from pc2grid_cli.options import AsJson, Force, SensorName
+from pc2grid_cli.options import AsJson, Force
+from signature.localization.answer_json import plain
 
 
 def simulate_command(
@@ -28,7 +28,7 @@ def simulate_command(
             " and what to write",
         ),
     ],
-    sensor: Annotated[SensorName, typer.Option(help="what the robot carries")],
+    sensor: Annotated[SensorKind, typer.Option(help="what the robot carries")],
     length: Annotated[float, typer.Option(min=0.1, metavar="M", help="metres to drive")] = 40.0,
     seed: Annotated[int, typer.Option(min=0, help="route, clutter, noise and odometry")] = 0,
     clutter: Annotated[int, typer.Option(min=0, help="movable objects in the way")] = 30,
@@ -57,17 +57,17 @@ def simulate_command(
         building_seed=building_seed,
         odometry=OdometryConfig(enabled=not no_odometry),
     )
-    with console.of(context).progress(f"simulate {sensor.value}") as update:
+    with console.of(context).progress(f"simulate {sensor}") as update:
         made = simulate_session(
-            files[-1], sensor=sensor.value, grid=grid, config=config, progress=update, overwrite=force
+            files[-1], sensor=sensor, grid=grid, config=config, progress=update, overwrite=force
         )
     if made.clutter < clutter:
         console.warn(f"only {made.clutter} of {clutter} pieces of clutter could be placed")
-    if json:
-        console.print_json(_document(made))
-        return
-    print(f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s")
-    print(f"{made.truth_path}: {made.scans} true poses of base_link in the map frame")
+    text = (
+        f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s\n"
+        f"{made.truth_path}: {made.scans} true poses of base_link in the map frame"
+    )
+    console.print_result(plain(SimulatedSession, made) if json else text)
 
 
 def _building(files: list[Path], force: bool) -> OccupancyGrid | Building | None:
@@ -88,16 +88,3 @@ def _config(**given: Any) -> SimulationConfig:
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error
-
-
-def _document(made: SimulatedSession) -> Simulate:
-    return {
-        "schema_version": 1,
-        "recording": str(made.path),
-        "truth": str(made.truth_path),
-        "sensor": made.sensor,
-        "scans": made.scans,
-        "duration_s": made.duration_s,
-        "length_m": made.length_m,
-        "clutter": made.clutter,
-    }

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 
 from pc2grid.errors import DatabaseError, OutputError, Pc2GridError
 from pc2grid.model import is_part_of
 from pc2grid_cli.output_files import check_database_name
-from signature.config import Config
 from signature.conversion_jobs import Job
 from signature.database import Provenance, maintenance, open_database
 from signature.database.postgres.server import is_url
@@ -73,52 +73,36 @@ def _refuse_others(
 
 
 def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
-    """How a stored session differs from the one that would be made, as the end of a sentence; empty: not.
+    """How a stored session differs from the one that would be made; empty: none does."""
+    known = [(present[job.name], job) for job in jobs if job.name in present]
+    every = (_differences(was, job, alone=len(jobs) == 1) for was, job in known)
+    return next(itertools.chain.from_iterable(every), "")
 
-    The content of the input is compared only if there is one input; of several, each job compares its own.
+
+def _differences(was: Provenance, job: Job, *, alone: bool) -> Iterator[str]:
+    """How a stored session differs from the one that would be made, each as the end of a sentence.
+
+    alone : there is no other input; only then its content is compared, of several each job compares its own.
     """
-    for job in jobs:
-        if job.name in present:
-            was = present[job.name]
-            difference = _made_otherwise(was, job)
-            if not difference and (was.source != job.path.name or (len(jobs) == 1 and _changed(was, job))):
-                difference = f", {job.name!r} made from a file {was.source!r} with other content"
-            if difference:
-                return difference
-    return ""
-
-
-def _made_otherwise(was: Provenance, job: Job) -> str:
-    """How a stored session differs from a job but for the input, as the end of a sentence; empty: not."""
     wanted = job.made_from(was.digest)
     if was.label != wanted.label:
-        return (
+        yield (
             f"; its session {job.name!r} has the label {str(was.label)!r}, this one would have"
             f" {str(wanted.label)!r} (--building, --floor)"
         )
     if (was.start_s, was.duration_s) != (wanted.start_s, wanted.duration_s):
-        return f", {job.name!r} made from another part of the recording (--start, --duration)"
-    made_with = [*_other_settings(was.config, job.config), *_other_versions(was.versions, wanted.versions)]
-    return f", {job.name!r} made with {made_with[0]}" if made_with else ""
-
-
-def _other_settings(was: Config, wanted: Config) -> list[str]:
-    """The settings that differ."""
-    return [
-        f"{section}.{key} = {old!r}, not {value!r}"
-        for section, settings in wanted
-        for key, value in settings
-        if (old := getattr(getattr(was, section), key)) != value
-    ]
-
-
-def _other_versions(was: Mapping[str, str], wanted: Mapping[str, str]) -> list[str]:
-    """The libraries that differ, in alphabetical order."""
-    return [
-        f"{library} {was.get(library)}, not {wanted.get(library)}"
-        for library in sorted({*was, *wanted})
-        if was.get(library) != wanted.get(library)
-    ]
+        yield f", {job.name!r} made from another part of the recording (--start, --duration)"
+    for section, settings in job.config:
+        for key, value in settings:
+            old = getattr(getattr(was.config, section), key)
+            if old != value:
+                yield f", {job.name!r} made with {section}.{key} = {old!r}, not {value!r}"
+    for library in sorted({*was.versions, *wanted.versions}):
+        versions = was.versions.get(library), wanted.versions.get(library)
+        if versions[0] != versions[1]:
+            yield f", {job.name!r} made with {library} {versions[0]}, not {versions[1]}"
+    if was.source != job.path.name or (alone and _changed(was, job)):
+        yield f", {job.name!r} made from a file {was.source!r} with other content"
 
 
 def _changed(was: Provenance, job: Job) -> bool:

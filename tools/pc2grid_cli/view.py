@@ -22,7 +22,7 @@ from pc2grid.pipeline import follow
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import find_log, searched
+from pc2grid_cli.locate import find, searched
 from pc2grid_cli.view_events import Events, Progress
 from pc2grid_cli.view_server import Cancelled, Options, ViewServer
 from signature.files import query_config
@@ -77,11 +77,9 @@ def view_command(
     )
     terminal = console.of(context)
     with (
-        searched(database, building, floor) as (opened, damaged),
+        searched(database, building, floor) as (opened, _),
         tempfile.TemporaryDirectory(prefix="pc2grid-view-") as folder,
     ):
-        for damage in damaged:
-            console.warn(f"{opened.location}: damaged and left out: {damage}")
         locator = Locator(opened, settings)
         try:
             server = ViewServer(
@@ -142,7 +140,7 @@ class Locator:
 
         try:
             known = KnownPose(near=_near(options.get("near")), session=options.get("session"))
-            found = find_log(
+            found = find(
                 path,
                 self._database,
                 self._settings,

@@ -302,7 +302,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _receive(self, path: Path, size: int) -> None:
         with path.open("wb", buffering=0) as file:
             while size:
-                self._stop_if_stopping()
+                if self.server.stopping.is_set():
+                    raise Cancelled
                 try:
                     block = self.rfile.read(min(size, _BLOCK_BYTES))
                 except (ConnectionError, TimeoutError):
@@ -317,10 +318,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                         hint="set TMPDIR to a larger disk, or use pc2grid relocalize, which needs no copy",
                     ) from error
                 size -= len(block)
-
-    def _stop_if_stopping(self) -> None:
-        if self.server.stopping.is_set():
-            raise Cancelled
 
 
 def _refusal(status: HTTPStatus, error: str, hint: str | None = None) -> tuple[HTTPStatus, Any]:

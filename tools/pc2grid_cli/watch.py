@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import enum
 import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, TypeVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 import typer
 
@@ -25,10 +24,19 @@ from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import as_text as check_as_text
 from pc2grid_cli.check_pose import live_document
-from pc2grid_cli.followed import followed
+from pc2grid_cli.followed import Followed, Live, followed, live
 from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import searched
-from signature.localization.answer_json import in_space_document
+from signature.localization.answer_json import (
+    Labelled,
+    PoseInSpace,
+    StampedPose,
+    Status,
+    in_space_document,
+    plain,
+    stamped_pose,
+)
+from signature.localization.belief import State
 from signature.localization.follower import Follower
 from signature.localization.in_building import answer_in_building
 from signature.localization.joining.building_map import map_of
@@ -38,8 +46,6 @@ from signature.localization.pose_check import PoseCheck, PoseWatch
 
 if TYPE_CHECKING:
     from pc2grid.io.live.nav2 import Outlet
-    from pc2grid_cli.followed import Followed
-    from pc2grid_cli.json_schemas import Watch
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame, SessionInfo
@@ -47,82 +53,96 @@ if TYPE_CHECKING:
     from signature.localization.prior import Prior
 
 
+class WatchedMap(Labelled):
+    """The map that a pose is in: its session, and the sha256 of what the session was made from, hex."""
+
+    database: str
+    session: str
+    digest: str
+
+
+class Watch(Live):
+    """A line of `pc2grid watch --json`: what one search of the database said. state: searching (not located
+    yet), located, doubtful (certain neither where it was nor elsewhere), lost, recovered (located elsewhere
+    or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of
+    the robot's own odometry frame. frame: of the building, in which the pose is; null: the map frame of the
+    session. in_space: null if the map or the scans have no points. confidence: the probability that the best
+    place is right. published: topics on which it was said."""
+
+    state: State
+    status: Status
+    stamp_ns: int
+    path_m: float
+    map: WatchedMap | None
+    frame: str | None
+    pose: StampedPose | None
+    T_map_odom: SE2 | None
+    in_space: PoseInSpace | None
+    confidence: float
+    published: list[str]
+
+
 EstimateT = TypeVar("EstimateT")
 
 
-class Publish(str, enum.Enum):
-    """What the robot is told."""
-
-    none = "none"
-    initialpose = "initialpose"
-    tf = "tf"
+Publish = Literal["none", "initialpose", "tf"]
+"""What the robot is told."""
+_Source = Annotated[
+    str,
+    typer.Argument(
+        metavar="ws://ROBOT:8765|RECORDING",
+        help="a robot with foxglove_bridge, or a finished recording, of which every scan is used",
+    ),
+]
+_Keep = Annotated[
+    bool, typer.Option("--keep", help="go on when it is located, and say when it is somewhere else")
+]
+_Publish = Annotated[
+    Publish,
+    typer.Option(
+        "--publish",
+        help="tell the robot: /initialpose when it is located; or the transform map -> odom, with --keep",
+    ),
+]
+_PublishMap = Annotated[bool, typer.Option("--publish-map", help="also /map, the map in which it is located")]
+_MapFrame = Annotated[
+    str, typer.Option("--map-frame", metavar="FRAME", help="the frame of what is published")
+]
+_RealTime = Annotated[
+    bool,
+    typer.Option(
+        "--real-time", help="replay the recording at its own pace; scans may be dropped, as of a robot"
+    ),
+]
+_Timeout = Annotated[
+    float | None, typer.Option("--timeout", min=0.0, metavar="S", help="give up after so many seconds")
+]
+_AsJson = Annotated[bool, typer.Option("--json", help="a JSON document on each line, one a search")]
 
 
 def watch_command(
     context: typer.Context,
-    source: Annotated[
-        str,
-        typer.Argument(
-            metavar="ws://ROBOT:8765|RECORDING",
-            help="a robot with foxglove_bridge, or a finished recording, of which every scan is used",
-        ),
-    ],
+    source: _Source,
     database: options.SearchedDatabase,
     building: options.Building = None,
     floor: options.Floor = None,
-    near: Annotated[
-        tuple[float, float, float] | None,
-        typer.Option(
-            "--near",
-            metavar="X Y RADIUS",
-            help="at the beginning, it is within RADIUS metres of X, Y of the map",
-        ),
-    ] = None,
-    check_topic: Annotated[
-        str | None,
-        typer.Option(
-            "--check-topic",
-            metavar="TOPIC",
-            help="judge the pose that the robot believes in, such as /amcl_pose or /tf: fine, lost or unsure",
-        ),
-    ] = None,
-    session: Annotated[
-        str | None,
-        typer.Option("--session", metavar="NAME", help="whose map frame that or --near is in, if several"),
-    ] = None,
-    keep: Annotated[
-        bool, typer.Option("--keep", help="go on when it is located, and say when it is somewhere else")
-    ] = False,
-    publish: Annotated[
-        Publish,
-        typer.Option(
-            "--publish",
-            help="tell the robot: /initialpose when it is located; or the transform map -> odom, with --keep",
-        ),
-    ] = Publish.none,
-    publish_map: Annotated[
-        bool, typer.Option("--publish-map", help="also /map, the map in which it is located")
-    ] = False,
-    map_frame: Annotated[
-        str, typer.Option("--map-frame", metavar="FRAME", help="the frame of what is published")
-    ] = "map",
-    frame: options.Frame = options.FrameName.building,
-    real_time: Annotated[
-        bool,
-        typer.Option(
-            "--real-time", help="replay the recording at its own pace; scans may be dropped, as of a robot"
-        ),
-    ] = False,
-    timeout: Annotated[
-        float | None, typer.Option("--timeout", min=0.0, metavar="S", help="give up after so many seconds")
-    ] = None,
+    near: options.Near = None,
+    check_topic: options.CheckTopic = None,
+    session: options.KnownSession = None,
+    keep: _Keep = False,
+    publish: _Publish = "none",
+    publish_map: _PublishMap = False,
+    map_frame: _MapFrame = "map",
+    frame: options.Frame = "building",
+    real_time: _RealTime = False,
+    timeout: _Timeout = None,
     topic: options.Topic = None,
     odometry: options.OdometryTopic = None,
     imu: options.ImuTopic = None,
     config: options.ConfigFile = None,
     set_: options.Assignments = None,
     assume_identity: options.AssumeIdentity = False,
-    json: Annotated[bool, typer.Option("--json", help="a JSON document on each line, one a search")] = False,
+    json: _AsJson = False,
 ) -> None:
     """Find where a running robot is, while it drives, or was while it was recorded. Exit code 4: it was not
     located.
@@ -138,29 +158,32 @@ def watch_command(
     )
     known = KnownPose(near=near, check_topic=check_topic, session=session)
     prior = known.at_start()
-    publishes = publish is not Publish.none or publish_map
-    if publishes and check_topic is not None:
-        raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
-    if publishes and not is_robot(source):
-        raise ConfigError(f"--publish: {source} takes no messages", hint="ws://ROBOT:8765 does")
+    if publish != "none" or publish_map:
+        _check_publishes(source, check_topic)
     terminal = console.of(context)
     end_s = math.inf if timeout is None else time.monotonic() + timeout
     with (
-        searched(database, building, floor) as (opened, damaged),
+        searched(database, building, floor) as (opened, _),
         followed(source, settings.read, real_time=real_time) as drive,
     ):
-        for damage in damaged:
-            console.warn(f"{opened.location}: damaged and left out: {damage}")
         following = _Following(drive, opened, settings, end_s, terminal)
         if check_topic is not None:
             good = _check(following, check_topic, session, as_json=json)
         else:
-            frames = opened.frames() if frame is options.FrameName.building else {}
+            frames = opened.frames() if frame == "building" else {}
             with _Robot.of(drive, opened, publish, publish_map, map_frame, frames) as robot:
-                good = _search(following, robot, prior, keep or publish is Publish.tf, as_json=json)
+                good = _search(following, robot, prior, keep or publish == "tf", as_json=json)
         _summarize(drive, terminal)
     if not good:
         raise typer.Exit(console.UNSURE)
+
+
+def _check_publishes(source: str, check_topic: str | None) -> None:
+    """Raises ConfigError if nothing can be published."""
+    if check_topic is not None:
+        raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
+    if not is_robot(source):
+        raise ConfigError(f"--publish: {source} takes no messages", hint="ws://ROBOT:8765 does")
 
 
 @dataclass(frozen=True)
@@ -226,7 +249,9 @@ def _search(
         def use(estimate: Estimate) -> bool:
             nonlocal located
             estimate = replace(estimate, answer=answer_in_building(estimate.answer, robot.frames))
-            _print(estimate, drive, robot, robot.tell(estimate, follower.lock), as_json=as_json)
+            published = robot.tell(estimate, follower.lock)
+            document = _document(estimate, drive, robot, published)
+            console.print_result(document if as_json else as_text(estimate, published), indent=None)
             located = estimate.answer.status == "located"
             return located and not forever
 
@@ -246,10 +271,8 @@ def _check(following: _Following, topic: str, session: str | None, *, as_json: b
         def use(checked: PoseCheck) -> bool:
             nonlocal fine
             fine = checked.status == "fine"
-            if as_json:
-                console.print_json_line(live_document(checked, drive, following.database.location))
-            else:
-                print(check_as_text(checked), flush=True)
+            document = live_document(checked, drive, following.database.location)
+            console.print_result(document if as_json else check_as_text(checked), indent=None)
             return False
 
         following.run(follower, use)
@@ -329,7 +352,7 @@ class _Robot:
             frames=frames,
             resets=ResetPolicy(),
         )
-        topics = [f"/{publish.value}"] if publish is not Publish.none else []
+        topics = [f"/{publish}"] if publish != "none" else []
         topics += ["/map"] if publish_map else []
         if live is None or not topics:
             yield robot
@@ -337,6 +360,18 @@ class _Robot:
         with Nav2Publisher(cast("Outlet", live.feed), map_frame) as robot.publisher:
             robot.publisher.announce(*topics)
             yield robot
+
+    def about_map(self, session: str) -> WatchedMap:
+        """The map of a session, as a document says it."""
+        info = self.sessions[session]
+        label = info.provenance.label
+        return {
+            "database": self.database.location,
+            "session": session,
+            "building": label.building,
+            "floor": label.floor,
+            "digest": info.digest,
+        }
 
     def tell(self, estimate: Estimate, lock: threading.Lock) -> list[str]:
         """Publish what follows from an estimate; returns the topics. lock : is held to read the database."""
@@ -348,28 +383,38 @@ class _Robot:
             publisher.stop_tf()
         if session is None:
             return []
-        told = []
-        if self.publish_map and session != self.map_session:
-            self.map_session = session
-            with lock:
-                grid = map_of(self.database, session, self.frames)
-            publisher.map(estimate.registered.scan.stamp_ns, grid)
-            told.append("/map")
+        return [
+            *self._tell_map(publisher, estimate, session, lock),
+            *self._tell_pose(publisher, live, estimate),
+        ]
+
+    def _tell_map(
+        self, publisher: Nav2Publisher, estimate: Estimate, session: str, lock: threading.Lock
+    ) -> list[str]:
+        if not self.publish_map or session == self.map_session:
+            return []
+        self.map_session = session
+        with lock:
+            grid = map_of(self.database, session, self.frames)
+        publisher.map(estimate.registered.scan.stamp_ns, grid)
+        return ["/map"]
+
+    def _tell_pose(self, publisher: Nav2Publisher, live: LiveLog, estimate: Estimate) -> list[str]:
         self.pose_is_due = self.pose_is_due or estimate.state == "recovered"
-        if self.publish is Publish.initialpose and self.pose_is_due and self.resets.allows():
+        if self.publish == "initialpose" and self.pose_is_due and self.resets.allows():
             self.pose_is_due = False
             assert estimate.answer.covariance is not None
             stamp_ns, T_map_base = _now(estimate, live)
             publisher.initialpose(stamp_ns, T_map_base, estimate.answer.covariance)
-            told.append("/initialpose")
-        elif self.publish is Publish.tf:
-            T_map_odom, odom_frame = estimate.T_map_odom, live.odometry_frame
-            if T_map_odom is None or odom_frame is None:
-                console.warn("--publish tf: the robot has no odometry; nothing is published")
-                return told
-            publisher.start_tf(odom_frame, T_map_odom, live.now_ns)
-            told.append("/tf")
-        return told
+            return ["/initialpose"]
+        if self.publish != "tf":
+            return []
+        T_map_odom, odom_frame = estimate.T_map_odom, live.odometry_frame
+        if T_map_odom is None or odom_frame is None:
+            console.warn("--publish tf: the robot has no odometry; nothing is published")
+            return []
+        publisher.start_tf(odom_frame, T_map_odom, live.now_ns)
+        return ["/tf"]
 
 
 def _now(estimate: Estimate, live: LiveLog) -> tuple[int, SE2]:
@@ -402,16 +447,6 @@ def _summarize(drive: Followed, terminal: console.Console) -> None:
         )
 
 
-def _print(
-    estimate: Estimate, drive: Followed, robot: _Robot, published: list[str], *, as_json: bool
-) -> None:
-    """An estimate on stdout."""
-    if as_json:
-        console.print_json_line(_document(estimate, drive, robot, published))
-    else:
-        print(as_text(estimate, published), flush=True)
-
-
 def as_text(estimate: Estimate, published: list[str]) -> str:
     """An estimate in one line."""
     answer = estimate.answer
@@ -428,47 +463,20 @@ def as_text(estimate: Estimate, published: list[str]) -> str:
     )
 
 
-def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: list[str]) -> Watch:
-    answer, T_map_odom, counts = estimate.answer, estimate.T_map_odom, drive.counts
-    session, pose = answer.session, answer.T_map_base
+def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: list[str]) -> Any:
+    answer, session = estimate.answer, estimate.answer.session
     document: Watch = {
-        "schema_version": 1,
         "state": estimate.state,
         "status": answer.status,
         "stamp_ns": answer.stamp_ns,
         "path_m": answer.path_m,
-        "map": None,
-        "frame": None,
-        "pose": None,
-        "T_map_odom": None,
+        "map": None if session is None else robot.about_map(session),
+        "frame": robot.frames[session].name if session and session in robot.frames else None,
+        "pose": stamped_pose(answer),
+        "T_map_odom": estimate.T_map_odom,
         "in_space": in_space_document(answer),
         "confidence": answer.confidence,
         "published": published,
-        "scans": drive.report().scans_read,
-        "dropped": counts.dropped,
-        "reconnected": counts.reconnected,
-        "lag_s": drive.lag_s,
-        "elapsed_s": estimate.elapsed_s,
+        **live(drive, estimate.elapsed_s),
     }
-    if session is not None and pose is not None and answer.covariance is not None:
-        info = robot.sessions[session]
-        label = info.provenance.label
-        document["frame"] = robot.frames[session].name if session in robot.frames else None
-        document["map"] = {
-            "database": robot.database.location,
-            "session": session,
-            "building": label.building,
-            "floor": label.floor,
-            "digest": info.digest,
-        }
-        document["pose"] = {
-            "stamp_ns": answer.stamp_ns,
-            "x": float(pose.x),
-            "y": float(pose.y),
-            "yaw": float(pose.yaw),
-            "covariance": answer.covariance.tolist(),
-        }
-    if T_map_odom is not None:
-        x, y, yaw = float(T_map_odom.x), float(T_map_odom.y), float(T_map_odom.yaw)
-        document["T_map_odom"] = {"x": x, "y": y, "yaw": yaw}
-    return document
+    return plain(Watch, document)

@@ -19,7 +19,7 @@ from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import find_log, find_map
+from pc2grid_cli.locate import find
 from signature.files import query_config
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.report import Found
@@ -91,19 +91,16 @@ def find_all(
         for number, window in enumerate(windows):
             found = None
             try:
-                if is_drawn_map(window.path):
-                    found = find_map(window.path, database, config, index)
-                else:
-                    found = find_log(
-                        window.path,
-                        database,
-                        config,
-                        span=window.span,
-                        recover=recover,
-                        observer=_Part(observer, number, len(windows)),
-                        known=known,
-                        index=index,
-                    )
+                found = find(
+                    window.path,
+                    database,
+                    config,
+                    span=window.span,
+                    recover=recover,
+                    observer=_Part(observer, number, len(windows)),
+                    known=known,
+                    index=index,
+                )
             except LogError as error:
                 console.warn(f"{window}: {error.message}")
             observer.on_progress((number + 1) / len(windows))
