@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from pc2grid.model import OCCUPIED, OccupancyGrid
-from pc2grid_lab.worlds import WorldConfig, change_plan, find_doorways, prepare_session
+from pc2grid_lab.worlds import WorldConfig, change_plan, prepare_session
 from tests.helpers.simulated_drives import office, plan
 
 
@@ -17,23 +15,6 @@ def with_block() -> OccupancyGrid:
     cells = grid.cells.copy()
     cells[54:66, 72:88] = OCCUPIED
     return OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0))
-
-
-def test_doorways_are_found() -> None:
-    doorways = find_doorways(office())
-    # The gaps in the walls of the corridor, each 1 m wide.
-    gaps = [(3.5, 6.0), (9.5, 6.0), (16.5, 6.0), (6.5, 8.0), (13.5, 8.0)]
-    middles = [np.mean((d.a_m, d.b_m), axis=0) for d in doorways]
-    for gap in gaps:
-        assert min(np.hypot(*(m - gap)) for m in middles) < 0.2
-    assert all(0.6 <= math.dist(d.a_m, d.b_m) <= 1.3 for d in doorways)
-    assert find_doorways(plan(8.0, 6.0, [])) == ()
-
-
-def test_nothing_changes_unless_asked_for() -> None:
-    grid = office()
-    same, added = change_plan(grid, WorldConfig())
-    assert same is grid and added == ()
 
 
 def test_doors_differ_from_session_to_session_and_the_robot_drives_through_none() -> None:

@@ -100,6 +100,7 @@ def compare(data: Path, out: Path, *options: str) -> Any:
     return done
 
 
+@pytest.mark.nightly  # the tests below run parts of it
 @pytest.mark.usefixtures("small")
 def test_a_small_run(data: Path, tmp_path: Path) -> None:
     first = compare(data, tmp_path)

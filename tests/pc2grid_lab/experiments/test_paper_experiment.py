@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.metrics import precision_recall_curve
 
-from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
+from pc2grid.model import FREE, OccupancyGrid
 from pc2grid.submaps.partition import submap_at
 from pc2grid_lab.baselines import make_methods
 from pc2grid_lab.experiments.noise import NOISE_LEVELS, Noise, add_noise
@@ -17,10 +17,8 @@ from pc2grid_lab.experiments.paper_experiment import (
     draw_queries,
     evaluate,
     precision_recall,
-    rotated_submap,
 )
-from pc2grid_lab.experiments.paper_task import halved
-from tests.helpers.rooms import canvas, cross, disc, grid_of, l_shape, random_rooms, rectangle, submap_of
+from tests.helpers.rooms import canvas, cross, disc, grid_of, l_shape, rectangle, submap_of
 
 SILENT = NOISE_LEVELS[0]
 
@@ -41,12 +39,6 @@ def test_precision_and_recall_by_hand() -> None:
     assert curve.auc == pytest.approx(2 / 3 + (2 / 3 + 3 / 4) / 2 / 3)
     assert curve.recall_at_90 == pytest.approx(2 / 3)
     assert curve.f1 == pytest.approx(2 * 0.75 / 1.75)
-
-
-def test_equal_similarities_pass_together() -> None:
-    curve = precision_recall(np.array([1.0, 1.0, 1.0]), np.array([True, False, False]))
-    assert curve.recall.tolist() == [1.0] and curve.precision.tolist() == pytest.approx([1 / 3])
-    assert curve.recall_at_90 == 0.0
 
 
 def test_nothing_true_has_no_area() -> None:
@@ -80,35 +72,9 @@ def test_queries_lie_near_centres_on_free_cells_and_repeat() -> None:
     assert other_seed.center_m != queries[0].center_m
 
 
-def test_noise_changes_the_cells_but_not_the_place() -> None:
-    experiment = Experiment(queries=5)
-    still = list(draw_queries(floor(), centers(), 8.0, experiment, SILENT))
-    noisy = list(draw_queries(floor(), centers(), 8.0, experiment, NOISE_LEVELS[2]))
-    for a, b in zip(still, noisy, strict=True):
-        assert a.center_m == b.center_m
-        assert (b.grid.occupied & ~a.grid.occupied).sum() > 500
-        assert not (a.grid.occupied & ~b.grid.occupied).any()
-
-
 def test_a_plan_without_a_free_place_is_refused() -> None:
     with pytest.raises(ValueError, match="no free cell"):
         next(draw_queries(grid_of(canvas()), np.zeros((1, 2)), 8.0, Experiment(), SILENT))
-
-
-def test_a_query_that_is_not_turned_is_the_submap() -> None:
-    grid = grid_of(random_rooms(2))
-    assert np.array_equal(
-        rotated_submap(grid, (0.0, 0.0), 5.0, 0.0).grid.cells, submap_at(grid, (0.0, 0.0), 5.0).grid.cells
-    )
-
-
-def test_a_quarter_turn_turns_the_other_way() -> None:
-    # Someone who looks along the map's y axis sees what lies at +y ahead of him, at +x.
-    cells = np.full((321, 321), FREE, np.int8)
-    cells[240, 160] = OCCUPIED  # 4 m at +y
-    query = rotated_submap(grid_of(cells), (0.0, 0.0), 8.0, np.pi / 2)
-    assert np.argwhere(query.grid.occupied).tolist() == [[160, 240]]
-    assert query.grid.to_point(np.array([[160, 240]])) == pytest.approx(np.array([[4.0, 0.0]]), abs=1e-6)
 
 
 def test_noise_has_the_given_counts_and_places() -> None:
@@ -124,16 +90,6 @@ def test_noise_has_the_given_counts_and_places() -> None:
     reach = np.linalg.norm(added[:, None] - walls[None], axis=2).min(axis=1) * 0.05
     assert 0 < reach.max() < 0.6
     assert 100 < len(added) <= 300
-
-
-def test_noise_stays_inside_the_disc_and_needs_something_to_stand_on() -> None:
-    full = submap_of(np.full((321, 321), FREE, np.int8))
-    noisy = add_noise(full, Noise(boundary=50, freespace=200), np.random.default_rng(1))
-    assert np.array_equal(noisy.grid.cells == -1, full.grid.cells == -1)
-    empty = submap_of(canvas())
-    assert np.array_equal(
-        add_noise(empty, NOISE_LEVELS[2], np.random.default_rng(1)).grid.cells, empty.grid.cells
-    )
 
 
 def test_the_paper_method_finds_rooms_that_differ() -> None:
@@ -160,12 +116,3 @@ def test_a_match_elsewhere_is_false() -> None:
     assert outcome.correct.mean() == pytest.approx(0.25, abs=0.12)
     with pytest.raises(ValueError, match="without submaps"):
         evaluate({"stubborn": Stubborn()}, grid, [], Experiment(queries=1), SILENT)
-
-
-def test_halving_keeps_walls() -> None:
-    cells = np.full((6, 6), -1, np.int8)
-    cells[0:4, 0:4] = 0
-    cells[3, 2] = 100
-    found = halved(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(1.0, 2.0)))
-    assert found.cells.tolist() == [[0, 0, -1], [0, 100, -1], [-1, -1, -1]]
-    assert found.resolution_m == 0.05

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -14,14 +13,9 @@ from pc2grid.io.nav2_map import save_map
 from pc2grid_cli.main import app
 from pc2grid_lab.compare import sensors
 from pc2grid_lab.experiments import sensor_matrix
-from pc2grid_lab.experiments.trial import matrix, reliability
+from pc2grid_lab.experiments.trial import matrix
 from tests.helpers.simulated_drives import office, plan
 from tests.helpers.trials import trial
-
-
-def test_a_trial_consists_of_plain_json_types() -> None:
-    stored = json.loads(json.dumps(asdict(trial(error_m=None))))
-    assert trial(**stored) == trial(error_m=None)
 
 
 def test_all_nine_cells_of_the_matrix_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
@@ -50,11 +44,6 @@ def test_a_cell_counts_the_trials_in_the_map_of_their_own_building() -> None:
     assert cell.median_error_m == pytest.approx(0.10)
     (nothing,) = matrix([trial(status="not_found", right=False, error_m=None)])
     assert nothing.median_error_m is None and nothing.wrong == 0.0
-
-
-def test_reliability_compares_confidence_with_truth() -> None:
-    rows = reliability([trial(confidence=0.95), trial(confidence=0.91, right=False), trial(confidence=1.0)])
-    assert rows == [(pytest.approx((0.95 + 0.91 + 1.0) / 3), pytest.approx(2 / 3), 3)]
 
 
 def test_a_laser_finds_itself_in_its_own_building_alone(

@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.geometry import SE2
 from pc2grid.model import Scan
 from pc2grid.simulate import SimulationConfig, simulate_session
@@ -19,10 +18,10 @@ from pc2grid_cli.main import app
 from pc2grid_lab.compare.peers import _tasks
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.peers import programs
-from pc2grid_lab.peers.outcome import PeerAnswer, PeerTrial, best_threshold, counted
+from pc2grid_lab.peers.outcome import PeerAnswer, PeerTrial, best_threshold
 from pc2grid_lab.peers.particle_filter import carmen_log
 from pc2grid_lab.peers.programs import PEERS, PINS, PeerFailed, answers, missing
-from pc2grid_lab.peers.site import Site, SiteQuery, is_covered, save_beams, truth_file
+from pc2grid_lab.peers.site import Site, SiteQuery, save_beams
 from tests.helpers.simulated_drives import drive, office
 
 
@@ -71,42 +70,6 @@ def test_the_threshold_is_the_best_one_for_the_peer() -> None:
     assert best_threshold([judged(None)]) == math.inf
 
 
-def test_cells_count_every_query_once() -> None:
-    trials = [
-        judged(0.1, 9.0),
-        judged(0.1, 8.0),
-        judged(0.1, 8.0),
-        judged(2.0, 8.5),
-        judged(0.1, 0.5),
-        judged(None),
-        judged(1.0, 9.5, covered=False),
-        judged(None, covered=False),
-        judged(0.0, 1.0, map_="there"),
-        *(judged(0.05, 9.0) for _ in range(4)),
-    ]
-    (cell,) = counted(trials)
-    assert cell.threshold == 8.0
-    assert (cell.covered, cell.right, cell.wrong) == (10, 7, 1)
-    assert (cell.uncovered, cell.uncovered_wrong, cell.elsewhere, cell.elsewhere_wrong) == (2, 1, 1, 0)
-    assert cell.interval is not None and 0.0 < cell.interval[0] < 7 / 10 < cell.interval[1] < 1.0
-    assert cell.median_error_m == pytest.approx(0.05)
-    assert cell.cpu_s == cell.elsewhere_cpu_s == 1.0
-
-
-def test_answers_elsewhere_do_not_count_in_the_time_of_an_answer() -> None:
-    elsewhere = [judged(None, map_="there", cpu_s=cpu_s) for cpu_s in (7.0, 9.0)]
-    (cell,) = counted([judged(0.1), *elsewhere])
-    assert (cell.cpu_s, cell.elsewhere_cpu_s) == (1.0, 8.0)
-    (cell,) = counted([judged(0.1)])
-    assert (cell.cpu_s, cell.elsewhere_cpu_s) == (1.0, None)
-
-
-def test_pc2grid_gets_no_threshold() -> None:
-    """It would only take wrong answers away that a user gets."""
-    (cell,) = counted([judged(3.0, 0.5, peer="pc2grid"), judged(0.1, 0.9, peer="pc2grid")])
-    assert cell.threshold is None and (cell.right, cell.wrong) == (1, 1)
-
-
 @pytest.mark.parametrize("first_deg", [-90.0, -89.5, -135.25])
 def test_beams_lie_where_the_laser_measured_them(tmp_path: Path, first_deg: float) -> None:
     bearings = np.radians(first_deg + np.arange(180.0))
@@ -138,34 +101,6 @@ def test_the_carmen_log_has_a_line_for_each_step_of_motion() -> None:
     assert [float(w) for w in words[18:21]] == pytest.approx([x, y, yaw], abs=1e-4)
     middle = SE2(x, y, yaw) @ SE2(0.3, 0.0, 0.0)
     assert [float(w) for w in words[15:18]] == pytest.approx([middle.x, middle.y, middle.yaw], abs=1e-4)
-
-
-def test_a_query_is_covered_where_the_map_shows_what_it_saw() -> None:
-    driven = session()
-    truth = driven.true_pose(len(driven) - 1)
-    assert truth is not None
-    hits_m = driven.planar_scans[-1].hits_m
-    assert is_covered(office(), hits_m, truth)
-    assert not is_covered(office(), hits_m, truth @ SE2(1.3, 0.7, 0.4))
-    assert not is_covered(office(), hits_m[:0], truth)
-
-
-def test_a_true_pose_is_carried_on_from_the_nearest_known_one() -> None:
-    driven = session()
-    known = driven.T_world_base.copy()
-    known[5:] = np.nan
-    partly = RegisteredSession(
-        sensor="laser",
-        planar_scans=driven.planar_scans,
-        T_odom_base=driven.T_odom_base,
-        lost=driven.lost,
-        T_world_base=known,
-    )
-    carried, true = partly.true_pose(20), driven.true_pose(20)
-    assert carried is not None and true is not None
-    assert (carried.x, carried.y, carried.yaw) == pytest.approx((true.x, true.y, true.yaw))
-    known[:] = np.nan
-    assert partly.true_pose(20) is None
 
 
 def test_what_is_missing_is_named_with_its_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -211,19 +146,6 @@ def test_clouds_are_matched_in_a_process_of_its_own(tmp_path: Path) -> None:
     assert answer.pose == pytest.approx((1.0, 2.0, 0.4), abs=0.1)
     assert answer.cpu_s > 0.0 and answer.peak_mb > 50.0
     assert answers(fpfh, tmp_path / "gone", [tmp_path / "00"], tmp_path / "kept.json") == [answer]
-
-
-def test_true_poses_stand_beside_the_recording(tmp_path: Path) -> None:
-    with pytest.raises(LogNotFound, match=r"log\.tum"):
-        truth_file(tmp_path / "log.mcap")
-    (tmp_path / "log_corrected.tum").touch()
-    assert truth_file(tmp_path / "log.mcap").name == "log_corrected.tum"
-
-
-def test_mapped_names_one_of_the_recordings() -> None:
-    for text in ("b=3", "a=x", "a"):
-        done = CliRunner().invoke(app, ["compare", "peers", "a.mcap", "--mapped", text])
-        assert isinstance(done.exception, ConfigError) or done.exit_code
 
 
 def test_a_drive_through_a_plan_beside_the_peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -102,15 +101,6 @@ def test_a_small_change_is_not_told(now: dict[str, Any]) -> None:
     assert changes(table(map_row()), table(map_row(**now))) == []
 
 
-def test_a_slower_machine_is_no_change_but_a_slower_row_is() -> None:
-    before = table(*(map_row(str(k)) for k in range(5)))
-    slower = table(*(map_row(str(k), cpu_s=20.0) for k in range(5)))
-    assert changes(before, slower) == []
-    one = table(*(map_row(str(k), cpu_s=60.0 if k == 3 else 20.0) for k in range(5)))
-    (change,) = changes(before, one)
-    assert change.row == "3" and change.worse and "10.0 -> 60.0 s (3.00" in change.text
-
-
 def test_warnings_that_come_and_go() -> None:
     old = map_row(warnings=warned([BENT], error_m=0.4), error_m=0.4)
     new = map_row(warnings=warned([HEIGHT, ODD], error_m=0.4), error_m=0.4)
@@ -119,21 +109,6 @@ def test_warnings_that_come_and_go() -> None:
         ("new warning: something that no one has (unknown)", False),
         ("no longer warned of: bent (right)", True),
     }
-
-
-@pytest.mark.parametrize(
-    ("error_m", "verdict"), [(0.03, "false"), (0.4, "right"), (0.17, "unknown"), (None, "unknown")]
-)
-def test_whether_a_bent_map_is_bent(error_m: float | None, verdict: str) -> None:
-    (warning,) = warned([BENT], error_m=error_m)
-    assert (warning.about, warning.verdict) == ("bent", verdict)
-
-
-def test_a_new_wrong_answer_is_named() -> None:
-    before, after = table(pair_row("right", "refused")), table(pair_row("right", "wrong"))
-    texts = [(c.row, c.text, c.worse) for c in changes(before, after)]
-    assert ("b in a", "wrong 0 -> 1 of 2", False) in texts
-    assert any("newly wrong: the window from 10.0 s, 5.00 m off at 0.990" in t and w for _, t, w in texts)
 
 
 def test_worse_by_more_than_chance_needs_five_windows() -> None:
@@ -145,25 +120,6 @@ def test_worse_by_more_than_chance_needs_five_windows() -> None:
     assert "0 windows more are located and right, 5 are no longer (p 0.031)" in five[-1].text
     better = changes(table(pair_row(*["refused"] * 6)), before)
     assert not any(change.worse for change in better)
-
-
-def test_only_windows_of_both_runs_are_compared() -> None:
-    """The quick form asks for some of them."""
-    before = table(pair_row(*["right"] * 6), map_row("gone"))
-    some = pair_row(*["right"] * 6)
-    after = table(replace(some, queries=some.queries[::2]), map_row("new"))
-    assert changes(before, after) == []
-
-
-def test_fewer_answers_of_the_quick_form_judge_less() -> None:
-    """In the quick form too few answers agree to judge them; in the whole one that is a change."""
-    judged, few = pair_row("right", "right", "right"), pair_row("right", "right", "right")
-    few = replace(few, queries=tuple(replace(q, right=None, rank=None) for q in few.queries))
-    assert changes(table(judged), replace(table(few), quick=True)) == []
-    assert [c.text for c in changes(table(judged), table(few))][:2] == [
-        "right 3 -> 0 of 3",
-        "not judged 0 -> 3 of 3",
-    ]
 
 
 def test_the_page_shows_each_row() -> None:
