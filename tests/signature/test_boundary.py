@@ -17,7 +17,7 @@ from signature.boundary import (
     pair_distance_counts,
 )
 from signature.config import SignatureConfig
-from tests.helpers.rooms import RESOLUTION_M, disc, random_rooms, rectangle, submap_of
+from tests.helpers.rooms import RESOLUTION_M, rectangle, submap_of
 
 CONFIG = SignatureConfig()
 
@@ -81,47 +81,6 @@ def test_the_compiled_counts_are_those_of_scipy(seed: int, count: int, bin_cells
     cells = np.random.default_rng(seed).integers(0, 226, (count, 2))
     arguments = (cells, 1.0 / bin_cells, ROUNDING_BINS, 40)
     assert np.array_equal(_kernels.pair_distance_counts(*arguments), pair_distance_counts(*arguments))
-
-
-def test_a_circle_has_the_arcsine_law_of_chords() -> None:
-    radius = 4.0
-    found = histogram(disc(radius))
-    chords = 0.2 * np.arange(81)
-    # Chord of a uniform angle: P(d <= x) = 2 / pi * asin(x / 2 R).
-    law = np.diff(2 / np.pi * np.arcsin(np.clip(chords / (2 * radius), 0, 1)))
-    assert np.abs(np.cumsum(found) - np.cumsum(law)).max() < 0.03
-    assert found[41:].sum() == 0
-
-
-def test_a_square_by_brute_force_over_its_outline() -> None:
-    found = histogram(rectangle(6.0, 6.0))
-    side = np.linspace(-3, 3, 60, endpoint=False)
-    outline = np.concatenate([[(t, -3), (3, t), (-t, 3), (-3, -t)] for t in side])
-    distances = np.linalg.norm(outline[:, None] - outline[None], axis=2)[np.triu_indices(len(outline), 1)]
-    law = np.histogram(distances, bins=80, range=(0, 16))[0] / len(distances)
-    assert np.abs(np.cumsum(found) - np.cumsum(law)).max() < 0.02
-
-
-def test_a_corridor_peaks_at_its_width() -> None:
-    found = histogram(rectangle(14.0, 2.0))
-    wide = histogram(rectangle(14.0, 4.0))
-    assert found[10] > 1.5 * found[8]  # nothing of the opposite wall is nearer than 2.0 m
-    assert wide[20] > 1.5 * wide[18]
-
-
-def test_translation_changes_nothing_and_turning_little() -> None:
-    cells = rectangle(7.0, 5.0)
-    shifted = np.roll(cells, (17, -9), axis=(0, 1))
-    assert np.abs(np.cumsum(histogram(cells) - histogram(shifted))).max() < 1e-6
-    for quarter in (1, 2, 3):
-        assert np.abs(np.cumsum(histogram(cells) - histogram(np.rot90(cells, quarter).copy()))).max() < 0.02
-
-
-@given(seed=st.integers(0, 500))
-@settings(max_examples=10, deadline=None)
-def test_shares_sum_to_one(seed: int) -> None:
-    found = histogram(random_rooms(seed))
-    assert found.min() >= 0 and found.sum() == pytest.approx(1.0, abs=1e-5)
 
 
 def test_only_clearly_occupied_cells_are_boundary() -> None:

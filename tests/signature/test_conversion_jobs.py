@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gc
 import json
-import multiprocessing
 import os
 import re
 import signal
@@ -26,14 +25,13 @@ from pc2grid.model import OccupancyGrid, part_name
 from pc2grid_cli.main import app
 from signature import conversion_jobs
 from signature.config import Config
-from signature.conversion_jobs import Job, Outcome, at_once, on_cluster, processes_here
+from signature.conversion_jobs import Job, Outcome, at_once, on_cluster
 from signature.database import maintenance, open_database
 from signature.sessions import build_sessions
 from tests.helpers import postgresql
 from tests.helpers.interruptible import interruptible
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
-ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("kitchen", "hall", "cellar", "attic")
 
 
@@ -211,18 +209,6 @@ def test_a_killed_worker_of_a_cluster_costs_only_what_it_had_in_hand(folder: Pat
         assert len(entry[1]) == len(entry[0].submaps) > 0
 
 
-def test_a_killed_process_ends_all(folder: Path) -> None:
-    others = set(multiprocessing.active_children())
-    outcomes = at_once([job(folder, name) for name in NAMES], processes_here(1))
-    assert next(outcomes).error is None
-    (child,) = set(multiprocessing.active_children()) - others
-    os.kill(child.pid or 0, signal.SIGSTOP)
-    os.kill(child.pid or 0, signal.SIGKILL)
-    with pytest.raises(ClusterError, match="a worker was lost"):
-        list(outcomes)
-    assert set(multiprocessing.active_children()) <= others
-
-
 def test_processes_end_with_the_one_that_started_them() -> None:
     code = (
         "from signature.conversion_jobs import processes_here\nimport os, signal\n"
@@ -348,19 +334,3 @@ def test_dask_is_a_cluster_and_jobs_are_processes(folder: Path, tmp_path: Path, 
     with pytest.raises(ConfigError, match="names the scheduler") as refused:
         run("convert", *inputs(folder, "hall"), "-o", tmp_path / "x.submaps", *words)
     assert "--jobs N" in str(refused.value.hint)
-
-
-PAGE = (ROOT / "examples" / "buildings.md").read_text()
-
-
-@pytest.mark.parametrize("command", re.findall(r"^pc2grid ([^#\n]*)", PAGE, re.MULTILINE))
-def test_commands_of_the_page_of_buildings_are_real(command: str) -> None:
-    from typer.main import get_command
-
-    group, arguments = get_command(app), command.split()
-    context = group.make_context("pc2grid", [], resilient_parsing=True)
-    while hasattr(group, "get_command"):
-        name = arguments.pop(0)
-        group = group.get_command(context, name)
-        assert group is not None, f"no command {name}"
-    group.make_context("pc2grid", arguments, parent=context)

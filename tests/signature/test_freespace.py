@@ -23,11 +23,7 @@ from signature.freespace import (
     visibility_graph,
 )
 from tests.helpers.rooms import (
-    RESOLUTION_M,
-    canvas,
-    cross,
     grid_of,
-    l_shape,
     random_rooms,
     rectangle,
     submap_of,
@@ -109,14 +105,6 @@ def test_a_line_through_a_corner_is_blocked_by_both_cells_beside_it(turns: int) 
         assert joined(nodes, np.rot90(occupied, turns)).has_edge(0, 1) == visible
 
 
-def test_a_slanted_wall_of_single_cells_cannot_be_slipped_through() -> None:
-    occupied = np.eye(41, dtype=bool)
-    nodes = np.array([[10, 30], [30, 10], [5, 20]])
-    weights = adjacency(nodes, occupied)
-    assert np.isinf(weights[0, 1])
-    assert weights[0, 2] == pytest.approx(np.hypot(5, 10) * RESOLUTION_M)
-
-
 def test_unknown_does_not_block_and_reach_does() -> None:
     nodes = np.array([[10, 10], [10, 70]])
     nothing = np.zeros((80, 80), bool)
@@ -139,32 +127,6 @@ def test_lengths_by_hand_in_a_square_with_a_corner() -> None:
     assert np.flatnonzero(found).tolist() == [7, 10, 17]
 
 
-def test_ways_without_end_and_beyond_the_last_bin() -> None:
-    lengths = np.array([[0, np.inf, 1], [np.inf, 0, 100], [1, 100, 0]], np.float32)
-    found = freespace_histogram(lengths, 8.0, CONFIG)
-    assert found[2] == 0.5 and found[79] == 0.5 and found.sum() == 1.0
-
-
-def test_a_corridor_is_a_line_of_nodes() -> None:
-    nodes, lengths, found = parts(rectangle(12.0, 2.0))
-    on_the_middle = np.abs(nodes[:, 0] - 160) <= 4
-    assert on_the_middle.mean() > 0.7
-    # Points evenly on a line of length L: the density of their distance d is 2 (L - d) / L^2.
-    length = lengths[np.isfinite(lengths)].max()
-    at = np.arange(81) * 0.4
-    law = np.diff(1 - np.clip(1 - at / length, 0, 1) ** 2)
-    assert np.abs(np.cumsum(found) - np.cumsum(law)).max() < 0.12
-
-
-def test_around_a_corner_ways_are_longer_than_straight() -> None:
-    nodes, lengths, _ = parts(l_shape())
-    straight = np.linalg.norm(nodes[:, None] - nodes[None], axis=2) * RESOLUTION_M
-    finite = np.isfinite(lengths)
-    assert finite.all()
-    assert (lengths - straight).min() > -1e-4
-    assert (lengths - straight).max() > 0.3
-
-
 def test_rooms_without_a_door_are_not_connected() -> None:
     cells = rectangle(12.0, 6.0)
     cells[:, 160] = np.where(cells[:, 160] >= 0, OCCUPIED, cells[:, 160])
@@ -173,19 +135,3 @@ def test_rooms_without_a_door_are_not_connected() -> None:
     assert left.any() and (~left).any()
     assert np.isinf(lengths[np.ix_(left, ~left)]).all()
     assert np.isfinite(lengths[np.ix_(left, left)]).all()
-
-
-def test_turning_and_shifting_change_little() -> None:
-    cells = cross(6.0, 2.0)
-    _, _, here = parts(cells)
-    for other in (np.rot90(cells).copy(), np.rot90(cells, 2).copy(), np.roll(cells, (11, 8), axis=(0, 1))):
-        assert np.abs(np.cumsum(here - parts(other)[2])).max() < 0.05
-
-
-def test_graph_carries_places_and_lengths() -> None:
-    graph = freespace_graph(submap_of(rectangle(8.0, 5.0)))
-    for a, b, length in graph.edges(data="length_m"):
-        assert length == pytest.approx(
-            np.hypot(*np.subtract(graph.nodes[a]["center_m"], graph.nodes[b]["center_m"]))
-        )
-    assert len(freespace_graph(submap_of(canvas()))) == 0

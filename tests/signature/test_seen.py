@@ -15,26 +15,14 @@ from pc2grid.submaps.isovist import HIDDEN, OPEN, WALL
 from signature.seen import (
     SEEN,
     boundary_seen,
-    freespace_seen,
     parts,
     path_lengths,
     seen_graph,
     seen_signatures,
-    symmetry_seen,
 )
 
 SIGHT_M, BEARINGS = 5.0, 48
 Ends = NDArray[np.int8]
-
-
-def room(width_m: float = 4.0, height_m: float = 3.0, x: float = 0.3, y: float = -0.2) -> tuple[F32, Ends]:
-    """The isovist (1, B) of a point of a rectangular room, x and y from its middle."""
-    angles = 2 * math.pi * np.arange(BEARINGS) / BEARINGS
-    c, s = np.cos(angles), np.sin(angles)
-    with np.errstate(divide="ignore"):
-        across = np.where(c > 0, width_m / 2 - x, width_m / 2 + x) / np.abs(c)
-        along = np.where(s > 0, height_m / 2 - y, height_m / 2 + y) / np.abs(s)
-    return np.minimum(across, along)[None].astype(np.float32), np.full((1, BEARINGS), WALL, np.int8)
 
 
 def random_views(count: int = 6) -> tuple[F32, Ends]:
@@ -104,23 +92,6 @@ def test_path_lengths_are_those_of_the_free_space_graph() -> None:
                     assert lengths_m[n, a, b] >= straight_m[n, a, b] - 1e-6
                     longer += lengths_m[n, a, b] > straight_m[n, a, b] + 0.1
     assert longer  # some lie around a corner
-
-
-def test_in_a_convex_room_every_path_is_straight_and_in_two_rooms_it_is_not() -> None:
-    convex = freespace_seen(*room(), SIGHT_M)[0, SEEN.path_bins :][: SEEN.detours]
-    np.testing.assert_allclose(convex[0], 1.0, atol=1e-3)
-    ranges_m, ends = room()
-    ranges_m[0, ::4] = 0.5  # pillars all around
-    assert freespace_seen(ranges_m, ends, SIGHT_M)[0, SEEN.path_bins] < 0.95
-
-
-def test_the_middle_of_a_room_is_symmetric_and_a_corner_is_not() -> None:
-    middle, corner = (symmetry_seen(*room(x=x, y=y))[0] for x, y in ((0.0, 0.0), (1.7, 1.2)))
-    full = 1.0 / (1.0 + SEEN.few)
-    assert middle[0] == pytest.approx(full, abs=0.01)  # at the best axis
-    assert middle[1] == pytest.approx(full, abs=0.01)  # at the one across it
-    assert middle[-1] == pytest.approx(full, abs=0.01)  # after half a turn
-    assert corner[1] < 0.7 and corner[-1] < 0.7
 
 
 def test_a_part_has_about_the_histograms_of_the_whole_and_a_part_taken_for_a_whole_has_not() -> None:

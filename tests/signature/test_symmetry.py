@@ -7,9 +7,6 @@ import math
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from scipy import ndimage
 
 from signature.boundary import boundary_edges
 from signature.config import SignatureConfig
@@ -19,8 +16,6 @@ from tests.helpers.rooms import (
     canvas,
     cross,
     l_shape,
-    polygon,
-    random_rooms,
     rectangle,
     submap_of,
 )
@@ -48,19 +43,6 @@ def test_axes_are_the_directions_with_the_most_length() -> None:
     assert math.degrees(axes.beta_rad) == pytest.approx(110, abs=0.5)
 
 
-def test_directions_are_undirected_and_wrap_around() -> None:
-    axes = symmetry_axes(np.array([line(179.4), line(0.6), line(-180.2)]), CONFIG)
-    assert axes is not None
-    assert abs((math.degrees(axes.alpha_rad) + 90) % 180 - 90) < 0.5
-    assert math.degrees(axes.beta_rad) == pytest.approx(90, abs=1)  # nothing else: the perpendicular
-
-
-def test_axes_need_not_be_perpendicular_but_are_apart() -> None:
-    axes = symmetry_axes(np.array([line(0, 200), line(10, 150), line(60, 50)]), CONFIG)
-    assert axes is not None
-    assert math.degrees(axes.beta_rad) == pytest.approx(60, abs=0.5)
-
-
 def test_a_plain_vote_counts_segments_not_metres() -> None:
     segments = np.array([line(20.4, 300), line(80, 10), line(80, 10), line(110, 10)])
     by_length = symmetry_axes(segments, CONFIG)
@@ -69,15 +51,6 @@ def test_a_plain_vote_counts_segments_not_metres() -> None:
     assert math.degrees(by_length.alpha_rad) == pytest.approx(20.4, abs=0.1)
     assert math.degrees(plain.alpha_rad) == pytest.approx(80)  # a whole degree
     assert math.degrees(plain.beta_rad) == pytest.approx(20)
-
-
-def test_without_the_limit_crossing_lines_are_brighter_than_one() -> None:
-    edges = np.zeros((101, 101), bool)
-    edges[50, 10:91] = edges[10:91, 50] = True
-    limited = blurred(edges, RESOLUTION_M, CONFIG)
-    unlimited = blurred(edges, RESOLUTION_M, CONFIG.model_copy(update={"symmetry_limited": False}))
-    assert limited.max() == CONFIG.symmetry_peak < unlimited.max()
-    np.testing.assert_array_equal(limited, np.minimum(unlimited, np.float32(CONFIG.symmetry_peak)))
 
 
 def test_short_segments_are_not_lines() -> None:
@@ -120,69 +93,10 @@ def test_a_few_cells_are_blurred_as_opencv_blurs_all_of_them(shape: tuple[int, i
     assert blurred(edges, RESOLUTION_M, CONFIG) == pytest.approx(expected, abs=1e-4)
 
 
-@pytest.mark.parametrize("angle", [0.0, 0.3, 1.2, math.pi / 2, 3.0])
-def test_mirror_images_are_read_between_the_cells_and_beyond_the_rim(angle: float) -> None:
-    rng = np.random.default_rng(2)
-    image, cells = rng.random((9, 14), np.float32), rng.integers(0, (9, 14), (200, 2))
-    inside = np.pad(image, 20)  # of zeros, so that nothing is outside
-    mirrored = np.array(
-        [[math.cos(2 * angle), math.sin(2 * angle)], [math.sin(2 * angle), -math.cos(2 * angle)]]
-    )
-    columns, rows = mirrored @ (cells - [4.0, 6.5])[:, ::-1].T + [[26.5], [24.0]]
-    expected = ndimage.map_coordinates(inside, [rows, columns], order=1).mean()
-    assert reflection_score(cells, image, angle) == pytest.approx(float(expected), rel=1e-5)
-
-
-def test_mirroring_the_pixels_is_rotating_and_flipping_the_image() -> None:
-    edges, angle = edges_of(random_rooms(4)), math.radians(30)
-    image = blurred(edges, RESOLUTION_M, CONFIG)
-    middle = (160.0, 160.0)
-    upright = cv2.getRotationMatrix2D(middle, math.degrees(angle) - 90, 1.0)
-    turned_image = cv2.warpAffine(image, upright, (321, 321))
-    flipped = turned_image[:, ::-1]
-    cells = np.argwhere(edges)
-    columns, rows = upright @ np.vstack((cells[:, 1], cells[:, 0], np.ones(len(cells))))
-    expected = cv2.remap(
-        flipped, columns.astype(np.float32), rows.astype(np.float32), cv2.INTER_LINEAR
-    ).mean()
-    assert reflection_score(cells, image, angle) == pytest.approx(float(expected), rel=0.03)
-
-
 def test_a_mirrored_room_scores_higher_than_an_l_shape() -> None:
     for symmetric in (rectangle(8.0, 6.0), cross(6.0, 2.0)):
         assert scores(symmetric).min() > 1.5 * scores(l_shape()).max()
     assert scores(rectangle(8.0, 6.0)).min() > 0.9 * CONFIG.symmetry_peak
-
-
-def test_moving_one_wall_of_a_mirrored_room_costs_one_axis() -> None:
-    room = rectangle(8.0, 6.0)
-    whole = scores(room)
-    off = scores(polygon([(-4, -3), (3, -3), (3, 3), (-4, 3)]))
-    assert off.min() < 0.8 * whole.min()
-    assert off.max() > 0.9 * whole.max()
-
-
-@pytest.mark.parametrize("angle_deg", [10, 33, 45, 90, 137])
-def test_turning_the_room_changes_the_scores_little(angle_deg: float) -> None:
-    def turned(angle: float) -> np.ndarray:
-        c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-        corners = [(-5, -3), (5, -3), (5, 3), (1, 3), (1, 1), (-5, 1)]
-        return polygon([(c * x - s * y, s * x + c * y) for x, y in corners])
-
-    # A line at 45 degrees has 1 / sqrt(2) of the pixels of a level one of the same length, and so that much
-    # less of a crest; the rest of the tolerance is the axis, which Hough finds to 1.5 degrees.
-    ratio = scores(turned(angle_deg)) / scores(turned(0))
-    assert (ratio > 0.8 / math.sqrt(2)).all() and (ratio < 1.15).all()
-    assert scores(turned(angle_deg)) == pytest.approx(scores(turned(angle_deg + 90)), rel=0.2)
-
-
-@given(seed=st.integers(0, 1000))
-@settings(max_examples=10, deadline=None)
-def test_scores_stay_in_range_and_repeat(seed: int) -> None:
-    cells = random_rooms(seed)
-    first = scores(cells)
-    assert (first >= 0).all() and (first <= CONFIG.symmetry_peak).all()
-    assert np.array_equal(first, scores(cells))
 
 
 def test_without_walls_there_is_no_axis() -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import fcntl
 import json
 import multiprocessing
 import os
@@ -20,7 +19,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psutil
 import pytest
 
 from pc2grid.errors import (
@@ -43,7 +41,7 @@ from signature.database.postgres import server
 from signature.database.protocol import APPLICATION_ID, OLDER_ID
 from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
 from signature.database.sqlite import atomic_update
-from signature.database.sqlite.atomic_update import hold, rewrite
+from signature.database.sqlite.atomic_update import hold
 from signature.describe import describe
 from signature.sessions import add_session, provenance
 from tests.helpers import postgresql
@@ -136,31 +134,6 @@ def test_files_of_other_programs(tmp_path: Path) -> None:
         store(stranger, [make_entry()], keep=True)
     assert stranger.read_bytes() == before
     assert list(tmp_path.iterdir()) == [stranger]
-
-
-@pytest.mark.fault(44)
-@pytest.mark.parametrize(
-    ("header", "said"),
-    [
-        (set_header(60, 7), ["database format 7; this pc2grid reads format 1", "use a newer pc2grid"]),
-        (
-            set_header(68, OLDER_ID),
-            [
-                "of an older format, which this pc2grid does not read",
-                "convert the recordings again, with `pc2grid convert`",
-            ],
-        ),
-    ],
-)
-def test_the_command_line_says_of_another_format_what_to_do(
-    path: Path, header: Callable[[bytes], bytes], said: list[str]
-) -> None:
-    path.write_bytes(header(path.read_bytes()))
-    before = path.read_bytes()
-    done = pc2grid("db", "info", path.name, cwd=path.parent)
-    assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.splitlines() == [f"pc2grid: error: x.submaps: {said[0]}", f"hint: {said[1]}"]
-    assert path.read_bytes() == before and list(path.parent.iterdir()) == [path]
 
 
 # --- fault 43: flipped bits ---------------------------------------------------------------------------
@@ -520,63 +493,6 @@ def test_what_follows_from_the_map_is_made_again(empty: maintenance.Place, tmp_p
         assert np.array_equal(database.seen_places("house").signatures, before.signatures)
         tuesday = TUESDAY
         assert_holds(database, (dataclasses.replace(tuesday[0], points=None), *tuesday[1:]))
-
-
-def test_a_lock_that_its_holder_took_away_is_not_held(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between our opening the lock file and locking it, its holder removes it: another may lock a new one."""
-    lock, plain, seen = path.with_name(f".{path.name}.lock"), fcntl.flock, []
-
-    def flock(descriptor: int, how: int) -> None:
-        seen.append(descriptor)
-        if len(seen) <= 2:
-            lock.unlink()
-        if len(seen) == 2:
-            lock.write_text("another one's")
-        plain(descriptor, how)
-
-    monkeypatch.setattr(fcntl, "flock", flock)
-    with hold(path, 1.0):
-        assert len(seen) == 3
-        assert lock.read_text().startswith(f"process {os.getpid()} on ")
-        monkeypatch.undo()
-        with pytest.raises(DatabaseBusy), hold(path, 0.0):
-            pass
-    assert list(path.parent.iterdir()) == [path]
-
-
-def test_a_mistake_of_the_body_stays_its_own(path: Path) -> None:
-    """Not called a full disk, nor damage: there was nothing that could be damaged."""
-    target, before = path.with_name("new.submaps"), psutil.Process().num_fds()
-    with pytest.raises(sqlite3.IntegrityError, match="UNIQUE"), rewrite(target, keep=False) as connection:
-        for number in (1, 2):
-            connection.execute("INSERT INTO session VALUES ('', ?, '', 'monday', '{}', 0)", [number])
-    assert list(path.parent.iterdir()) == [path]
-    assert psutil.Process().num_fds() == before
-
-
-@pytest.mark.fault(39)
-@pytest.mark.parametrize("with_code", [True, False])
-def test_a_medium_that_refuses_is_told_from_damage(with_code: bool) -> None:
-    """By the error code of SQLite; by its message where Python gives no code."""
-    for code, message in [
-        (13, "database or disk is full"),
-        (10 | 3 << 8, "disk I/O error"),
-        (1, "no such table"),
-    ]:
-        error = sqlite3.OperationalError(message)
-        if with_code:
-            error.sqlite_errorcode = code
-        found = atomic_update._explained(error, Path("x.submaps"), kept=True)
-        assert isinstance(found, DatabaseCorrupt if code == 1 else OutputError), message
-
-
-def test_waiting_for_another_writer_keeps_nothing_open(path: Path) -> None:
-    before = psutil.Process().num_fds()
-    with hold(path, 1.0):
-        with pytest.raises(DatabaseBusy), hold(path, 0.2):
-            pass
-        assert psutil.Process().num_fds() == before + 1
-    assert psutil.Process().num_fds() == before
 
 
 def test_names_that_cannot_be_files(tmp_path: Path) -> None:

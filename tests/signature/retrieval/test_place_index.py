@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64
@@ -53,6 +53,7 @@ OWN = next(iter(OFFICE.places.blocks()))
 PLACES = len(OFFICE.places.table)
 
 
+@functools.cache
 def queries(field_deg: float = 360.0, every_m: float = 1.0) -> list[tuple[QueryMap, SE2]]:
     """What parts of a drive along the office have seen, and their frame there."""
     found, path_m = [], 0.0
@@ -68,6 +69,7 @@ def queries(field_deg: float = 360.0, every_m: float = 1.0) -> list[tuple[QueryM
     return found
 
 
+@functools.cache
 def with_floors(floors: int) -> Places:
     """The office among floors of other buildings."""
     plans = {f"floor {seed}": office_floorplan(seed) for seed in range(1, floors + 1)}
@@ -80,11 +82,10 @@ def right(query: QueryMap, T_map_query: SE2, reach_m: float = 1.5) -> np.ndarray
     return np.flatnonzero(np.hypot(*(OFFICE.places.table.center_m - base_m).T) <= reach_m)
 
 
-@pytest.mark.parametrize("field_deg", [360.0, 90.0])
-def test_a_random_shortlist_of_the_same_size_finds_fewer_places(field_deg: float) -> None:
+def test_a_random_shortlist_of_the_same_size_finds_fewer_places() -> None:
     places, rng = with_floors(6), np.random.default_rng(0)
     count = len(places.table)
-    most, asked = shortlist_size(count, RelocalizeConfig()), queries(field_deg)
+    most, asked = shortlist_size(count, RelocalizeConfig()), queries(90.0)
     assert most <= 0.06 * count and len(asked) > 10
 
     def share(index: PlaceIndex) -> float:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.bend import Bend
 from signature.database.protocol import BuildingFrame
 from signature.localization.joining.building_map import building_map
@@ -60,15 +60,3 @@ def test_a_bent_map_is_straight_in_the_building() -> None:
     assert np.abs(y - 0.45).max() < 0.1 + 1e-6 and (np.histogram(x, np.arange(5.0, 35.1))[0] >= 10).all()
     # Nothing of the map was cut off that the bend moves beyond its edges.
     assert whole.free_m2 == pytest.approx(drawn.free_m2, rel=0.02)
-
-
-def test_no_map_is_no_building() -> None:
-    with pytest.raises(ValueError, match="without a map"):
-        building_map([])
-
-
-def test_what_the_newest_is_not_sure_of_stays() -> None:
-    unsure = grid([[50, 50, _], [50, THING, _]])
-    whole = building_map([(OLD, at()), (unsure, at())])
-    assert whole.cells[::-1].tolist() == [[OCCUPIED, OCCUPIED, OCCUPIED], [FREE, THING, OCCUPIED]]
-    assert building_map([(unsure, at())]).cells[::-1].tolist() == [[50, 50, _], [50, THING, _]]

@@ -10,15 +10,12 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
-from signature.localization.joining import join as join_module
 from signature.localization.joining.graph_matching import Alignment, align_graphs
 from signature.localization.joining.join import JOIN, Join, join_maps
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, joinable, part
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import office, plan, with_tables
 
-MIDDLE_M = (9.5, 7.0)
-"""The middle of the strip that both know, in the map of the west."""
 west, east = joinable(part(WEST)), joinable(in_frame(part(EAST), T_OFFICE_EAST))
 
 
@@ -61,14 +58,6 @@ def test_tables_of_a_lidar_do_not_part_it_from_a_laser(lidar_asked: bool) -> Non
     assert told.status == "joined" and told.agreement > 0.95 > 0.6 > untold.agreement
 
 
-def test_it_does_not_matter_which_of_the_two_is_asked() -> None:
-    there, back = join_maps(west, east), join_maps(east, west)
-    distance_m, turn_rad = off(back, there.T_target_source.inverse(), MIDDLE_M)
-    # Walls are drawn two cells thick, and each map is put anywhere within the other's.
-    assert back.status == "joined"
-    assert distance_m < 2.0 * RESOLUTION_M and turn_rad < 2.0 * RESOLUTION_M / 14.0
-
-
 def test_the_graphs_propose_where_the_other_map_lies() -> None:
     """Among the three sets with most evidence: rooms along a corridor look alike, and walls decide."""
 
@@ -98,24 +87,6 @@ def test_a_wing_that_comes_twice_is_ambiguous() -> None:
     both = plan(20, 9, [*wing, *((a + width_m, b, c + width_m, d) for a, b, c, d in wing), (10, 0, 10, 9)])
     single = part((0.0, 0.0, width_m, 9.0), both)
     assert join_maps(joinable(both), joinable(single)).status == "ambiguous"
-
-
-def test_what_is_not_judged_is_not_the_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    others = (east, joinable(OTHER), joinable(MIRRORED))
-    found = [join_maps(west, other) for other in others]
-    monkeypatch.setattr(join_module, "_bound", lambda evidence, prior: 1.0)  # so all are judged
-    for some, other in zip(found, others, strict=True):
-        every = join_maps(west, other)
-        assert (some.T_target_source, some.probability) == (every.T_target_source, every.probability)
-
-
-def test_decoys_are_looked_for_where_something_fits(monkeypatch: pytest.MonkeyPatch) -> None:
-    joined, different = join_maps(west, east), join_maps(west, joinable(OTHER))
-    monkeypatch.setattr(join_module, "_MIRROR", None)  # what a decoy is made with
-    assert join_maps(west, joinable(OTHER)).rivals == different.rivals
-    with pytest.raises(TypeError):
-        join_maps(west, east)
-    assert joined.rivals > different.rivals
 
 
 def test_too_little_in_common_is_not_joined() -> None:

@@ -9,8 +9,7 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.mapping.precision import position_sigmas
-from pc2grid.model import Health, Loop, Precision, Trajectory
+from pc2grid.model import Health, Precision, Trajectory
 from signature.bend import Bend, largest_m
 from signature.database.protocol import BuildingFrame
 from signature.localization.joining.pieces import Link
@@ -118,34 +117,3 @@ def test_sessions_that_were_joined_before_stay_bent_as_they_are() -> None:
     there = found["drive"].placed(drawn(20.0))
     wanted = SE2(0.0, 0.5, 0.0) @ true(20.0)
     assert (there.x, there.y) == pytest.approx((wanted.x, wanted.y), abs=0.05)
-
-
-def test_a_body_has_a_node_for_each_local_map_and_each_end_of_a_loop() -> None:
-    assert len(SOFT.nodes) == 11 and len(SOFT.edges) == 10
-    loop = Loop(older=30, newer=110, T_older_newer=SE2(16.0), information=np.eye(3))
-    refused = Loop(older=35, newer=115, T_older_newer=SE2(), information=np.eye(3), accepted=False)
-    closed = body_of(way(), (loop, refused), exact_to(0.3))
-    assert len(closed.nodes) == 13 and len(closed.edges) == 12 + 1
-
-
-def test_a_session_of_which_no_precision_is_known_is_rigid() -> None:
-    assert body_of(way(), (), None) is RIGID and body_of(way(), (), Precision()) is RIGID
-
-
-def test_a_body_is_as_stiff_as_its_session_is_exact() -> None:
-    for sigma_m in (0.01, 0.3):
-        body = body_of(way(), (), exact_to(sigma_m))
-        found_m = position_sigmas(body.nodes, body.edges)[0]
-        # The weights of the places depend a little on the sigmas.
-        assert np.sqrt(np.square(found_m).mean()) == pytest.approx(sigma_m, rel=0.1)
-
-
-def test_a_step_over_which_tracking_was_lost_is_soft() -> None:
-    health = [Health.FINE] * len(S)
-    health[50] = Health.LOST
-    body = body_of(way(health=tuple(health)), (), exact_to(0.3))
-    sigma_m = np.array([edge.information[0, 0] ** -0.5 for edge in body.edges])
-    # 1.5 m against 0.06 m, see `LoopParameters`.
-    assert int(np.argmax(sigma_m)) == 2 and np.delete(sigma_m, 2) == pytest.approx(
-        sigma_m[2] / 25.0, rel=0.01
-    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import itertools
 import json
 import math
 import re
@@ -17,20 +16,16 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
-from pc2grid.model import Consistency, Contradiction, Health, OccupancyGrid, Precision, Trajectory
+from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory
 from pc2grid_cli.locate import find_map
-from pc2grid_cli.nav2_pose import initialpose
 from pc2grid_cli.relocalize import map_sigma_m
 from signature.boundary import boundary_histogram
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
 from signature.describe import Signature
 from signature.freespace import freespace_histogram, shortest_paths
-from signature.localization.shown import report
-from signature.localization.shown.report import Found, contents, deviation, runs, write_report
-from signature.localization.shown.signatures_compared import why_here
+from signature.localization.shown.report import Found, contents, write_report
 from signature.sessions import add_sessions, provenance
 from signature.similarity import distances
 from tests.helpers.session_maps import LOOPS, session, way
@@ -81,12 +76,6 @@ def test_the_page_is_whole_and_fetches_nothing(
     assert embedded(page)["sessions"][1]["name"] == NASTY
 
 
-def test_the_same_database_gives_the_same_page(database: SubmapDatabase, tmp_path: Path) -> None:
-    for name in ("a.html", "b.html"):
-        write_report(tmp_path / name, database)
-    assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
-
-
 def test_submaps_graph_and_path_are_those_of_the_database(database: SubmapDatabase) -> None:
     first = contents(database)["sessions"][0]
     table = database.signatures()
@@ -109,26 +98,6 @@ def test_the_picture_lies_where_the_grid_lies(database: SubmapDatabase) -> None:
     assert (image["x"], image["y"], image["w"], image["h"]) == (0.0, 0.0, 20.0, 14.0)
     # The highest row of the picture is the one with the largest y.
     assert np.array_equal(pixels[::-1, :, 0] < 60, grid.occupied)
-
-
-def test_a_path_is_cut_where_its_health_changes_and_stays_connected() -> None:
-    pieces = runs(way())
-    assert [p["health"] for p in pieces] == ["fine", "degenerate", "lost", "fine"]
-    for before, after in itertools.pairwise(pieces):
-        assert before["xy"][-2:] == after["xy"][:2]
-    assert pieces[-1]["xy"][-2:] == [8.8, 7.0]
-
-
-def test_the_page_knows_every_health() -> None:
-    page = (Path(report.__file__).parent / "report.html").read_text()
-    line = next(line for line in page.splitlines() if line.startswith("const HEALTH"))
-    assert all(f"{health.value}: [" in line for health in Health)
-
-
-def test_standing_still_costs_no_points() -> None:
-    still = Trajectory(stamps_ns=np.arange(500), T_session_base=np.tile(np.eye(4), (500, 1, 1)))
-    (piece,) = runs(still)
-    assert piece["health"] == "fine" and len(piece["xy"]) == 4
 
 
 def test_loops_join_the_places_that_they_are_between(database: SubmapDatabase) -> None:
@@ -203,16 +172,6 @@ def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: F
     assert len(shown["hypotheses"]) == len(found.answer.hypotheses)
 
 
-def test_the_curve_is_the_history_of_the_answer(database: SubmapDatabase, found: Found) -> None:
-    last = found.answer.history[-1]
-    before = tuple(replace(last, path_m=float(m), confidence=0.1 * m, status="ambiguous") for m in (1, 2))
-    answer = replace(found.answer, history=(*before, last))
-    shown = contents(database, found=replace(found, answer=answer))["answer"]
-    assert [m["path_m"] for m in shown["history"]] == [1.0, 2.0, last.path_m]
-    assert [m["status"] for m in shown["history"]] == ["ambiguous", "ambiguous", "located"]
-    assert shown["history"][-1]["confidence"] == last.confidence
-
-
 def test_the_walls_of_the_query_are_weighed_at_each_hypothesis(
     database: SubmapDatabase, found: Found
 ) -> None:
@@ -256,11 +215,6 @@ def test_the_signatures_of_the_query_lie_on_those_of_the_map_where_it_is_and_not
         assert found.answer.places[rival["hypothesis"]] != found.answer.places[0]
         told = why["told_apart"]
         assert here["views"][told]["log_ratio"] > rival["views"][told]["log_ratio"]
-
-
-def test_without_a_hypothesis_there_is_nothing_to_explain(database: SubmapDatabase, found: Found) -> None:
-    nowhere = replace(found.answer, hypotheses=(), places=(), status="not_found", T_map_base=None)
-    assert why_here(nowhere, database) is None
 
 
 def test_what_a_changed_query_contradicts_is_where_it_was_changed(
@@ -330,24 +284,6 @@ def test_a_page_about_an_answer_explains_the_maps_of_its_hypotheses(
     for session_ in contents(database, found=found)["sessions"]:
         explained = [submap["sources"] is not None for submap in session_["submaps"]]
         assert set(explained) == {session_["name"] in there}
-
-
-def test_a_deviation_is_not_smaller_than_the_map_can_show() -> None:
-    assert deviation(np.zeros((3, 3)), 0.05, 5.0) == pytest.approx((0.025, 0.025, 0.005), abs=1e-6)
-    assert deviation(np.diag([4.0, 0.25, 0.01]), 0.05, 5.0) == pytest.approx((2.0, 0.5, 0.1))
-
-
-def test_an_initial_pose_is_what_nav2_takes() -> None:
-    covariance = np.array([[0.1, -0.01, 0.02], [-0.01, 0.2, -0.03], [0.02, -0.03, 0.3]])
-    message = initialpose(1_700_000_000_123_456_789, SE2(1.0, -2.0, np.pi / 2), covariance)
-    assert message["header"] == {"stamp": {"sec": 1_700_000_000, "nanosec": 123_456_789}, "frame_id": "map"}
-    pose = message["pose"]["pose"]
-    assert pose["position"] == {"x": 1.0, "y": -2.0, "z": 0.0}
-    assert pose["orientation"] == pytest.approx({"x": 0, "y": 0, "z": 0.5**0.5, "w": 0.5**0.5})
-    full = np.array(message["pose"]["covariance"]).reshape(6, 6)
-    # Row by row of x, y, z, roll, pitch, yaw; nav2 refuses negative numbers, and what is above 1e9.
-    assert np.array_equal(full, np.diag([0.1, 0.2, 1e6, 1e6, 1e6, 0.3]))
-    assert json.loads(json.dumps(message)) == message
 
 
 def test_a_map_of_nothing_still_has_a_page(tmp_path: Path) -> None:
