@@ -8,7 +8,6 @@ PC2GRID_FUZZ is the number of mutations of each kind: at least 100, so that ever
 
 from __future__ import annotations
 
-import hashlib
 import os
 from pathlib import Path
 from typing import NamedTuple
@@ -22,10 +21,10 @@ from pc2grid.config import ReadConfig
 from pc2grid.errors import DatabaseError, MapFileError, Pc2GridError
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.model import OccupancyGrid
-from signature.database import SubmapDatabase, open_database
+from signature.database import open_database
 from signature.database.maintenance import check, copy, store
 from tests.helpers import foxglove_messages as foxglove
-from tests.helpers.databases import make_entry
+from tests.helpers.databases import digests_of, make_entry
 from tests.helpers.memory import bounded_memory
 from tests.helpers.mutations import MOST_BYTES, PARTS, mutated, patiently, put
 from tests.helpers.recordings import STEP, T0, Message, drive, read, ros, write_mcap
@@ -171,28 +170,6 @@ def test_fuzz_content_of_recordings(tmp_path: Path, kind: str, part: int) -> Non
 # --- databases ----------------------------------------------------------------------------------------
 
 
-def sessions_of(database: SubmapDatabase) -> dict[str, str]:
-    """A digest of everything in each session."""
-    digests = {}
-    table = database.signatures()
-    for index, info in enumerate(database.sessions()):
-        digest = hashlib.sha256(repr(info).encode())
-        digest.update(database.grid(info.name).cells.tobytes())
-        trajectory = database.trajectory(info.name)
-        digest.update(trajectory.stamps_ns.tobytes() + trajectory.T_session_base.tobytes())
-        digest.update(repr(trajectory.health).encode())
-        for loop in database.loops(info.name):
-            digest.update(repr((loop.older, loop.newer, loop.T_older_newer, loop.accepted)).encode())
-            digest.update(loop.information.tobytes())
-        for submap in database.submaps(info.name):
-            digest.update(repr((submap.submap_id, submap.center_m, submap.radius_m)).encode())
-            digest.update(submap.grid.cells.tobytes())
-        for field in ("boundary", "freespace", "symmetry", "submap_id", "center_m"):
-            digest.update(np.ascontiguousarray(getattr(table, field)[table.session_index == index]))
-        digests[info.name] = digest.hexdigest()
-    return digests
-
-
 @pytest.mark.parametrize("part", range(PARTS))
 @bounded_memory(MOST_BYTES)
 def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: int) -> None:
@@ -203,7 +180,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
     store(path, [make_entry(name, i, submaps=2) for i, name in enumerate(names)], keep=False)
     whole = path.read_bytes()
     with open_database(path) as database:
-        clean = sessions_of(database)
+        clean = digests_of(database)
     sunday = make_entry("sunday", 9, submaps=1)
     rng = np.random.default_rng([44, part])
     outcomes = {"whole": 0, "refused": 0, "left out": 0, "saved": 0, "added": 0}
@@ -213,7 +190,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
         whole_again = False
         try:
             with open_database(path) as database:
-                assert sessions_of(database) == clean
+                assert digests_of(database) == clean
             outcomes["whole"] += 1
             whole_again = True
         except DatabaseError:
@@ -222,7 +199,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
             try:
                 with open_database(path) as database:
                     left_out = database.leave_out_damaged()
-                    rest = sessions_of(database)
+                    rest = digests_of(database)
                 assert rest.items() <= clean.items()
                 assert len(rest) >= len(names) - len(left_out)
                 assert rest == clean or not whole_again
@@ -235,7 +212,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
                 copy(path, saved, recover=True, overwrite=True)
                 assert check(saved) == ()
                 with open_database(saved) as database:
-                    found = sessions_of(database)
+                    found = digests_of(database)
                 assert found.keys() <= clean.keys()
                 assert found == clean or problems
                 outcomes["saved"] += bool(found) and bool(problems)

@@ -63,21 +63,6 @@ def test_an_angle_is_wrapped_to_itself(angle_rad: float) -> None:
     assert wrap_angle(wrapped) == wrapped
 
 
-def test_half_a_turn_has_one_name() -> None:
-    assert wrap_angle(-math.pi) == wrap_angle(math.pi) == math.pi
-    half_turns = math.pi * np.array([-3.0, -1.0, 1.0, 3.0])
-    assert wrap_angle(half_turns).tolist() == [math.pi] * 4
-
-
-@given(st.lists(st.floats(-1e6, 1e6)))
-def test_an_array_of_angles_is_wrapped_like_each_of_them(angles_rad: list[float]) -> None:
-    wrapped = wrap_angle(np.array(angles_rad))
-    assert wrapped.shape == (len(angles_rad),)
-    for angle_rad, found in zip(angles_rad, wrapped.tolist(), strict=True):
-        assert -math.pi < found <= math.pi
-        assert abs(wrap_angle(found - wrap_angle(angle_rad))) < 1e-9
-
-
 @given(PLANAR, PLANAR, PLANAR)
 def test_planar_poses_are_a_group(a: SE2, b: SE2, c: SE2) -> None:
     assert_same((a @ b) @ c, a @ (b @ c))
@@ -130,22 +115,6 @@ def test_between_two_poses(a: np.ndarray, b: np.ndarray, fraction: float) -> Non
     line = (1 - fraction) * a[:3, 3] + fraction * b[:3, 3]
     np.testing.assert_allclose(between[:3, 3], line, atol=1e-6)
     np.testing.assert_allclose(between[:3, :3] @ between[:3, :3].T, np.eye(3), atol=1e-9)
-
-
-@pytest.mark.parametrize("turn", [(math.pi, 0, 0), (0, math.pi, 0), (0, 0, math.pi), (2.0, 2.0, 1.0)])
-def test_half_turns_keep_their_digits(turn: tuple[float, float, float]) -> None:
-    """Where a naive quaternion divides by nearly zero."""
-    axis = np.array(turn) / np.linalg.norm(turn)
-    pose = pose_from_rotation_vector(axis * math.pi)
-    quat = quat_xyzw_from_pose(pose)
-    np.testing.assert_allclose(np.abs(quat[:3]), np.abs(axis), atol=1e-12)
-    np.testing.assert_allclose(pose_from_xyz_quat((0, 0, 0), quat), pose, atol=1e-12)
-
-
-@pytest.mark.parametrize("quat", [(0, 0, 0, 0), (0, 0, 0, 1e-10), (0, 0, 0, math.nan), (math.inf, 0, 0, 1)])
-def test_a_quaternion_without_direction(quat: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="no direction"):
-        pose_from_xyz_quat((0, 0, 0), quat)
 
 
 # --- files --------------------------------------------------------------------------------------------

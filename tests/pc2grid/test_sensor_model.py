@@ -3,16 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import get_args
 
 import pytest
 
-from pc2grid.model import SensorKind
 from pc2grid.sensor_model import SENSOR_MODELS
-
-
-def test_every_kind_has_a_model() -> None:
-    assert set(SENSOR_MODELS) == set(get_args(SensorKind))
 
 
 def test_the_noise_of_a_camera_reaches_a_voxel_at_some_range() -> None:

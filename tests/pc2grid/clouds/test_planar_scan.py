@@ -63,15 +63,3 @@ def test_gaps_between_beams_are_closed_but_not_those_of_missing_returns() -> Non
 def test_far_returns_give_free_space_but_no_hits() -> None:
     planar_scan = planar_scan_of([(50.0, 0.0, 0.0)], ground=None)
     assert len(planar_scan.hits_m) == 0 and planar_scan.free_m[0] == CONFIG.max_range_m
-
-
-def test_bearings_start_at_the_sensor() -> None:
-    planar_scan = planar_scan_of([(3.0, 1.0, 1.0)], sensor=(1.0, 1.0, 0.7))
-    assert planar_scan.free_m[0] == 2.0
-    assert planar_scan.free_polygon()[0] == pytest.approx((3.0, 1.0))
-    assert planar_scan.free_polygon(0.5)[0] == pytest.approx((1.5, 1.0))
-
-
-def test_an_empty_scan_has_neither_hits_nor_free_space() -> None:
-    planar_scan = planar_scan_of(np.zeros((0, 3)))
-    assert len(planar_scan.hits_m) == 0 and not planar_scan.free_m.any()

@@ -28,26 +28,11 @@ def test_blocks_give_what_open3d_gives_for_all_at_once(monkeypatch: pytest.Monke
     assert np.abs(ours[np.lexsort(ours.T)] - expected[np.lexsort(expected.T)]).max() < 1e-6
 
 
-def test_lattice_keeps_its_points() -> None:
-    lattice = np.mgrid[0:2:0.05, 0:2:0.05, 0:0.1:0.05].reshape(3, -1).T
-    cloud = VoxelCloud(0.05)
-    cloud.add(lattice)
-    assert len(cloud) == len(lattice)
-    assert np.abs(cloud.points_m() - lattice).max() < 1e-6
-
-
 def test_points_far_from_zero_keep_their_place() -> None:
     far = np.array([[5e6, 4e6, 100.0], [5e6 + 0.01, 4e6, 100.0], [5e6 - 3.0, 4e6, 100.0]])
     cloud = VoxelCloud(0.05)
     cloud.add(far)
     assert cloud.points_m() == pytest.approx(np.array([far[2], far[:2].mean(axis=0)]), abs=1e-6)
-
-
-def test_voxels_of_few_points_can_be_left_out() -> None:
-    cloud = VoxelCloud(0.1)
-    cloud.add(np.array([[0.0, 0, 0], [0.01, 0, 0], [1.0, 0, 0]]))
-    assert len(cloud.points_m(least=2)) == 1
-    assert VoxelCloud(0.1).points_m().shape == (0, 3)
 
 
 def test_what_cannot_be_a_building_is_refused() -> None:

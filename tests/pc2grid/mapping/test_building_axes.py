@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.mapping.building_axes import WallDirection, pull_to_axes, wall_direction
+from pc2grid.mapping.building_axes import WallDirection
 from pc2grid.mapping.loop_parameters import LOOPS
 from pc2grid.mapping.pose_graph import Edge, optimise
 from pc2grid.mapping.precision import position_sigmas
@@ -55,25 +55,6 @@ def off(poses: np.ndarray, truth: np.ndarray) -> float:
 DRIFT_RAD = np.random.default_rng(3).normal(0.0, math.radians(0.3), 99)
 """What loop closure expects of tracking: 3 degrees after 99 steps."""
 TURNING = [0.0] * 50 + [math.pi / 2] * 50
-
-
-def test_a_corner_of_two_walls_has_their_direction() -> None:
-    tilt = math.radians(10.0)
-    corner = wall_direction(np.repeat([tilt, tilt + math.pi / 2, tilt + math.pi], 20))
-    assert corner.direction_rad == pytest.approx(tilt)
-    assert corner.concentration == pytest.approx(1.0)
-
-
-def test_a_round_wall_has_no_direction() -> None:
-    assert wall_direction(np.linspace(0.0, 2 * math.pi, 400, endpoint=False)).concentration < 1e-6
-    assert wall_direction(np.empty(0)) == WallDirection(0.0, 0.0)
-
-
-def test_deviations_are_from_the_axes_of_most() -> None:
-    yaw = np.radians([0.0, 1.0, 90.0, 180.0, -90.0, 30.0])
-    deviation, information = pull_to_axes(yaw, [WallDirection(0.0, 1.0)] * 6)
-    assert np.degrees(deviation) == pytest.approx([-0.2, 0.8, -0.2, -0.2, -0.2, 29.8], abs=0.25)
-    assert information[5] < 0.02 * information[0]  # a wing at another angle
 
 
 def test_axes_straighten_a_drive_without_loops() -> None:

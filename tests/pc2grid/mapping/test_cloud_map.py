@@ -55,16 +55,6 @@ def test_plan_is_free_where_floor_is_seen_and_nothing_stands() -> None:
     assert cell_at(drivable_plan(room_cloud(), one_is_enough), 1.5, 4.4) == 100
 
 
-def test_map_is_drawn_like_the_scans_of_a_session() -> None:
-    grid = map_cloud(room_cloud())
-    assert cell_at(grid, 3.0, 2.0) < 20
-    assert cell_at(grid, 5.02, 3.2) > 65  # the near side of the pillar
-    assert cell_at(grid, 4.0, 0.02) > 65
-    assert cell_at(grid, -0.3, 3.0) == -1
-    # The whole room but pillar and table, and nothing else.
-    assert 40.0 < grid.free.sum() * grid.resolution_m**2 < 48.0
-
-
 def test_floor_hidden_by_furniture_is_free_up_to_the_wall_and_a_hole_in_it_is_closed() -> None:
     cloud = room_cloud()
     hidden = (cloud[:, 2] < 0.1) & (cloud[:, 0] > 0.1) & (cloud[:, 0] < 0.4) & (cloud[:, 1] > 1.0)
@@ -86,13 +76,6 @@ def test_ground_far_from_seen_floor_stays_unknown() -> None:
     assert cell_at(map_cloud(cloud[~wide]), 1.5, 2.0) == -1
 
 
-def test_tiles_do_not_show() -> None:
-    small = CloudMapParameters(tile_m=8.0)
-    one = map_cloud(room_cloud(), parameters=CloudMapParameters(tile_m=16.0))
-    several = map_cloud(room_cloud() - (4.0, 3.0, 0.0), parameters=small)
-    assert several.free.sum() == pytest.approx(one.free.sum(), rel=0.02)
-
-
 def test_single_scan_is_drawn_from_its_origin() -> None:
     """Sixteen rings around a sensor 1 m above the floor: on the floor there is no room for a viewpoint."""
     bearing, elevation = np.meshgrid(np.linspace(-np.pi, np.pi, 1800), np.radians(np.arange(-15, 16, 2)))
@@ -107,22 +90,6 @@ def test_single_scan_is_drawn_from_its_origin() -> None:
     grid = map_cloud(scan, origin_m=origin)
     assert cell_at(grid, 5.0, 4.0) < 20
     assert max(cell_at(grid, x_m, 2.0) for x_m in (7.98, 8.02)) > 65
-
-
-def test_denser_cloud_gives_the_same_plan() -> None:
-    cloud = room_cloud() + 0.02  # away from the edges of cells
-    rng = np.random.default_rng(0)
-    dense = np.concatenate((cloud, cloud + rng.uniform(-0.01, 0.01, cloud.shape)))
-    assert np.array_equal(drivable_plan(cloud).cells, drivable_plan(dense).cells)
-
-
-def test_cloud_is_turned_about_its_middle() -> None:
-    """Coordinates of a country are millions of metres: a tilt about their origin would move the building."""
-    country = np.array([4e6, 5e6, 300.0])
-    near, far = (
-        transform_points(level_cloud(c), c) for c in (room_cloud(1.0, 2.0), room_cloud(1.0, 2.0) + country)
-    )
-    assert np.abs(far - near - (4e6, 5e6, 0.0)).max() < 0.01
 
 
 @pytest.mark.parametrize(("scale", "words"), [(1000.0, "too high"), (0.001, "too small")])

@@ -137,12 +137,6 @@ def test_an_object_that_was_there_on_the_way_out_only_does_not_bend_a_map() -> N
     assert not found.bent
 
 
-def test_nothing_to_compare() -> None:
-    nowhere = Trajectory(stamps_ns=np.empty(0), T_session_base=np.empty((0, 4, 4)))
-    empty = OccupancyGrid(cells=np.empty((0, 0)), resolution_m=0.05, origin_m=(0.0, 0.0))
-    assert measure_consistency([], empty, nowhere) == Consistency()
-
-
 def among_people(session: Session) -> Iterator[Reading]:
     """Readings of a session in which one person walks 3 m ahead of the robot, one behind it, and three come
     towards it; upright cylinders of 0.2 m radius."""

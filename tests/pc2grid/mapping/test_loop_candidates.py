@@ -10,7 +10,6 @@ import pytest
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates
-from pc2grid.mapping.pose_graph import between, compose
 
 STEP_M = 4.0
 
@@ -48,10 +47,6 @@ def accepted(*batches: list[Candidate]) -> list[Candidate]:
 NODES = corridor(41)[0]
 
 
-def test_near_the_tracked_pose_one_recognition_is_enough() -> None:
-    assert len(accepted([seen(NODES, 9, 10, 31)])) == 1
-
-
 def test_far_from_the_tracked_pose_others_must_agree() -> None:
     off = SE2(0.0, 4.0, 0.0)  # of 84 m; 2.4 m are a standard deviation
     alone = [seen(NODES, 9, 10, 31, off=off)]
@@ -86,10 +81,3 @@ def test_what_is_not_accepted_waits_and_what_cannot_be_is_forgotten() -> None:
     second = seen(NODES, 10, 7, 34, off=off)
     candidates.add([second])
     assert candidates.acceptable(*corridor(41)) == [first, second]
-
-
-def test_poses_are_composed_and_inverted() -> None:
-    a, b = np.array([[1.0, 2.0, 0.5]]), np.array([[-3.0, 0.5, 2.0]])
-    assert between(a, compose(a, b)) == pytest.approx(b)
-    both = SE2(*a[0]) @ SE2(*b[0])
-    assert compose(a, b)[0] == pytest.approx((both.x, both.y, both.yaw))

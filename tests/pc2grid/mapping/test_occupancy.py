@@ -96,17 +96,6 @@ def test_a_grid_tells_the_heights_of_what_stands_there() -> None:
     assert unknown.grid().heights is None
 
 
-def test_a_grid_knows_the_plane_of_its_laser() -> None:
-    def drawn(*heights_m: float | None) -> float | None:
-        builder = GridBuilder(ProjectionConfig())
-        for height_m in heights_m:
-            builder.add(dataclasses.replace(disc(2.0), height_m=height_m), SE2())
-        return builder.grid().height_m
-
-    assert drawn(0.3, 0.3) == 0.3
-    assert drawn(0.3, 2.0) is None and drawn(0.3, None) is None and drawn(None) is None
-
-
 def test_a_map_may_span_half_a_kilometre_between_two_rooms() -> None:
     builder = GridBuilder(ProjectionConfig())
     builder.add(disc(2.0), SE2(0.0, 0.0, 0.0))
@@ -159,7 +148,3 @@ def test_lone_hit_beside_a_wall_is_noise_until_it_is_repeated() -> None:
 def occupied_at(grid: OccupancyGrid, points: NDArray[np.floating]) -> NDArray[np.bool_]:
     cells = grid.to_cell(points)
     return np.asarray(grid.cells[cells[:, 0], cells[:, 1]] >= 65)
-
-
-def test_nothing_seen_gives_an_empty_grid() -> None:
-    assert GridBuilder(ProjectionConfig()).grid().cells.size == 0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -11,7 +9,6 @@ from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.mapping.pose_graph import Edge, optimise
 from pc2grid.mapping.precision import (
-    PRECISION,
     position_sigmas,
     precision_of,
     precision_warning,
@@ -100,44 +97,6 @@ def test_a_loop_from_the_end_of_the_wing_ties_it() -> None:
     assert tied[-1] < 0.5 * loose[-1]
 
 
-def test_it_does_not_matter_where_the_session_begins() -> None:
-    last = len(TRUTH) - 1
-    backwards = [
-        replace(
-            edge,
-            first=last - edge.second,
-            second=last - edge.first,
-            T_first_second=edge.T_first_second.inverse(),
-            information=_turned(edge),
-        )
-        for edge in edges(TRUTH)
-    ]
-    sigma, _ = position_sigmas(TRUTH, edges(TRUTH))
-    reversed_, _ = position_sigmas(TRUTH[::-1].copy(), backwards)
-    assert np.allclose(reversed_[::-1], sigma, rtol=1e-3)
-
-
-def _turned(edge: Edge) -> F64:
-    """The information of an edge on its inverse."""
-    back = edge.T_first_second.inverse()
-    c, s = np.cos(back.yaw), np.sin(back.yaw)
-    # A small change of the edge moves its inverse by this.
-    moved = -np.array([[c, -s, -back.y], [s, c, back.x], [0.0, 0.0, 1.0]])
-    turn_back = np.linalg.inv(moved)
-    return np.asarray(turn_back.T @ edge.information @ turn_back)
-
-
-def test_fewer_places_are_interpolated() -> None:
-    sigma, _ = position_sigmas(TRUTH, edges(TRUTH))
-    few, _ = position_sigmas(TRUTH, edges(TRUTH), parameters=replace(PRECISION, most_places=len(TRUTH) // 2))
-    assert np.abs(few - sigma).max() < 0.02
-
-
-def test_one_pose_is_where_it_is() -> None:
-    sigma, _ = position_sigmas(np.zeros((1, 3)), [])
-    assert sigma.tolist() == [0.0]
-
-
 def way(length_m: float = 30.0) -> Trajectory:
     count = round(length_m / 0.5) + 1
     return Trajectory(
@@ -166,8 +125,3 @@ def test_a_map_that_is_tied_well_has_no_warning() -> None:
     # Less than a local map: nothing to come back to.
     assert precision_of(way(1.0), np.array([1]), np.array([2.0])).loose == ()
     assert precision_of(way(), np.empty(0, np.int64), np.empty(0)) == Precision()
-
-
-def test_stamps_and_sigmas_belong_together() -> None:
-    with pytest.raises(ValueError, match="expected as many stamps as sigmas, got 2 and 1"):
-        Precision(stamps_ns=(0, 1), sigma_m=(0.1,))

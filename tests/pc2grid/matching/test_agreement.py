@@ -9,7 +9,6 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.matching.agreement import Support, agreement
-from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part
@@ -58,21 +57,6 @@ def test_where_the_map_knows_nothing_it_says_nothing() -> None:
     east = HERE.apply(found.points_m)[:, 0] > 10.1
     assert (found.support[east] == Support.UNKNOWN).all()
     assert (found.support[~east] != Support.UNKNOWN).mean() > 0.95
-
-
-@pytest.mark.parametrize("pose", [HERE, SE2(6.0, 5.0, 0.7), SE2(1.0, 13.0, 3.0)])
-def test_the_shares_are_those_that_the_score_is_made_of(pose: SE2) -> None:
-    target, query = Walls.of(OFFICE), Walls.of(office_part((10.0, 7.0)))
-    found, fit = agreement(target, query, pose), score_fit(target, query, pose, np.eye(3))
-    known = found.share(Support.FITS) + found.share(Support.CONTRADICTED)
-    assert known == pytest.approx(fit.overlap)
-    assert found.share(Support.UNKNOWN) == pytest.approx(1.0 - fit.overlap)
-
-
-def test_a_wrong_place_shows_what_speaks_against_it() -> None:
-    found = agreement(Walls.of(OFFICE), Walls.of(office_part((10.0, 7.0))), SE2(6.0, 5.0, 0.7))
-    assert found.share(Support.CONTRADICTED) > 0.3
-    assert len(found.missed_m) > 50
 
 
 @pytest.mark.parametrize("value", [UNKNOWN, FREE])

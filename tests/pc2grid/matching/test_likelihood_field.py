@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField, LikelihoodParameters
-from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.model import OccupancyGrid
 
 
 def a_grid(resolution_m: float = 0.05) -> OccupancyGrid:
@@ -29,14 +29,6 @@ def test_the_field_is_a_gaussian_of_the_exact_distance(resolution_m: float, sigm
     assert np.array_equal(field.known, ~unknown)
 
 
-def test_a_margin_is_unknown_and_keeps_the_frame() -> None:
-    grid = a_grid()
-    field, wide = LikelihoodField.of(grid), LikelihoodField.of(grid, margin_m=0.5)
-    assert wide.values.shape == (110, 160) and wide.origin_m == pytest.approx((-1.5, 1.5))
-    assert np.array_equal(wide.values[10:-10, 10:-10], field.values)
-    assert not wide.known[:10].any() and (wide.values[:2] == LIKELIHOOD.neutral_value).all()
-
-
 def test_points_are_looked_up_in_their_cells_and_outside_nothing_is_known() -> None:
     grid = a_grid()
     field = LikelihoodField.of(grid)
@@ -45,10 +37,3 @@ def test_points_are_looked_up_in_their_cells_and_outside_nothing_is_known() -> N
     assert (likelihood == 1.0).all() and known.all()
     likelihood, known = field.at(np.array([[-1.01, 3.0], [0.0, 1.99], [6.01, 3.0], [0.0, 6.51]]))
     assert not likelihood.any() and not known.any()
-
-
-@pytest.mark.parametrize("value", [UNKNOWN, 0])
-def test_a_grid_without_walls_has_a_field(value: int) -> None:
-    cells = np.full((30, 20), value, np.int8)
-    field = LikelihoodField.of(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)))
-    assert (field.values == (LIKELIHOOD.neutral_value if value == UNKNOWN else 0)).all()

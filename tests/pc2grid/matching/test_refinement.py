@@ -9,7 +9,6 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.matching._kernels import normal_equations
-from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.refinement import (
     REFINEMENT,
     RefinementParameters,
@@ -17,7 +16,7 @@ from pc2grid.matching.refinement import (
     plain_normal_equations,
     refine,
 )
-from pc2grid.matching.walls import WallParameters, Walls
+from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part, plan
@@ -41,28 +40,6 @@ def test_the_compiled_normal_equations_are_the_plain_ones(near: tuple[float, flo
     size = math.hypot(step[0], step[1])
     assert size > 0.01
     assert pose == pytest.approx(np.array([*near, 0.3]) + (step * 2.0 / size if size > 2.0 else step))
-
-
-def test_a_step_of_the_refinement_is_two_cells_at_most() -> None:
-    """Far down the slope of a wall the straight line leads much too far."""
-    field = np.zeros((80, 80), np.uint8)
-    away = np.arange(80) - 40.0
-    sigma = LIKELIHOOD.sigma_m / FIELD.resolution_m
-    field[:] = np.exp(-0.5 * (away / sigma) ** 2) * 255
-    x, y = np.zeros(40), np.linspace(-15, 15, 40)
-    start = np.array([40.5 - 2.2 * sigma, 40.0, 0.0])
-    (tx, ty, _), _, _ = gauss_newton(field, x, y, start, ONE_STEP)
-    assert math.hypot(tx - start[0], ty - 40.0) == pytest.approx(2.0, abs=1e-9)
-    assert tx > start[0]
-    (tx, _, yaw), _, _ = gauss_newton(field, x, y, start, RefinementParameters(steps=30))
-    assert tx == pytest.approx(40.5, abs=0.05) and yaw == pytest.approx(0.0, abs=1e-3)
-
-
-def test_many_points_are_refined_after_a_few_of_them() -> None:
-    walls = Walls.of(office(), WallParameters(spacing_m=0.05))
-    assert len(walls.points_m) > 2000
-    pose, _ = refine(FIELD, walls.points_m, SE2(0.12, -0.08, 0.01), (10.0, 7.0))
-    assert math.hypot(pose.x, pose.y) < 0.01 and abs(pose.yaw) < 1e-3
 
 
 def test_the_pose_found_turns_with_the_query() -> None:

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy import ndimage
 
-from pc2grid.matching.walls import WALLS, WallParameters, Walls, steadiness, thin_evenly
+from pc2grid.matching.walls import WALLS, WallParameters, Walls, thin_evenly
 from pc2grid.model import OCCUPIED, THING, OccupancyGrid
 
 
@@ -25,26 +24,6 @@ def test_a_wall_point_counts_by_the_size_of_its_object() -> None:
     assert (walls.weights[~box] == 1.0).all() and box.sum() >= 25
     assert walls.weights[box] == pytest.approx(0.6 / 2.0, abs=0.03)  # a cell wider on each side
     assert walls.weight == pytest.approx((~box).sum() + 0.3 * box.sum(), rel=0.05)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.01, 0.1, 1.0])
-def test_an_object_is_as_long_as_its_connected_component(share: float) -> None:
-    occupied = np.random.default_rng(0).random((60, 90)) < share
-    cells = np.argwhere(occupied)[::2]
-    joined = ndimage.binary_dilation(occupied, np.ones((3, 3)))
-    labels, _ = ndimage.label(joined, np.ones((3, 3)))
-    boxes = ndimage.find_objects(labels)
-    longer = np.array([max(s.stop - s.start for s in boxes[labels[i, j] - 1]) for i, j in cells])
-    expected = np.minimum(longer * 0.05 / WALLS.fixed_m, 1.0)
-    assert np.allclose(steadiness(occupied, cells, 0.05), expected)
-
-
-def test_thinning_keeps_one_point_a_square_and_the_order() -> None:
-    points = np.random.default_rng(0).uniform(-3, 3, (500, 2))
-    kept = thin_evenly(points, 0.5)
-    squares = np.floor(points / 0.5).astype(int)
-    assert (np.diff(kept) > 0).all()
-    assert len(kept) == len(np.unique(squares, axis=0)) == len(np.unique(squares[kept], axis=0))
 
 
 @settings(max_examples=20, deadline=None)

@@ -9,27 +9,18 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
-from scipy import ndimage
 
 from pc2grid.geometry import SE2
 from pc2grid.matching._kernels import best_in_tiles, tile_bounds
-from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import (
-    BLOCK,
-    BOUND_SLACK,
-    MARGIN_M,
     MOST_POINTS,
-    REACHES_M,
-    SQUARE,
-    TILE,
     SearchMap,
     SearchParameters,
     Tiles,
     headings,
-    levels_of,
     plain_best_in_tiles,
     plain_sums,
     plain_tile_bounds,
@@ -44,14 +35,6 @@ STEP = math.radians(2.0)
 ALL = {"floor": 0.0, "keep": 0.0}
 
 
-def image(target: SearchMap, level: int) -> np.ndarray:
-    """A sliding maximum as cells (H, W), put together from its images."""
-    rows, columns = (slice(n, -n) for n in TILE)
-    inner = target.images[level][..., rows, columns]
-    _, _, height, width = inner.shape
-    return inner.transpose(2, 0, 3, 1).reshape(height * SQUARE, width * SQUARE)
-
-
 def score(points: np.ndarray, pose: np.ndarray, level: np.ndarray) -> float:
     """Mean of sliding maxima `level` (N,) at points (N, 2) m moved by x, y, yaw."""
     cells = np.array([*(pose[:2] - FIELD.origin_m) / FIELD.resolution_m, pose[2]])
@@ -59,58 +42,10 @@ def score(points: np.ndarray, pose: np.ndarray, level: np.ndarray) -> float:
     return float(total / (255.0 * len(points)))
 
 
-def of_cells(points: np.ndarray, step_rad: float) -> np.ndarray:
-    """The sliding maxima for half a cell and half a step of heading."""
-    return levels_of(points / FIELD.resolution_m, step_rad, MAP)[3]
-
-
 def seen_from(truth: np.ndarray, walls: np.ndarray) -> np.ndarray:
     """Wall points of the map in the frame of a pose."""
     c, s = math.cos(truth[2]), math.sin(truth[2])
     return ((walls - truth[:2]) @ np.array([[c, -s], [s, c]])).astype(np.float32)
-
-
-@pytest.mark.parametrize("resolution_m", [0.03, 0.05, 0.1])
-def test_a_level_is_the_maximum_within_its_reach(resolution_m: float) -> None:
-    """Each is made from the one before; here from the field itself, whose edge goes on outside."""
-    cells = np.full((90, 120), FREE, np.int8)
-    cells[np.random.default_rng(3).random(cells.shape) < 0.01] = OCCUPIED
-    found = SearchMap.of(OccupancyGrid(cells=cells, resolution_m=resolution_m, origin_m=(0.0, 0.0)))
-    height, width = found.field.values.shape
-    for level, reach_m in enumerate(REACHES_M):
-        side = 2 * math.ceil(reach_m / resolution_m - 1e-6) + 1
-        expected = ndimage.maximum_filter(found.field.values, side, mode="nearest")
-        assert np.array_equal(image(found, level)[:height, :width], expected)
-
-
-@settings(max_examples=8, deadline=None)
-@given(seed=st.integers(0, 10_000), corner=st.booleans())
-def test_the_best_pose_is_the_best_of_all_in_the_box(seed: int, corner: bool) -> None:
-    rng = np.random.default_rng(seed)
-    points = rng.uniform(-5, 5, (30, 2)).astype(np.float32)
-    # Near a corner of the map, most windows hang over its edge.
-    start = np.array([[*((0.3, 0.3) if corner else rng.uniform(3, 11, 2)), rng.uniform(-3, 3)]])
-    found = search_windows(
-        MAP,
-        points,
-        start,
-        half_t_m=0.2,
-        half_a_rad=2 * STEP,
-        parameters=SearchParameters(step_rad=STEP, **ALL),
-    )
-    # The box has two headings, each of two halves.
-    steps, turns = FIELD.resolution_m * np.arange(-4, 5), STEP * np.arange(-1.5, 2)
-    poses = start[0] + np.array([(dx, dy, da) for dx in steps for dy in steps for da in turns])
-    level = of_cells(points, STEP)
-    everywhere = [score(points, pose, level) for pose in poses]
-    # A coordinate on the border of two cells may be rounded either way; and the squares of the lattice that
-    # the box touches reach over its edge.
-    assert max(everywhere) - 0.02 <= found[0, 3]
-    assert score(points, found[0, :3], level) == pytest.approx(found[0, 3], abs=0.02)
-    assert np.abs(found[0, :2] - start[0, :2]).max() <= 0.2 + SQUARE * FIELD.resolution_m
-    within = start[0] + rng.uniform(-1, 1, (200, 3)) * (0.2, 0.2, 2 * STEP)
-    exact = np.zeros(len(points), int)
-    assert max(score(points, pose, exact) for pose in within) <= found[0, 3] + 0.02
 
 
 @settings(max_examples=15, deadline=None)
@@ -149,20 +84,6 @@ def test_a_cut_out_of_the_map_is_found_where_it_was_cut(center: tuple[float, flo
     assert abs(pose.yaw) < math.radians(0.5)
     fit = score_fit(MAP.walls, walls, pose, np.eye(3))
     assert fit.forward > 0.95 and fit.backward > 0.9 and fit.overlap > 0.99
-
-
-@pytest.mark.parametrize("count", [1, 3, 4, 90])
-def test_the_right_one_of_several_boxes_wins(count: int) -> None:
-    rng = np.random.default_rng(count)
-    truth = np.array([10.3, 7.1, 0.4])
-    walls = WALLS_M[np.hypot(*(WALLS_M - truth[:2]).T) < 4.0]
-    points = seen_from(truth, walls[rng.choice(len(walls), count, replace=False)])
-    starts = truth + np.array([(0.3, -0.2, 0.05), (-3.0, 2.0, 1.0), (4.0, -3.0, -2.0)])
-    shape = {"half_t_m": 0.5, "half_a_rad": math.radians(5.0)}
-    found = search_windows(MAP, points, starts, parameters=SearchParameters(floor=0.3, keep=0.7), **shape)
-    assert found[0, 3] > 0.95
-    if count == 90:
-        assert math.dist(found[0, :2], truth[:2]) < 0.15 and abs(found[0, 2] - truth[2]) < 0.03
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -227,27 +148,6 @@ def test_leaving_out_what_would_not_be_reported_changes_nothing(seed: int, half_
     assert np.array_equal(found, whole[whole[:, 3] >= max(0.3, 0.8 * whole[0, 3])])
 
 
-def test_points_so_far_away_that_no_maximum_covers_them() -> None:
-    """Half a heading moves them farther than any sliding maximum looks, and they may be on a wall."""
-    rng, half_a_rad = np.random.default_rng(5), math.radians(10.0)
-    angles, far = rng.uniform(-math.pi, math.pi, 24), rng.uniform(1, 20, 24)
-    points = np.column_stack((far * np.cos(angles), far * np.sin(angles))).astype(np.float32)
-    starts = np.array([(10.02, 7.03, 0.2 + turn * 2 * half_a_rad) for turn in (-1, 0, 1)])
-    coarse = SearchParameters(step_rad=half_a_rad, **ALL)
-    found = search_windows(MAP, points, starts, half_t_m=0.2, half_a_rad=half_a_rad, parameters=coarse)
-    level = levels_of(points / FIELD.resolution_m, half_a_rad, MAP)[3]
-    uncovered = far * 0.5 * half_a_rad > REACHES_M[-1]
-    assert np.array_equal(level < 0, uncovered) and 0 < np.count_nonzero(uncovered) < 24
-    steps, sides = FIELD.resolution_m * np.arange(-4, 5), half_a_rad * np.array((-0.5, 0.5))
-    poses = [
-        start + np.array((dx, dy, da)) for start in starts for dx in steps for dy in steps for da in sides
-    ]
-    scores = [score(points, pose, level) for pose in poses]
-    assert max(scores) - 0.02 <= found[0, 3]
-    assert score(points, found[0, :3], level) == pytest.approx(found[0, 3], abs=0.02)
-    assert max(scores) - np.median(scores) > 0.05
-
-
 def boxes_around(rng: np.random.Generator, inside: bool) -> np.ndarray:
     """Boxes (6, 3) in cells: within the map, or over its edge and beyond; two of them have one heading."""
     height, width = FIELD.values.shape
@@ -277,54 +177,3 @@ def test_the_compiled_functions_are_the_plain_ones(seed: int, inside: bool) -> N
     assert np.sort(fast[:, 3]) == pytest.approx(np.sort(slow[:, 3]), abs=1e-12)
     again = plain_sums(MAP.images, levels[3], points, fast[:, :3])
     assert again / (255.0 * 25) == pytest.approx(fast[:, 3], abs=1e-12)
-
-
-@settings(max_examples=10, deadline=None)
-@given(seed=st.integers(0, 10_000))
-def test_no_pose_of_a_square_exceeds_its_bound(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    points, half_a = rng.uniform(-120, 120, (50, 2)), math.radians(1.7)
-    level = levels_of(points, half_a, MAP)
-    square = np.array([[250.0, 200.0, 0.4]])
-    found = [plain_sums(MAP.images, level[0], points, square)[0]]
-    # Its half, a quarter of that and a cell in it: each is bounded by the one before.
-    for part, (at, turn) in enumerate((((0.0, 0.0), 0.5), ((-1.0, 1.0), 0.5), ((-0.5, 1.5), 0.5)), start=1):
-        pose = square + np.array((*at, turn * half_a))
-        found.append(plain_sums(MAP.images, level[part], points, pose)[0])
-        # Half a cell is neglected: of 3,000 seeds by 0.012 of all points at most.
-        assert found[part] - (1.0 - BOUND_SLACK) * 255 * 50 <= found[part - 1] < 255 * 50
-    poses = square + rng.uniform(-1, 1, (300, 3)) * (0.5 * SQUARE, 0.5 * SQUARE, half_a)
-    assert plain_sums(MAP.images, np.zeros(50, np.int64), points, poses).max() <= found[0]
-
-
-def test_tiles_hold_each_square_that_a_box_touches_once() -> None:
-    boxes = np.array([(10.0, 10.0, 0.5), (14.0, 10.0, 0.5), (600.0, -3.0, 0.5), (10.0, 10.0, 2.0)])
-    tiles = Tiles.of(boxes, 8.0)
-    assert set(tiles.inside.ravel().tolist()) == {0, 65535}
-    expected = {
-        (yaw, row, column)
-        for x, y, yaw in boxes.tolist()
-        for row in range(math.floor((y - 8) / SQUARE), math.ceil((y + 8) / SQUARE))
-        for column in range(math.floor((x - 8) / SQUARE), math.ceil((x + 8) / SQUARE))
-    }
-    found = [
-        (yaw, *(corner + square).tolist())
-        for corner, yaw, inside in zip(tiles.corner, tiles.yaw_rad.tolist(), tiles.inside, strict=True)
-        for square in np.argwhere(inside)
-    ]
-    assert len(found) == len(set(found)) and set(found) == expected
-
-
-def test_a_tile_is_made_of_whole_blocks() -> None:
-    assert all(side % BLOCK == 0 for side in TILE)
-
-
-def test_the_edge_of_the_margin_is_neutral_on_all_levels() -> None:
-    """So that points farther outside may be taken to lie on it."""
-    blurred_m = 2.0 * LIKELIHOOD.sigma_m
-    wide = round((MARGIN_M - REACHES_M[-1] - blurred_m) / FIELD.resolution_m)
-    assert wide * FIELD.resolution_m >= 0.9
-    for level in range(len(REACHES_M)):
-        edge = image(MAP, level)
-        edge[wide:-wide, wide:-wide] = LIKELIHOOD.neutral_value
-        assert (edge == LIKELIHOOD.neutral_value).all()

@@ -5,9 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
 
-from pc2grid.geometry import SE2, invert_pose, motion_size, transform_points
+from pc2grid.geometry import invert_pose, motion_size, transform_points
 from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import SimulationConfig, carried_camera, prepare_session, simulate_session
@@ -57,18 +56,6 @@ def test_what_it_sees_lies_on_the_surfaces_of_the_room_at_its_true_pose() -> Non
         assert off_surface_m(points_m).max() < 0.005  # depths are in whole millimetres
 
 
-def test_it_looks_ahead_and_down_from_the_height_of_a_hand() -> None:
-    drive = session()
-    poses = np.array([drive.pose(0.1 * k) for k in range(300)])
-    down_deg = np.degrees(np.arcsin(-poses[:, 2, 0]))
-    assert abs(down_deg.mean() - 20.0) < 5.0 and np.ptp(down_deg) > 15.0  # 20 degrees of sway, of 3 sines
-    assert np.abs(down_deg - 20.0).max() < 20.1
-    assert np.abs(poses[:, 2, 3] - 1.5).max() < 0.101
-    planar = [SE2.from_matrix(pose) for pose in poses[:20]]
-    true = [drive.drive.pose(0.1 * k) for k in range(20)]
-    assert max(abs(a.x - b.x) + abs(a.y - b.y) for a, b in zip(planar, true, strict=True)) < 1e-9
-
-
 def test_its_odometry_is_of_six_degrees_of_freedom() -> None:
     drive = session()
     assert drive.odometry is not None
@@ -78,38 +65,6 @@ def test_its_odometry_is_of_six_degrees_of_freedom() -> None:
     true = drive.pose(reading.time_s)
     assert np.allclose(T_odom_base[2], true[2])  # height and tilt are those of the hand
     assert np.linalg.norm(np.linalg.inv(drive.pose(0.0))[:3] @ true[:, 3]) > 0.1
-
-
-def kept(drive: Session) -> float:
-    """Share of the pixels that have a depth."""
-    return float(np.mean([np.isfinite(reading.values_m).mean() for reading in drive.readings()]))
-
-
-def test_holes_are_patches_of_the_size_that_was_asked_for() -> None:
-    whole, holed = session(), session(holes=0.4)
-    assert kept(holed) == pytest.approx(0.6 * kept(whole), abs=0.03)
-    lost = np.isnan(next(iter(holed.readings())).values_m).reshape(72, 96)
-    beside = lost[:, 1:] == lost[:, :-1]
-    assert beside.mean() > 0.85  # single pixels would agree with their neighbours in 0.52 of the cases
-
-
-def test_points_fly_where_depth_jumps_and_only_there() -> None:
-    """A camera that sees no jump shows none; behind a thing, some lie between it and the wall."""
-    drive = session(flying=1.0)
-    calm = [drive.scan(reading) for reading in drive.readings()]
-    away = [transform_points(drive.pose(k / 3.0), scan.points_m) for k, scan in enumerate(calm)]
-    assert max(off_surface_m(points_m).max() for points_m in away) < 0.35  # of corners seen at a small angle
-    cluttered = SimulationConfig(length_m=4.0, clutter=30, seed=4)
-    shares = []
-    for flying in (0.0, 1.0):
-        config = carried_camera(cluttered, rate_hz=3.0)
-        quiet = {"noise_per_m": 0.0, "dropout": 0.0, "edge_dropout": 0.0, "holes": 0.0, "flying": flying}
-        config = config.model_copy(update={"depth": config.depth.model_copy(update=quiet)})
-        made = prepare_session(sensor="depth", grid=room(), config=config)
-        images = [reading.values_m for reading in made.readings()]
-        shares.append(images)
-    changed = np.mean([(np.abs(a - b) > 0.1).mean() for a, b in zip(*shares, strict=True)])
-    assert 0.002 < changed < 0.2
 
 
 def test_a_lidar_in_the_hand_sweeps_while_the_hand_moves() -> None:

@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
-from pc2grid.config import ReadConfig
 from pc2grid.errors import OutputError
 from pc2grid.geometry import transform_points
-from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid, Scan, SensorKind
 from pc2grid.simulate import Session, SimulationConfig, iter_session, prepare_session, simulate_session
-from pc2grid.simulate import session as session_module
 from pc2grid.simulate.config import DepthConfig, DriveConfig, LaserConfig, LidarConfig, OdometryConfig
 from pc2grid.simulate.sensors import depth, laser, lidar
 from pc2grid.simulate.session import EPOCH_NS
@@ -126,18 +123,6 @@ def test_depth_noise_grows_with_the_square_of_depth() -> None:
         np.testing.assert_allclose(reading * 1000, np.round(reading * 1000), atol=1e-3)
 
 
-def test_depth_is_lost_at_edges_and_out_of_range() -> None:
-    camera = depth(DepthConfig(dropout=0.0, edge_dropout=1.0))
-    scene = np.full((120, 160), 2.0, np.float32)
-    scene[:, 80:] = 4.0
-    scene[0, 0], scene[0, 4], scene[0, 8] = np.inf, 9.0, 0.1
-    reading = camera.measure(scene.ravel(), np.random.default_rng(0)).reshape(scene.shape)
-    assert np.isnan(reading[:, 79:81]).all()
-    assert np.isfinite(reading[2:, :79]).all()
-    assert np.isfinite(reading[2:, 81:]).all()
-    assert np.isnan(reading[0, [0, 4, 8]]).all()
-
-
 @pytest.mark.parametrize("make", [lidar, laser])
 def test_range_noise_dropouts_and_limits(make: Any) -> None:
     config = LidarConfig(dropout=0.1) if make is lidar else brief().laser.model_copy(update={"dropout": 0.1})
@@ -159,29 +144,10 @@ def test_sessions_differ_in_clutter_and_route_but_not_in_walls() -> None:
     assert not np.allclose(one.drive.poses[0], two.drive.poses[0])
 
 
-def test_sensors_of_one_seed_share_drive_and_clutter() -> None:
-    a, b = (prepare_session(sensor=sensor, config=brief(clutter=10)) for sensor in ("lidar", "depth"))
-    assert np.array_equal(a.drive.poses, b.drive.poses)
-    assert [furniture.pose for furniture in a.clutter] == [furniture.pose for furniture in b.clutter]
-
-
 def test_clutter_is_seen() -> None:
     session = prepare_session(sensor="lidar", config=brief(clutter=120))
     away = [away_from_walls(session, unmoved(session, scan)) for scan, _ in session.scans()]
     assert np.mean(np.concatenate(away) > 0.2) > 0.005
-
-
-def test_readings_do_not_depend_on_how_rays_are_batched(monkeypatch: pytest.MonkeyPatch) -> None:
-    session = prepare_session(sensor="depth", config=brief(length_m=1.0))
-    together = [reading.values_m for reading in session.readings()]
-    monkeypatch.setattr(session_module, "RAYS_PER_CAST", 1)
-    alone = [reading.values_m for reading in session.readings()]
-    np.testing.assert_array_equal(together, alone)
-
-
-def test_without_odometry_there_is_none() -> None:
-    config = brief(odometry=OdometryConfig(enabled=False))
-    assert all(scan.T_odom_base is None for scan, _ in iter_session(sensor="laser", config=config))
 
 
 # --- recordings ---------------------------------------------------------------------------------------
@@ -238,24 +204,6 @@ def test_recording_holds_what_the_sensor_measured(tmp_path: Path, sensor: Sensor
     true = session.drive.at(np.array([reading.time_s for reading in readings]))
     np.testing.assert_allclose(truth.planar()[:, :2], true[:, :2], atol=1e-8)
     np.testing.assert_allclose(np.cos(truth.planar()[:, 2] - true[:, 2]), 1, atol=1e-8)
-
-
-@pytest.mark.parametrize("sensor", SENSORS)
-def test_recording_reads_back_as_the_session_in_memory(tmp_path: Path, sensor: SensorKind) -> None:
-    config = brief(length_m=1.0)
-    made = simulate_session(tmp_path / "out.mcap", sensor=sensor, config=config)
-    with open_log(made.path, ReadConfig(depth_stride=1)) as log:
-        read = list(log.scans())
-    memory = [scan for scan, _ in iter_session(sensor=sensor, config=config)]
-    assert [scan.stamp_ns for scan in read] == [scan.stamp_ns for scan in memory]
-    for a, b in zip(read, memory, strict=True):
-        np.testing.assert_allclose(a.points_m, b.points_m, atol=2e-5)
-        np.testing.assert_allclose(a.T_base_sensor, b.T_base_sensor, atol=1e-9)
-        np.testing.assert_allclose(a.T_odom_base, b.T_odom_base, atol=1e-4)
-        assert (a.offsets_s is None) == (b.offsets_s is None)
-        if a.offsets_s is not None:
-            np.testing.assert_allclose(a.offsets_s, b.offsets_s, atol=1e-6)
-            np.testing.assert_allclose(a.T_first_last, b.T_first_last, atol=1e-4)
 
 
 def test_same_seed_same_bytes(tmp_path: Path) -> None:

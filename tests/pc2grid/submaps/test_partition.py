@@ -25,18 +25,12 @@ from pc2grid.submaps.junction_graph import (
     junction_graph,
     map_skeleton,
 )
-from pc2grid.submaps.partition import divide, partition, submap_at
+from pc2grid.submaps.partition import partition, submap_at
 from pc2grid.submaps.skeleton import junctions_and_ends, pixel_steps
-from tests.helpers.rooms import canvas, cross, grid_of, rectangle
+from tests.helpers.rooms import canvas, cross, grid_of
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 PAPER = PartitionConfig.paper()
-
-
-def test_a_cross_has_one_junction_in_the_middle() -> None:
-    submaps = partition(grid_of(cross(7.0, 2.0)), PAPER)
-    assert len(submaps) == 1
-    assert np.hypot(*submaps[0].center_m) < 0.3
 
 
 def test_junctions_nearer_than_the_cluster_distance_are_one() -> None:
@@ -77,14 +71,6 @@ def test_a_submap_is_a_disc_around_its_centre() -> None:
     assert submap.grid.cells.shape == (n, n) and n % 2 == 1
 
 
-def test_submaps_keep_the_cells_of_the_map() -> None:
-    grid = grid_of(cross(7.0, 2.0))
-    submap = partition(grid, PartitionConfig.paper(radius_m=4.0))[0]
-    for row, column in np.argwhere(submap.grid.cells != UNKNOWN)[::97]:
-        there = grid.to_cell(submap.grid.to_point(np.array([[row, column]])))[0]
-        assert grid.cells[tuple(there)] == submap.grid.cells[row, column]
-
-
 def test_centres_are_free_and_sorted_and_repeat() -> None:
     corridor = np.full((321, 800), UNKNOWN, np.int8)
     corridor[150:180, 50:750] = FREE
@@ -115,19 +101,6 @@ def test_junction_graph_of_a_cross_is_a_star_with_four_arms() -> None:
     arms = [length for _, _, length in graph.edges(middle[0], data="length_m")]
     assert len(arms) >= 4
     assert max(arms) == pytest.approx(6.5, abs=1.0)
-
-
-def test_junction_graph_measures_between_two_junctions() -> None:
-    corridor = np.full((321, 800), UNKNOWN, np.int8)
-    corridor[150:180, 50:750] = FREE
-    corridor[50:280, 200:230] = corridor[50:280, 500:530] = FREE
-    graph = junction_graph(grid_of(corridor))
-    a, b = (n for n, kind in graph.nodes(data="kind") if kind == "junction")
-    assert graph.edges[a, b]["length_m"] == pytest.approx(300 * 0.05, abs=0.6)
-
-
-def test_a_room_alone_is_found() -> None:
-    assert len(partition(grid_of(rectangle(6.0, 4.0)), PAPER)) >= 1
 
 
 @pytest.mark.skipif(not (DATA / "maps").is_dir(), reason="no real maps: set PC2GRID_DATA")
@@ -205,14 +178,6 @@ def test_edges_are_the_shortest_ways_along_the_skeleton(seed: int) -> None:
         for node, end in ((min(a, b), path_m[0]), (max(a, b), path_m[-1])):
             members = grid.to_point(pixels[places[node]])
             assert np.linalg.norm(members - end, axis=1).min() < 1e-5
-
-
-def test_submaps_are_made_from_the_graph() -> None:
-    grid = rooms(1)
-    graph, submaps = divide(grid, PAPER)
-    junctions = {node["center_m"] for _, node in graph.nodes(data=True) if node["kind"] == "junction"}
-    assert junctions and junctions == {submap.center_m for submap in submaps}
-    assert [s.center_m for s in submaps] == [s.center_m for s in partition(grid, PAPER)]
 
 
 @pytest.mark.parametrize("seed", [None, 0, 1])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -10,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from pc2grid.arrays import BoolGrid, cells_of
+from pc2grid.arrays import BoolGrid
 from pc2grid.submaps.sampling import sample_evenly
 from pc2grid.submaps.skeleton import (
     _DELETABLE,
@@ -20,8 +19,6 @@ from pc2grid.submaps.skeleton import (
     _padded,
     clearance_of,
     junctions_and_ends,
-    pixel_steps,
-    skeleton_of,
     thin,
 )
 
@@ -93,38 +90,12 @@ def test_guo_hall_keeps_components_and_holes(seed: int) -> None:
     assert ndimage.label(~thinned)[1] == ndimage.label(~mask)[1]
 
 
-def test_a_thick_line_becomes_its_middle() -> None:
-    mask = np.zeros((21, 60), bool)
-    mask[8:13, 5:55] = True
-    thinned = thin(mask)
-    assert set(np.flatnonzero(thinned.any(axis=1))) == {10}
-    assert thinned.sum() >= 45
-
-
-def test_thinning_of_nothing_and_of_a_single_pixel() -> None:
-    assert not thin(np.zeros((5, 5), bool)).any()
-    single = np.zeros((5, 5), bool)
-    single[0, 4] = True
-    assert np.array_equal(thin(single), single)
-    assert np.array_equal(thin_plain(single), single)
-    assert thin(np.ones((40, 40), bool)).sum() >= 1
-
-
 def test_clearance_is_the_distance_to_the_nearest_cell_that_is_not_free() -> None:
     free = np.ones((41, 41), bool)
     free[20, 20] = False
     clearance = clearance_of(free, 0.05)
     exact = ndimage.distance_transform_edt(np.pad(free, 1))[1:-1, 1:-1] * 0.05
     assert np.abs(clearance - exact).max() <= 0.03 * exact.max()
-
-
-def test_erosion_closes_what_is_narrower_than_twice_the_clearance() -> None:
-    free = np.zeros((41, 81), bool)
-    free[5:36, 3:38] = free[5:36, 43:78] = True
-    free[18:24, 38:43] = True  # a gap of 0.3 m
-    wide = ndimage.label(skeleton_of(free, 0.05, 0.1), EIGHT)[1]
-    narrow = ndimage.label(skeleton_of(free, 0.05, 0.3), EIGHT)[1]
-    assert (wide, narrow) == (1, 2)
 
 
 def junctions(skeleton: np.ndarray) -> np.ndarray:
@@ -148,25 +119,6 @@ def test_junctions_and_ends_of_a_cross() -> None:
     assert not len(junctions(line))
 
 
-def pixel_graph(skeleton: np.ndarray, resolution_m: float) -> nx.Graph:
-    pixels, steps, lengths = pixel_steps(skeleton)
-    assert np.array_equal(pixels, np.argwhere(skeleton))
-    graph = nx.Graph()
-    for (a, b), length in zip(steps, lengths, strict=True):
-        graph.add_edge(tuple(pixels[a].tolist()), tuple(pixels[b].tolist()), length_m=length * resolution_m)
-    return graph
-
-
-def test_steps_measure_along_the_skeleton() -> None:
-    corner = np.zeros((12, 12), bool)
-    corner[2, 2:9] = corner[2:9, 8] = True
-    graph = pixel_graph(corner, 0.1)
-    # The corner pixel has no short cut across: 6 steps right, 6 down.
-    assert nx.shortest_path_length(graph, (2, 2), (8, 8), "length_m") == pytest.approx(1.2)
-    diagonal = pixel_graph(np.eye(5, dtype=bool), 0.1)
-    assert nx.shortest_path_length(diagonal, (0, 0), (4, 4), "length_m") == pytest.approx(0.4 * 2**0.5)
-
-
 @given(seed=st.integers(0, 10_000), spacing=st.floats(1.0, 12.0))
 @settings(max_examples=25, deadline=None)
 def test_samples_are_apart_and_cover(seed: int, spacing: float) -> None:
@@ -187,13 +139,3 @@ def test_sampling_is_greedy_in_the_order_given(seed: int, spacing: float) -> Non
         if not kept or np.linalg.norm(np.array(kept) - cell, axis=1).min() >= spacing - 1e-9:
             kept.append(cell)
     assert np.array_equal(sample_evenly(cells, spacing), kept)
-
-
-def test_sampling_of_nothing() -> None:
-    assert sample_evenly(np.empty((0, 2), np.int64), 2.0).shape == (0, 2)
-
-
-def test_cells_of_is_argwhere() -> None:
-    mask = blobs(3)
-    assert np.array_equal(cells_of(mask), np.argwhere(mask))
-    assert cells_of(np.zeros((4, 0), bool)).shape == (0, 2)
