@@ -268,18 +268,6 @@ def test_closed_pipe_is_quiet(tmp_path: Path) -> None:
     assert done.stderr == ""
 
 
-@pytest.mark.parametrize(
-    "command",
-    ["", "demo", "simulate", "info", "convert", "relocalize", "compare", "compare paper",
-     "compare sensors", "compare recordings", "export", "db", "db info",
-     "db check", "db merge", "db copy", "config", "config dump"],
-)  # fmt: skip
-def test_every_command_explains_itself(tmp_path: Path, command: str) -> None:
-    shown = pc2grid(*command.split(), "--help", cwd=tmp_path)
-    assert shown.returncode == 0, shown.stderr
-    assert f"Usage: pc2grid {command}".rstrip() in shown.stdout
-
-
 def test_help_loads_nothing_heavy(tmp_path: Path) -> None:
     heavy = ("numpy", "scipy", "cv2", "open3d", "kiss_icp", "matplotlib", "pydantic", "numba", "networkx")
     code = (

@@ -148,13 +148,3 @@ def test_export_writes_a_page_and_does_not_overwrite_it(
     before = page.read_bytes()
     code, _, err = pc2grid(capsys, "export", folder / "b.submaps", "--report", page)
     assert code == 1 and "--force" in err and page.read_bytes() == before
-
-
-def test_nothing_is_written_if_the_session_is_not_clear(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    two, page, poses = tmp_path / "two.submaps", tmp_path / "page.html", tmp_path / "way.tum"
-    assert pc2grid(capsys, "convert", folder / "office.yaml", folder / "part.yaml", "-o", two)[0] == 0
-    code, _, err = pc2grid(capsys, "export", two, "--report", page, "--trajectory", poses)
-    assert code == 1 and "--session" in err and not page.exists() and not poses.exists()
-    assert pc2grid(capsys, "export", two, "--report", page)[0] == 0 and page.exists()

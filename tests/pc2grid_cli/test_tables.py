@@ -12,18 +12,6 @@ from pc2grid_cli import tables
 from pc2grid_cli.tables import show, table
 
 
-def test_a_table_has_a_title_on_the_left_and_numbers_on_the_right(capsys: pytest.CaptureFixture[str]) -> None:
-    made = table("maps", ["map"], ["error, m"])
-    made.add_row("lidar", "0.5")
-    made.add_row("depth camera", "12.25")
-    show("before", made, "after")
-    lines = [line.strip() for line in capsys.readouterr().out.splitlines()]
-    assert lines[0] == "before" and lines[-1] == "after"
-    assert lines[1] == "maps"
-    first, second = (line for line in lines if line.startswith(("lidar", "depth")))
-    assert len(first) == len(second) and first.endswith(" 0.5") and second.endswith("12.25")
-
-
 def test_a_narrow_terminal_cuts_nothing_off(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -97,18 +97,6 @@ def test_a_robot_is_located_where_it_is(here: Path, capsys: pytest.CaptureFixtur
     assert len(last["map"]["digest"]) == 64
 
 
-def test_relocalize_says_the_same(
-    here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
-) -> None:
-    """At the end of the recording, with no look in between."""
-    result = CliRunner().invoke(app, ["relocalize", "tuesday.mcap", "-d", "plan.submaps", "--json"])
-    history = {m["stamp_ns"]: m for m in json.loads(result.stdout)["history"]}
-    for stamp_ns, path_m, _, pose, *_ in expected:
-        if stamp_ns in history and pose is not None and path_m > 0.5:
-            moment = history[stamp_ns]
-            assert math.dist((moment["x"], moment["y"]), (pose["x"], pose["y"])) < 0.05
-
-
 def test_every_scan_of_a_recording_is_used_and_it_says_the_same_each_time(
     here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
 ) -> None:
