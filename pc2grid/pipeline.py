@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
@@ -21,16 +20,12 @@ from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LOOPS
 from pc2grid.mapping.part_maps import PartMap, draw_parts, long_enough
 from pc2grid.mapping.report import (
-    HELD_SCANS,
     check_followed,
-    not_held,
     part_reports,
     with_track_warnings,
-    without_points,
 )
 from pc2grid.mapping.track import Track, TrackRecord
 from pc2grid.model import (
-    Health,
     Loop,
     OccupancyGrid,
     ReadReport,
@@ -61,14 +56,10 @@ def follow(
 ) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
     """Each scan with its pose, and its planar scan, as they come.
 
-    The memory needed is that of one local map, however many scans there are. Those of a sensor in the hand
-    without odometry count as lost as long as few of its last scans fix their poses
-    (`pc2grid.mapping.report.not_held`); their planar scans are empty, since the map that these are cut out
-    of is not to be trusted either.
+    The memory needed is that of one local map, however many scans there are.
 
-    observer : is warned of that, once, and of scans before the first that shows which way is up, which are
-        left out (`pc2grid.estimation.carried.begin`). Raises TrackingLost if it is so at the last
-        scan.
+    observer : is warned of scans before the first that shows which way is up, which are left out
+        (`pc2grid.estimation.carried.begin`).
 
     >>> import pc2grid
     >>> with pc2grid.open_log("tuesday.mcap") as log:
@@ -77,27 +68,13 @@ def follow(
     ((4, 4), 0.0)
     """
     tracker = _tracker(config)
-    unaided: deque[Health] = deque(maxlen=HELD_SCANS)  # of a sensor in the hand, without odometry
-    fault, warned = None, False
     rest = iter(scans)
     beginning = _begin(rest)
     if beginning.warning is not None:
         observer.on_warning(beginning.warning)
     for scan in chain(beginning.scans, rest):
         tracked = tracker.track(scan)
-        registered, planar_scan = tracked.registered, tracked.planar_scan
-        if tracker.carried and scan.T_odom_base is None:
-            unaided.append(registered.health)
-            fault = not_held(unaided, "the last scans")
-        if fault is not None:
-            registered = dataclasses.replace(registered, health=Health.LOST)
-            planar_scan = planar_scan.emptied()
-            if not warned and len(unaided) == HELD_SCANS:
-                warned = True
-                observer.on_warning(str(fault))
-        yield registered, planar_scan
-    if fault is not None:
-        raise fault
+        yield tracked.registered, tracked.planar_scan
 
 
 def build_map(
@@ -167,10 +144,7 @@ def build_maps(
     if not track.with_odometry:
         _check_without_odometry(track, planar, str(log.info.path))
     kept = long_enough(parts)
-    read = with_track_warnings(log.report(), track)
-    if planar and config.projection.points_voxel_m is not None:
-        read = without_points(read)
-    reports = part_reports(read, session, parts, kept)
+    reports = part_reports(with_track_warnings(log.report(), track), session, parts, kept)
     maps = tuple(
         _session_map(
             part,
@@ -187,12 +161,8 @@ def build_maps(
 
 def _check_without_odometry(track: Track, planar: bool, name: str) -> None:
     """Raise TrackingLost if the scans of a laser, or of a sensor in the hand, do not tell where they are."""
-    if planar or track.carried:
+    if planar:
         check_followed(track.trajectory, name)
-    if track.carried:
-        fault = not_held(track.trajectory.health, name)
-        if fault is not None:
-            raise fault
 
 
 def _session_map(
@@ -278,12 +248,13 @@ def _map(
     projection = config.projection
     rest = iter(scans)
     beginning = _begin(rest)
-    narrow = any(SENSOR_MODELS[scan.sensor].narrow for scan in beginning.scans[:1])
+    models = [SENSOR_MODELS[scan.sensor] for scan in beginning.scans[:1]]
+    narrow = any(model.narrow for model in models)
     in_hand = not all(is_rolling(scan) for scan in beginning.scans[:1])
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
         points = None
-        if projection.points_voxel_m is not None:
+        if projection.points_voxel_m is not None and not any(model.planar for model in models):
             points = KeyframePoints(projection.points_voxel_m, projection.max_range_m)
             stack.enter_context(closing(points))
         closer = LoopCloser(

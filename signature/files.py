@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +15,8 @@ from pc2grid.errors import ConfigError, OutputError
 from pc2grid.io.atomic import require_writable
 from pc2grid.io.recording import open_log
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
-from pc2grid.model import SessionMap, Trajectory
+from pc2grid.mapping.report import lost_warnings
+from pc2grid.model import Health, SessionMap, Trajectory
 from pc2grid.observer import Observer, ProgressBars
 from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
@@ -146,7 +147,7 @@ def relocalize(
                     until_located=until_located,
                     observer=observer,
                 )
-                about = about_log(path, log, answer, scans=len(poses), span=span)
+                about = about_log(path, log, answer, span, poses.health)
     asked = Asked(poses=poses, about=about, database=str(database), accept=settings.relocalize.accept)
     return replace(answer, asked=asked)
 
@@ -209,9 +210,12 @@ def locate_log(
 
 
 def about_log(
-    path: Path, query: Log, answer: Answer | PoseCheck, *, scans: int, span: TimeSpan = TimeSpan()
+    path: Path, query: Log, answer: Answer | PoseCheck, span: TimeSpan, health: Sequence[Health]
 ) -> QueryRecording:
-    """The description of a recording, or of a part of it, in the JSON document of the answer."""
+    """The description of a recording, or of a part of it, in the JSON document of the answer.
+
+    health : of its scans.
+    """
     report = query.report()
     return {
         "path_m": answer.path_m,
@@ -219,10 +223,10 @@ def about_log(
         "source": path.name,
         "start_s": span.start_s,
         "duration_s": span.duration_s,
-        "scans": scans,
+        "scans": len(health),
         "sensor": query.choose().sensor,
         "lossy": report.lossy,
-        "warnings": list(report.warnings),
+        "warnings": [*report.warnings, *lost_warnings(health)],
     }
 
 

@@ -10,7 +10,7 @@ believed, else it is lost.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -131,10 +131,12 @@ class CarriedSensor:
             credible=of_known >= self._parameters.least_agreement,
         )
 
-    def holds(self, fit: Fit) -> bool:
+    def held(self, fit: Fit) -> Fit:
         """See `PlacingSensor`."""
-        placement = Placement(fit.pose, fit.alone[1], fit.overlap, 0.0, fit.measured)
-        return self._space.is_held(self._thinned, placement)
+        alone, information = fit.alone
+        placement = Placement(fit.pose, information, fit.overlap, 0.0, fit.measured)
+        held = self._space.held(self._thinned, placement)
+        return replace(fit, alone=(alone, held.information), measured=held.measured)
 
     def follow(self, belief: Belief) -> None:
         """Nothing: the surfaces of the last scans are in the map."""

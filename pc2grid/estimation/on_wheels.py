@@ -99,9 +99,9 @@ class SensorOnWheels:
         for guess in self._maps.search(self._planar_scan, prior, *window):
             yield self._matched(self._maps, guess, belief)
 
-    def holds(self, fit: Fit) -> bool:
+    def held(self, fit: Fit) -> Fit:
         """Lines hold what lies on them."""
-        return True
+        return fit
 
     def follow(self, belief: Belief) -> Estimate | None:
         """See `PlacingSensor`. Half of what a camera sees while it turns may be new to the map, but not to

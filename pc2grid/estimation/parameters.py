@@ -71,6 +71,8 @@ class TrackingParameters:
     Health:
 
     min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
+    known_m, known_rad : a scan of a sensor in the hand without odometry is lost if a standard deviation of
+        its pose on the local map is larger. The first is half of what a right answer may be off.
     give_up_scans : lost scans in a row after which tracking starts again.
     """
 
@@ -97,6 +99,8 @@ class TrackingParameters:
     map_travel_m: float = 5.0
 
     min_overlap: float = 0.3
+    known_m: float = 0.15
+    known_rad: float = math.radians(3.0)
     give_up_scans: int = 10
 
 

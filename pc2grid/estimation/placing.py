@@ -76,8 +76,8 @@ class PlacingSensor(Protocol):
     def search(self, belief: Belief) -> Iterator[Fit]:
         """Match the scan taken last wherever a belief holds it possible."""
 
-    def holds(self, fit: Fit) -> bool:
-        """Whether the map holds the scan taken last, and points do not only seem to."""
+    def held(self, fit: Fit) -> Fit:
+        """A match of the scan taken last, by what the map holds, and not only seems to."""
 
     def follow(self, belief: Belief) -> Estimate | None:
         """The motion, T_last_now, by the last scans alone; None if the scan taken last does not fit them."""
@@ -146,14 +146,11 @@ class Placer:
         if best.fit.overlap < p.min_overlap or not (best.near or best.fit.credible):
             return Placed(belief.pose, motion=self._sensor.follow(belief))
         spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
-        alone, information = best.fit.alone
+        fit = self._sensor.held(best.fit)
+        alone, information = fit.alone
         # The inverse of the sum of both covariances, also where a match tells nothing of a direction.
         believed = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
-        return Placed(
-            best.fit.pose,
-            (alone, 0.5 * (believed + believed.T)),
-            measured=best.fit.measured and (not self._is_vague(belief) or self._sensor.holds(best.fit)),
-        )
+        return Placed(fit.pose, (alone, 0.5 * (believed + believed.T)), measured=fit.measured)
 
     def _hypotheses(self, expected: Sequence[Belief]) -> list[_Hypothesis]:
         """Where the scan taken last may lie.

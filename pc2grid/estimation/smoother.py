@@ -44,7 +44,8 @@ class SmootherParameters:
         metre (rad); it grows with the square root of the way. drift_turn_m : that of the position over a turn
         of one radian.
     unsteady : in m/s and rad/s; without odometry, the change of the motion from one scan to the next is this
-        times the time between them: a robot indoors starts, stops and turns.
+        times the time between them: a robot indoors starts, stops and turns. growth : and times the time to
+        this power, so that it does not depend on how often a hand is seen.
     gyroscope_radps : of a gyroscope, with its bias.
     steady_s : the motion before is taken over this time, so that an error of one pose does not come back in
         the next with the other sign.
@@ -59,6 +60,7 @@ class SmootherParameters:
     drift: float = 0.05
     drift_turn_m: float = 0.03
     unsteady: float = 0.4
+    growth: float = 0.0
     gyroscope_radps: float = 0.02
     steady_s: float = 0.3
     scale: float = 0.05
@@ -72,7 +74,7 @@ class SmootherParameters:
 
 SMOOTHER = SmootherParameters()
 IN_THE_HAND = SmootherParameters(
-    reading_m=0.002, reading_rad=0.001, drift=0.005, drift_turn_m=0.005,
+    reading_m=0.002, reading_rad=0.001, drift=0.005, drift_turn_m=0.005, unsteady=0.9, growth=0.5,
     scale=1e-6, direction_rad=1e-6, yaw_rad_per_m=1e-6, turn=1e-6,
 )  # fmt: skip
 """For odometry in six degrees of freedom, which is visual and inertial: it is exact to millimetres from image
@@ -184,13 +186,17 @@ class Smoother:
 
     # ------------------------------------------------------------------------------------------ prediction
 
-    def start(self, T_session_base: F64, T_odom_base: F64 | None) -> None:
-        """Begin with a pose (4, 4), which defines the session frame, and a reading of odometry."""
+    def start(self, T_session_base: F64, T_odom_base: F64 | None, speed: F64 | None = None) -> None:
+        """Begin with a pose (4, 4), which defines the session frame, and a reading of odometry.
+
+        speed : (6,) of the steps before, per second; None: the sensor stands.
+        """
+        self._begins_at = np.zeros(6) if speed is None else speed
         p, d = self._parameters, len(self._free)
         reading = T_session_base if T_odom_base is None else T_odom_base
         self._state = _State(T_session_base[None].copy(), reading[None].copy(), np.zeros(_ERRORS))
         self._window = self._row(Evidence(seconds=0.0), T_session_base, reading)
-        self._begins = True  # the sensor has not been seen to move yet
+        self._begins = True  # the sensor has not been seen to move since
         errors = np.array([p.scale, p.direction_rad, p.yaw_rad_per_m, p.turn])
         own = np.concatenate((np.full(d, 1e-4), self._noise(p.reading_m, p.reading_rad)))
         information = np.diag(np.concatenate((errors, own)) ** -2)
@@ -217,15 +223,28 @@ class Smoother:
         turn : (4, 4) by a gyroscope; None if there is none.
         """
         p = self._parameters
-        spans_s = np.concatenate(((0.0,), np.cumsum(self._window.seconds[:0:-1])))  # back from the last scan
-        back = min(int(np.searchsorted(spans_s, p.steady_s)), len(spans_s) - 1)
-        step, _, _ = steps(self._state.poses[-1 - back :][:1], self._state.poses[-1:])
-        share = min(seconds / max(float(spans_s[back]), _LEAST_S), 1.0)
-        motion, sigmas = moved(np.eye(4)[None], share * step)[0], self._unsteadiness(seconds)
+        step, over_s = self._latest()
+        share = min(seconds / over_s, 1.0)
+        motion, sigmas = moved(np.eye(4)[None], share * step[None])[0], self._unsteadiness(seconds)
         if turn is not None:
             motion[:3, :3] = turn[:3, :3]
             sigmas = np.where(self._free < 3, sigmas, p.gyroscope_radps * seconds)
         return motion, sigmas
+
+    def _latest(self) -> tuple[F64, float]:
+        """The motion (6,) over the last scans, and over how many seconds."""
+        spans_s = np.concatenate(((0.0,), np.cumsum(self._window.seconds[:0:-1])))  # back from the last scan
+        back = min(int(np.searchsorted(spans_s, self._parameters.steady_s)), len(spans_s) - 1)
+        if not back:
+            return self._begins_at, 1.0
+        step, _, _ = steps(self._state.poses[-1 - back :][:1], self._state.poses[-1:])
+        return step[0], max(float(spans_s[back]), _LEAST_S)
+
+    @property
+    def speed(self) -> F64:
+        """The motion (6,) over the last scans, per second."""
+        step, over_s = self._latest()
+        return step / over_s
 
     def after(self, motion: F64, sigmas: F64) -> Belief:
         """The last pose after a motion (4, 4) with standard deviations (D,) of its own."""
@@ -241,15 +260,15 @@ class Smoother:
 
         guess : (4, 4) T_session_base where the estimate begins, such as where the scan fits.
 
-        Without odometry, the sensor is taken to stand at the beginning.
+        Without odometry, the sensor is taken to stand at the beginning, or to go on as before it.
         """
         before, read = self._state, evidence.T_odom_base
         reading = before.readings[-1] @ invert_pose(before.poses[-1]) @ guess
         if read is not None and not evidence.continues:
             reading = read
         if self._begins and read is None and evidence.motion is None:
-            stands = np.diag(self._unsteadiness(evidence.seconds) ** -2)
-            evidence = dataclasses.replace(evidence, motion=(np.eye(4), stands))
+            motion, sigmas = self.steady(evidence.seconds)
+            evidence = dataclasses.replace(evidence, motion=(motion, np.diag(sigmas**-2)))
         self._begins = False
         self._window = self._window.then(self._row(evidence, guess, reading))
         state = _State(
@@ -402,7 +421,7 @@ class Smoother:
         of_second = of_poses.by_first[1:] - ratio[:, :, None] * of_poses.by_second[:-1]
         of_third = of_poses.by_second[1:]
         jacobian = np.concatenate([J[:, :, self._free] for J in (of_first, of_second, of_third)], axis=2)
-        sigmas = p.unsteady * np.tile(seconds[2:, None], len(self._free))
+        sigmas = np.array([self._unsteadiness(s) for s in seconds[2:].tolist()]).reshape(-1, len(self._free))
         sigmas[~window.unmeasured[2:]] = np.inf
         error = _wrapped(of_poses.step[1:] - ratio * of_poses.step[:-1])
         return self._factor(rows, error, jacobian, sigmas, kernel=np.inf)
@@ -430,7 +449,8 @@ class Smoother:
 
     def _unsteadiness(self, seconds: float) -> F64:
         """Standard deviations (D,) of the change of the motion from one scan to the next."""
-        return np.full(len(self._free), self._parameters.unsteady * seconds)
+        p = self._parameters
+        return np.full(len(self._free), p.unsteady * seconds ** (1.0 + p.growth))
 
     def _drift_variance(self, reported: F64) -> F64:
         """Variances (N, D) of the drift over steps (N, 6)."""

@@ -107,9 +107,9 @@ class SpaceMap:
         """Register a scan from a guess (4, 4); it is held to a prior. wide : see `SurfaceMap.match`."""
         return self._surfaces.match(thinned.points_m, thinned.weights, guess, prior, wide=wide)
 
-    def is_held(self, thinned: ThinnedScan, placement: Placement) -> bool:
-        """Whether surfaces hold a scan where it was placed; see `SurfaceMap.is_held`."""
-        return self._surfaces.is_held(thinned.points_m, thinned.weights, placement)
+    def held(self, thinned: ThinnedScan, placement: Placement) -> Placement:
+        """A placement of a scan with the information that surfaces give; see `SurfaceMap.held`."""
+        return self._surfaces.held(thinned.points_m, thinned.weights, placement)
 
     def agreement(self, thinned: ThinnedScan, pose: F64) -> tuple[float, float]:
         """How a scan at a pose (4, 4) agrees with surfaces and free space, see `ColumnMap.agreement`."""

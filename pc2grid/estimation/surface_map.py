@@ -13,7 +13,7 @@ decides in the directions that the points do not fix.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +67,7 @@ class SurfaceParameters:
     least_points: float = 5.0
     aside: float = 0.5
     aside_scale: float = 1.5
-    least_kept: float = 0.3
+    least_kept: float = 0.2
 
     def independent(self, points: int) -> float:
         """How many points of unit weight, with independent errors, so many points of a scan are worth."""
@@ -231,13 +231,13 @@ class SurfaceMap:
             guess = self._align(self._coarse, points_m[few], weights[few], guess, prior, p.coarse_rounds).pose
         return self._align(self.fine, points_m[fine], weights[fine], guess, prior, p.rounds)
 
-    def is_held(self, points_m: F64, weights: F64, placement: Placement) -> bool:
-        """Whether the surfaces hold thinned points (N, 3) where they were placed, in every direction.
+    def held(self, points_m: F64, weights: F64, placement: Placement) -> Placement:
+        """A placement of thinned points (N, 3), with the information that the surfaces truly give.
 
         On surfaces that noise has made uneven, points find a neighbour wherever they are, and the tangent of
         their distances says that they are held. Half a voxel aside nothing draws them back: the secant of the
         gradients there is small beside the tangent. Both are compared along the six principal changes of the
-        pose, in metres by which these displace the points.
+        pose, in metres by which these displace the points. What is not held tells nothing.
         """
         p = self._parameters
         few = random_subset(len(points_m), p.coarse_points)
@@ -248,13 +248,19 @@ class SurfaceMap:
             pose = moved(placement.pose[None], step[None])[0]
             return self.fine.equations(points, own, pose, p.aside_scale * self.fine.edge_m)[:2]
 
-        H, _ = at(np.zeros(6))
-        tangents, changes = eigh(H, _displacement(points))
+        displacement = _displacement(points)
+        tangents, changes = eigh(at(np.zeros(6))[0], displacement)
         secants = [
             change @ (at(aside_m * change)[1] - at(-aside_m * change)[1]) / (2.0 * aside_m)
             for change in changes.T
         ]
-        return placement.measured and bool(np.all(secants >= p.least_kept * tangents))
+        loose = changes[:, secants < p.least_kept * tangents]
+        kept = np.eye(6) - loose @ loose.T @ displacement
+        return replace(
+            placement,
+            information=kept.T @ placement.information @ kept,
+            measured=placement.measured and not loose.size,
+        )
 
     def _align(
         self,

@@ -125,7 +125,8 @@ class Tracker:
         estimate = self._estimated(placed, Evidence(seconds, reading, continues, placed.alone, between))
         # 4. Judge the pose, and start again if nothing fits any more.
         bridged = placed.motion is not None or (reading is not None and continues)
-        health = self._health.judge(placed, bridged=bridged)
+        unaided = estimate if self.carried and reading is None else None
+        health = self._health.judge(placed, unaided, bridged=bridged)
         pose = self._sensor.levelled(estimate.pose)
         tracked = self._finish(scan, points, pose, health)
         if self._health.gives_up:
@@ -136,7 +137,7 @@ class Tracker:
         """The pose of a scan by all that is known of it. Nothing ties a new local map to what was before."""
         if not placed.first:
             return self._smoother.add(placed.pose, evidence)
-        self._smoother.start(self._flat(placed.pose), evidence.T_odom_base)
+        self._smoother.start(self._flat(placed.pose), evidence.T_odom_base, self._smoother.speed)
         return self._smoother.belief
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -20,13 +20,6 @@ from pc2grid.model import Health, ReadReport, Trajectory, part_name
 _MOST_LOST = 0.2
 """Share of lost scans above which a laser, or a sensor in the hand, gives no map without odometry: its parts
 do not hang together. Chosen by hand."""
-_LEAST_HELD = 1.0 / 3.0
-"""Share of scans in which the points fix the pose, below which a sensor in the hand gives no map without
-odometry. In recordings of two rooms, an office, a kitchen and a hall it is 0.9 to 1, of a simulated phone
-that drifts by 2 percent 0.5, and in simulated flats that are seen three times a second, whose tracks are off
-by metres, 0.1."""
-HELD_SCANS = 100
-"""While a recording is followed, so many of the last scans are judged by that share; chosen by hand."""
 _WARN_DEGENERATE = 0.1
 """Share of degenerate scans above which the report says so; chosen by hand."""
 _STOREY_M = 2.0
@@ -47,20 +40,16 @@ def check_followed(trajectory: Trajectory, name: str) -> None:
     )
 
 
-def not_held(health: Collection[Health], name: str) -> TrackingLost | None:
-    """The error of a log, if most scans of a sensor in the hand, without odometry, do not fix their poses.
-
-    Such a map does not contradict itself: each scan fits what the last ones showed, wherever these lie.
-    """
-    total, fine = len(health), sum(h is Health.FINE for h in health)
-    if fine >= _LEAST_HELD * total:
-        return None
-    return TrackingLost(
-        f"{name}: only {fine} of {total} scans of a sensor in the hand fix the pose in every direction, and "
-        "there is no odometry, so that the poses would be wrong by metres",
-        hint="--odometry TOPIC names a topic with odometry, such as the visual-inertial one of the device; "
-        "else record it, or more scans a second, or corners and furniture in place of bare walls",
-    )
+def lost_warnings(health: Sequence[Health]) -> list[str]:
+    """At most one sentence: that a query, with scans of this health, begins anew where tracking was lost."""
+    lost = [number for number, of_scan in enumerate(health, start=1) if of_scan is Health.LOST]
+    if not lost:
+        return []
+    return [
+        f"{len(lost)} of {len(health)} scans could not be followed, so only the last "
+        f"{len(health) - lost[-1]} count; record odometry, or more scans a second, or corners and furniture "
+        "in place of bare walls"
+    ]
 
 
 def part_reports(
@@ -122,12 +111,6 @@ def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
     warnings += height_warnings(track.heights_m, track.trajectory)
     warnings += odometry_warnings(track.trajectory, track.readings)
     return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))
-
-
-def without_points(report: ReadReport) -> ReadReport:
-    """The report of a recording of which points in space were asked for, and that has none."""
-    no_points = "a 2D laser shows no points in space, so none are kept"
-    return dataclasses.replace(report, warnings=(*report.warnings, no_points))
 
 
 def height_warnings(heights_m: F64, trajectory: Trajectory) -> list[str]:

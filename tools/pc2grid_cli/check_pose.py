@@ -33,7 +33,7 @@ from signature.localization.pose_check import CheckStatus, check_pose
 if TYPE_CHECKING:
     from pc2grid.clouds.planar_scan import PlanarScan
     from pc2grid.io import Log
-    from pc2grid.model import RegisteredScan
+    from pc2grid.model import Health, RegisteredScan
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.localization.pose_check import PoseCheck
@@ -105,19 +105,18 @@ def check_log(
     with open_log(path, config.read, recover=recover) as log:
         T_map_base, stamp_ns = _believed(log, known, span)
         ends_ns = log.info.start_ns, log.info.end_ns
-        scans = 0
+        health: list[Health] = []
 
         def counted() -> Iterator[tuple[RegisteredScan, PlanarScan]]:
-            nonlocal scans
             for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), config, observer):
-                scans += 1
+                health.append(registered.health)
                 observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
                 yield registered, planar_scan
 
         with observer.step("check", span.length_ns(*ends_ns) * 1e-9):
             index = MapIndex.of(database, config)
             checked = check_pose(counted(), index, T_map_base, stamp_ns=stamp_ns, session=known.session)
-        about = about_log(path, log, checked, scans=scans, span=span)
+        about = about_log(path, log, checked, span, health)
         document: RelocalizeCheck = {**_judgement(checked, database.location), "query": about}
         return checked, plain(RelocalizeCheck, document)
 

@@ -68,7 +68,7 @@ def find(
         index = index or MapIndex.of(database, config, observer)
         index = index if prior is None else index.within(prior)
         answer, poses = locate_log(log, index, config, span=span, see=see, observer=observer)
-        about = about_log(path, log, answer, scans=len(poses), span=span)
+        about = about_log(path, log, answer, span, poses.health)
         return Found(answer=answer, poses=poses, about=about, report=log.report())
 
 

@@ -58,8 +58,8 @@ class Sensor:
         self.searched += 1
         yield from self.elsewhere
 
-    def holds(self, fit: Fit) -> bool:
-        return True
+    def held(self, fit: Fit) -> Fit:
+        return fit
 
     def follow(self, belief: Belief) -> None: ...
 

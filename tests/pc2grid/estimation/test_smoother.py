@@ -15,7 +15,7 @@ from pc2grid.estimation import _kernels
 from pc2grid.estimation.belief import PLANAR, SPATIAL, Belief
 from pc2grid.estimation.graph import Factors, normal_equations, without
 from pc2grid.estimation.manifold import Steps, _rotation_vectors, _skew, moved, steps
-from pc2grid.estimation.smoother import Evidence, Smoother
+from pc2grid.estimation.smoother import IN_THE_HAND, Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose, motion_size, pose_from_rotation_vector
 
 
@@ -271,3 +271,26 @@ def test_a_gyroscope_replaces_the_turn_of_the_motion_before() -> None:
     np.testing.assert_allclose(belief.pose[:3, :3], turn[:3, :3], atol=1e-3)
     np.testing.assert_allclose(belief.pose[:3, 3], (0.4, 0.0, 0.0), atol=0.02)
     assert belief.sigmas[1] < 0.1 * smoother.after(*smoother.steady(0.1)).sigmas[1]
+
+
+def test_how_far_a_hand_goes_unseen_does_not_depend_on_how_often_it_is_looked_for() -> None:
+    """Nothing is known of a second but the motion before it: the standard deviation is that of 5 and 20 Hz."""
+    sigmas = []
+    for rate in (5, 20):
+        smoother = Smoother(SPATIAL, IN_THE_HAND)
+        smoother.start(np.eye(4), None)
+        for _ in range(rate):
+            belief = smoother.add(np.eye(4), Evidence(seconds=1.0 / rate))
+        sigmas.append(belief.sigmas[0])
+    assert sigmas[0] == pytest.approx(sigmas[1], rel=0.3)
+
+
+def test_after_a_new_beginning_the_motion_goes_on() -> None:
+    smoother = Smoother(SPATIAL, IN_THE_HAND)
+    smoother.start(np.eye(4), None)
+    walked = pose_from_rotation_vector((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
+    for _ in range(5):
+        smoother.add(smoother.belief.pose @ walked, Evidence(seconds=0.1, motion=(walked, 1e6 * np.eye(6))))
+    smoother.start(np.eye(4), None, smoother.speed)
+    on, _ = smoother.steady(0.1)
+    assert on[0, 3] == pytest.approx(0.1, abs=0.01)

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.estimation import _surface_kernels as kernels
 from pc2grid.estimation.belief import SPATIAL, Belief
+from pc2grid.estimation.manifold import weakest
 from pc2grid.estimation.surface_map import SurfaceMap
 from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector, transform_points
 
@@ -69,18 +71,21 @@ def test_what_only_seems_to_be_held_is_not() -> None:
     the wall is measured. Half a voxel aside nothing draws the points back. A corner holds all the same."""
     rng = np.random.default_rng(3)
 
-    def after(faces: tuple[int, ...]) -> tuple[bool, bool]:
-        """Whether the position seems to be measured, and whether it is held."""
+    def after(faces: tuple[int, ...]) -> tuple[bool, bool, float]:
+        """Whether the position seems to be measured, whether it is held, and the share of the information
+        in its weakest direction that is left."""
         first, second = (
             corner(k, faces) + 0.02 * rng.standard_normal((5000 * len(faces), 3)) for k in (0, 1)
         )
         middle = second[(np.abs(second[:, 1]) < 0.7) | (second[:, 1] > 1.3)]  # not the ends of wall and floor
         surfaces, weights = seen(first), np.ones(len(middle))
         placed = surfaces.match(middle, weights, np.eye(4), held(np.eye(4), 1.0))
-        return placed.measured, surfaces.is_held(middle, weights, placed)
+        truly = surfaces.held(middle, weights, placed)
+        left = weakest(truly.information, 3) / weakest(placed.information, 3)
+        return placed.measured, truly.measured, left
 
-    assert after((0, 2)) == (True, False)
-    assert after((0, 1, 2)) == (True, True)
+    assert after((0, 2)) == (True, False, pytest.approx(0.0, abs=1e-6))
+    assert after((0, 1, 2)) == (True, True, pytest.approx(1.0))
 
 
 def test_a_scan_of_another_place_does_not_overlap() -> None:
