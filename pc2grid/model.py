@@ -263,6 +263,11 @@ class OccupancyGrid:
         things: BoolGrid = self.cells == THING
         return things
 
+    @property
+    def ground(self) -> BoolGrid:
+        """(H, W) cells where a sensor may be: the free ones, and the things, over which a hand reaches."""
+        return self.free | self.things
+
     def told(self, of: MapOf = "everything") -> NDArray[np.int8]:
         """(H, W) the cells as others are told them: 100 where something stands, 0 where it is free, else -1.
 

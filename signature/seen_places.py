@@ -98,4 +98,4 @@ def _roomy(grid: OccupancyGrid) -> BoolGrid:
 
     n = round(CLEARANCE_M / grid.resolution_m)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * n + 1, 2 * n + 1))
-    return np.asarray(cv2.erode(grid.free.astype(np.uint8), kernel), bool)
+    return np.asarray(cv2.erode(grid.ground.astype(np.uint8), kernel), bool)

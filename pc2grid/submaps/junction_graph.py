@@ -46,7 +46,7 @@ def junction_graph(grid: OccupancyGrid, config: PartitionConfig = PartitionConfi
 
 def map_skeleton(grid: OccupancyGrid, config: PartitionConfig) -> BoolGrid:
     """The edge map M^E of III-A (H, W): only the major free space, one pixel wide."""
-    return skeleton_of(grid.free, grid.resolution_m, config.clearance_m, config.thinning)
+    return skeleton_of(grid.ground, grid.resolution_m, config.clearance_m, config.thinning)
 
 
 def graph_of_skeleton(skeleton: BoolGrid, grid: OccupancyGrid, config: PartitionConfig) -> nx.Graph:

@@ -80,12 +80,12 @@ def submap_centers(grid: OccupancyGrid, config: PartitionConfig) -> F64:
 
 def _centers(graph: nx.Graph, skeleton: BoolGrid, grid: OccupancyGrid, config: PartitionConfig) -> F64:
     """The same, from the junction graph and the skeleton that it was made from."""
-    if not grid.free.any():
+    if not grid.ground.any():
         return np.empty((0, 2))
     points_m = [node["center_m"] for _, node in graph.nodes(data=True) if node["kind"] == "junction"]
     centers = grid.to_cell(np.array(points_m).reshape(-1, 2))
     if not len(centers):
-        clearance_m = clearance_of(grid.free, grid.resolution_m)
+        clearance_m = clearance_of(grid.ground, grid.resolution_m)
         centers = np.array([np.unravel_index(int(np.argmax(clearance_m)), clearance_m.shape)])
     if config.spacing_m is not None:
         # Junctions come first, so they are kept; the skeleton fills the gaps between them.

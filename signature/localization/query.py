@@ -327,7 +327,7 @@ def best_observed(
     the free space seen, because much of what surrounds a place is seen from elsewhere. How well a place
     is observed is the share of the rays from it that end on something known.
     """
-    middle = skeleton_of(grid.free, grid.resolution_m, QUERY.clearance_m)
+    middle = skeleton_of(grid.ground, grid.resolution_m, QUERY.clearance_m)
     spaced = sample_evenly(cells_of(middle), QUERY.every_m / grid.resolution_m)
     chosen: list[tuple[float, float]] = []
     for points, most in (

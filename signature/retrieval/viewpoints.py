@@ -222,7 +222,7 @@ def free_squares(grid: OccupancyGrid) -> F64:
     if not height or not width:
         return np.empty((0, 2))
     rows, columns = np.arange(0, height, n), np.arange(0, width, n)
-    free = np.add.reduceat(np.add.reduceat(grid.free.astype(np.int32), rows, axis=0), columns, axis=1)
+    free = np.add.reduceat(np.add.reduceat(grid.ground.astype(np.int32), rows, axis=0), columns, axis=1)
     corners = np.argwhere(free > 0)[:, ::-1] * (n * grid.resolution_m)
     return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
 
