@@ -89,10 +89,11 @@ class ProjectionConfig(Section):
         default=20.0, gt=0, description="returns farther than this do not draw the map"
     )
     points_voxel_m: float | None = Field(
-        default=None,
+        default=0.05,
         ge=0.01,
         le=1.0,
-        description="also keep the points in space, one for each voxel of this edge; null: none",
+        description="of lidars and depth cameras the points in space are kept, too, one for each voxel of"
+        " this edge; null: none",
     )
     max_cells: int = Field(default=100_000_000, gt=0, description="a map larger than this is refused")
 

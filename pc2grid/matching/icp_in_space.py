@@ -13,12 +13,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, freeze
+from pc2grid.arrays import F64, I64, freeze
 from pc2grid.clouds.ground import find_ground
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.clouds.voxel_cloud import VoxelCloud
@@ -36,12 +35,15 @@ from pc2grid.model import PointMap
 class RegistrationParameters:
     """How points are registered and compared. All chosen by hand, tried in simulation.
 
-    voxel_m : edge of the voxels that the query is reduced to. points : so many of these are registered.
+    voxel_m : edge of the voxels that the query, and the map for it, are reduced to. points : so many of the
+        query are registered.
+    tile_m : edge of the squares of the map whose normals are estimated together.
     margin_m : of the part of the map that is used, around the query.
     floor_m : the floors are compared so far around the sensor.
     normal_radius_m, normal_neighbours : neighbourhood in which the normals of the map are estimated.
     rounds_m : largest distance of corresponding points, round by round.
-    iterations : of each round.
+    iterations : of each round, at most. converged : a round ends when the share of points that meet the map,
+        and their distance as a share of it, change by less.
     tukey : constant of Tukey's loss, as a share of the distance of the round.
     farthest_m, farthest_rad, tilt_rad : ICP must not move or tilt the planar pose more than this.
     patch_m : errors of points nearer than this to each other are taken to be the same, in the covariance. In
@@ -50,13 +52,15 @@ class RegistrationParameters:
     """
 
     voxel_m: float = 0.1
-    points: int = 5000
+    points: int = 2000
+    tile_m: float = 4.0
     margin_m: float = 1.0
     floor_m: float = 8.0
-    normal_radius_m: float = 0.25
+    normal_radius_m: float = 0.35
     normal_neighbours: int = 30
     rounds_m: tuple[float, ...] = (0.6, 0.3, 0.15)
     iterations: int = 30
+    converged: tuple[float, ...] = (1e-3, 1e-4, 1e-5)
     tukey: float = 0.5
     farthest_m: float = 0.6
     farthest_rad: float = math.radians(10.0)
@@ -91,6 +95,8 @@ class RayParameters:
     above_m: float = 2.0
 
 
+_TILES = 1 << 20  # along y, at most
+_NO_POINTS = np.empty(0, np.int64)
 REGISTRATION = RegistrationParameters()
 RAYS = RayParameters()
 
@@ -205,9 +211,58 @@ class SpatialFit:
         return moved
 
 
+class MapSurface:
+    """The points of a map in space, (V, 3) `points_m`, and the normals of its surfaces: each is estimated
+    once, when a query lies near it for the first time."""
+
+    def __init__(self, points: PointMap, parameters: RegistrationParameters = REGISTRATION) -> None:
+        self._parameters = parameters
+        self.points_m: F64 = points.points_m()
+        tiles, of_point, count = np.unique(
+            self._tiles_of(self.points_m), return_inverse=True, return_counts=True
+        )
+        members = np.split(np.argsort(of_point, kind="stable"), np.cumsum(count)[:-1])
+        self._members = dict(zip(tiles.tolist(), members, strict=False))
+        self._surfaces: dict[int, tuple[F64, F64]] = {}
+
+    def near(self, at_m: F64) -> tuple[F64, F64]:
+        """The points (M, 3), one a voxel, and their normals (M, 3), of at least what is within reach of
+        points (N, 3)."""
+        reach_m = 2.0 * self._parameters.rounds_m[0]
+        corners_m = np.array([(x, y) for x in (-reach_m, reach_m) for y in (-reach_m, reach_m)])
+        tiles = np.unique(self._tiles_of((at_m[:, None, :2] + corners_m).reshape(-1, 2)))
+        none = np.empty((0, 3))
+        points, normals = zip((none, none), *map(self._surface, tiles.tolist()), strict=True)
+        return np.concatenate(points), np.concatenate(normals)
+
+    def _tiles_of(self, points_m: F64) -> I64:
+        """The number of the tile that each point (N, 2 or more) lies in."""
+        x, y = np.floor(points_m[:, :2] / self._parameters.tile_m).astype(np.int64).T
+        return np.asarray(x * _TILES + y)
+
+    def _surface(self, tile: int) -> tuple[F64, F64]:
+        """The points and normals of a tile."""
+        from pc2grid.open3d_core import o3d
+
+        p = self._parameters
+        if tile not in self._surfaces:
+            beside = [tile + x * _TILES + y for x in (-1, 0, 1) for y in (-1, 0, 1)]
+            members = [self.points_m[self._members.get(k, _NO_POINTS)] for k in (tile, *beside)]
+            if not len(members[0]):
+                return members[0], members[0]
+            points = _around(np.concatenate(members[1:]), members[0], p.normal_radius_m)
+            cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(p.voxel_m)
+            own = np.flatnonzero(self._tiles_of(np.asarray(cloud.points)) == tile)
+            cloud.estimate_normals(
+                o3d.geometry.KDTreeSearchParamHybrid(radius=p.normal_radius_m, max_nn=p.normal_neighbours)
+            )
+            self._surfaces[tile] = np.asarray(cloud.points)[own], np.asarray(cloud.normals)[own]
+        return self._surfaces[tile]
+
+
 def register_in_space(
     views: Sequence[SpatialView],
-    points: PointMap,
+    surface: MapSurface,
     T_map_query: SE2,
     parameters: RegistrationParameters = REGISTRATION,
     rays: RayParameters = RAYS,
@@ -225,12 +280,11 @@ def register_in_space(
     if not len(query):
         return None
     lifted = T_map_query.lift()
-    target = _around(points.points_m(), transform_points(lifted, query), p.margin_m)
+    target = _around(surface.points_m, transform_points(lifted, query), p.margin_m)
     start = _on_floor(target, query, lifted, views[-1].sensor_m)
     if start is None:
         return None
-    near = _near(target, transform_points(start, query), 2.0 * p.rounds_m[0] + p.normal_radius_m)
-    found = _icp(query, near, start, p)
+    found = _icp(query, surface.near(transform_points(start, query)), start, p)
     if found is None:
         return None
     T, information, center_m, rmse_m = found
@@ -266,24 +320,6 @@ def _around(points: F64, query: F64, margin_m: float) -> F64:
     return around
 
 
-def _near(points: F64, query: F64, edge_m: float) -> F64:
-    """At least the points of a map (V, 3) that are within `edge_m` of a query (N, 3) in the map.
-
-    Normals take most of the time, and walls that the query has not seen need none.
-    """
-    low = points.min(axis=0) - 2.0 * edge_m
-
-    def cells(of: F64) -> NDArray[np.int64]:
-        index = np.clip((of - low) / edge_m, 0, (1 << 20) - 1).astype(np.int64)
-        code: NDArray[np.int64] = (index[:, 0] << 42) + (index[:, 1] << 21) + index[:, 2]
-        return code
-
-    around = np.array([(x << 42) + (y << 21) + z for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)])
-    seen = np.unique(np.unique(cells(query))[:, None] + around)
-    chosen: F64 = points[np.isin(cells(points), seen)]
-    return chosen
-
-
 def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None:
     """The pose (4, 4) `lifted` of a query in the map, tilted and raised so that the two floors are one.
 
@@ -314,33 +350,34 @@ def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None
 
 
 def _icp(
-    query: F64, target: F64, start: F64, p: RegistrationParameters
+    query: F64, surface: tuple[F64, F64], start: F64, p: RegistrationParameters
 ) -> tuple[F64, F64, F64, float] | None:
-    """The pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m; None without overlap."""
+    """The pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m; None without overlap.
+
+    surface : points (M, 3) and normals (M, 3) of the map.
+    """
     from pc2grid.open3d_core import o3d
 
-    def cloud_of(points: F64) -> Any:
-        return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
-
-    share = min(1.0, p.points / len(query))
-    query = query[random_subset(len(query), p.points)]
-    source, surface = cloud_of(query), cloud_of(target)
-    surface.estimate_normals(
-        o3d.geometry.KDTreeSearchParamHybrid(radius=p.normal_radius_m, max_nn=p.normal_neighbours)
+    target_m, normals = surface
+    source, target = (
+        o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        for points in (query[random_subset(len(query), p.points)], target_m)
     )
+    target.normals = o3d.utility.Vector3dVector(normals)
+    share = min(1.0, p.points / len(query))
     steps = o3d.pipelines.registration
     T = start
-    for distance_m in p.rounds_m:
+    for distance_m, converged in zip(p.rounds_m, p.converged, strict=True):
         estimate = steps.TransformationEstimationPointToPlane(steps.TukeyLoss(k=p.tukey * distance_m))
-        criteria = steps.ICPConvergenceCriteria(1e-7, 1e-7, p.iterations)
-        result = steps.registration_icp(source, surface, distance_m, T, estimate, criteria)
+        criteria = steps.ICPConvergenceCriteria(converged, converged, p.iterations)
+        result = steps.registration_icp(source, target, distance_m, T, estimate, criteria)
         T = np.array(result.transformation)
         if len(result.correspondence_set) < 100:
             return None
     pairs = np.asarray(result.correspondence_set)
-    placed = transform_points(T, query)[pairs[:, 0]]
-    normals = np.asarray(surface.normals)[pairs[:, 1]]
-    away_m = np.einsum("ij,ij->i", placed - target[pairs[:, 1]], normals)
+    placed = transform_points(T, np.asarray(source.points))[pairs[:, 0]]
+    normals = normals[pairs[:, 1]]
+    away_m = np.einsum("ij,ij->i", placed - target_m[pairs[:, 1]], normals)
     near = np.abs(away_m) < p.tukey * p.rounds_m[-1]
     placed, normals, away_m = placed[near], normals[near], away_m[near]
     center_m = placed.mean(axis=0)

@@ -136,6 +136,7 @@ def stored_session(entry: Entry) -> StoredSession:
             path_m=round(session_map.trajectory.length_m, 3),
             duration_s=round(session_map.trajectory.duration_s, 3),
             scans=len(session_map.trajectory),
+            points=0 if session_map.points is None else len(session_map.points),
             report=session_map.report,
             provenance=provenance,
             consistency=session_map.consistency,
@@ -173,6 +174,8 @@ def completed(parts: Mapping[str, Any]) -> StoredSession:
             found["submaps"] = SubmapArrays.of(submaps, signatures, config)
             found["info"] = replace(found["info"], submaps=len(submaps))
             found.pop("seen", None)
+    if found["points"] is None:
+        found["info"] = replace(found["info"], points=0)
     found.setdefault("seen", seen_from(found["submaps"], grid, config))
     return StoredSession(**found)
 
@@ -237,6 +240,11 @@ def _check_trajectory(trajectory: Trajectory, info: SessionInfo, _: object) -> N
     _expect(len(trajectory), info.scans, "poses")
 
 
+def _check_points(points: PointMap | None, info: SessionInfo, _: object) -> None:
+    validation.check_points(points)
+    _expect(0 if points is None else len(points), info.points, "points")
+
+
 def _check_graph(graph: GraphArrays, _: SessionInfo, grid: OccupancyGrid | None) -> None:
     graph_from_arrays(graph)
     if grid is not None:
@@ -265,7 +273,7 @@ _CHECKS: dict[str, Callable[[Any, SessionInfo, OccupancyGrid | None], None]] = {
     "trajectory": _check_trajectory,
     "loops": lambda loops, info, grid: validation.check_loops(loops, info.scans),
     "graph": _check_graph,
-    "points": lambda points, info, grid: validation.check_points(points),
+    "points": _check_points,
     "submaps": _check_submaps,
     "seen": lambda seen, info, grid: validation.check_seen(seen, info.submaps),
 }

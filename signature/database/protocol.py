@@ -136,6 +136,7 @@ class SessionInfo:
     path_m : distance driven, metres; 0 for an imported map.
     duration_s : time between first and last pose.
     scans : poses in its trajectory.
+    points : how many points in space are stored.
     report : what was read, and what was lost while reading.
     consistency : how well its map agrees with its own scans; None for an imported map.
     odometry : how well odometry agrees with its scans; None likewise.
@@ -150,6 +151,7 @@ class SessionInfo:
     path_m: float
     duration_s: float
     scans: int
+    points: int
     report: ReadReport
     provenance: Provenance
     consistency: Consistency | None = None

@@ -61,7 +61,7 @@ def answer_query(
     clock.lap("decide")
     in_space = None
     if query.in_space is not None:
-        verdict, in_space = settle_in_space(verdict, query.in_space, index.points, index.config.accept)
+        verdict, in_space = settle_in_space(verdict, query.in_space, index.surface, index.config.accept)
         clock.lap("in_space")
     answer = _answer(index, seen, verdict, history)
     timing_ms = dict(clock.total_ms)

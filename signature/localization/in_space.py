@@ -29,8 +29,7 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.matching.icp_in_space import SpatialFit, register_in_space
-from pc2grid.model import PointMap
+from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_space
 from signature.database import SubmapDatabase
 from signature.localization.answer import PoseInSpace, SpaceStatus, Status, Verdict
 from signature.localization.posterior import POSTERIOR
@@ -60,24 +59,29 @@ class SpaceParameters:
 
 SPACE = SpaceParameters()
 
-PointsOf = Callable[[str], PointMap | None]
-"""The points of a session by its name; None if it has none."""
+SurfaceOf = Callable[[str], MapSurface | None]
+"""The points of a session in space by its name; None if it has none."""
 
 
-def points_reader(database: SubmapDatabase) -> PointsOf | None:
+def surface_reader(database: SubmapDatabase) -> SurfaceOf | None:
     """Reads the points of the sessions of a database, and keeps the latest; None if none has any."""
-    if not any(info.provenance.config.projection.points_voxel_m for info in database.sessions()):
+    if not any(info.points for info in database.sessions()):
         return None
-    return lru_cache(maxsize=SPACE.places)(database.points)
+
+    def surface_of(session: str) -> MapSurface | None:
+        points = database.points(session)
+        return None if points is None else MapSurface(points)
+
+    return lru_cache(maxsize=SPACE.places)(surface_of)
 
 
 def settle_in_space(
-    verdict: Verdict, query: QueryInSpace, points_of: Callable[[int], PointMap | None], accept: float
+    verdict: Verdict, query: QueryInSpace, surface_of: Callable[[int], MapSurface | None], accept: float
 ) -> tuple[Verdict, PoseInSpace | None]:
     """The verdict with the points as a factor, and the pose in space of the place that is located, or was and
     is turned down; else None. As it was, where no place can be compared.
 
-    points_of : the points of a session, by its index. accept : least confidence to be located.
+    surface_of : the points of a session, by its index. accept : least confidence to be located.
     """
     if not query.views or query.T_odom_base is None:
         return verdict, None
@@ -85,8 +89,8 @@ def settle_in_space(
     best, masses = 0, np.array(verdict.masses)
     for place in range(min(len(masses), SPACE.places)):
         h = verdict.hypotheses[verdict.places.index(place)]
-        points = points_of(h.session_index)
-        fit = None if points is None else register_in_space(query.views, points, h.fit.T_map_query)
+        surface = surface_of(h.session_index)
+        fit = None if surface is None else register_in_space(query.views, surface, h.fit.T_map_query)
         if fit is not None and fit.rays:
             fits[place] = fit
             masses, best = masses_in_space(verdict.masses, fits)

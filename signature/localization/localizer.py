@@ -94,7 +94,7 @@ class Localizer:
     @property
     def uses_points(self) -> bool:
         """Whether scans must be given with their points."""
-        return self.index.points_of is not None
+        return self.index.surface_of is not None
 
     def add(
         self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True

@@ -9,13 +9,14 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from pc2grid.errors import DatabaseCorrupt
+from pc2grid.matching.icp_in_space import MapSurface
 from pc2grid.matching.window_search import SearchMap
-from pc2grid.model import OccupancyGrid, PointMap
+from pc2grid.model import OccupancyGrid
 from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import Hypothesis, align, distinct, fitted
-from signature.localization.in_space import PointsOf, points_reader
+from signature.localization.in_space import SurfaceOf, surface_reader
 from signature.localization.posterior import POSTERIOR
 from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
@@ -34,12 +35,12 @@ class MapIndex:
     Each map is prepared (in tens of milliseconds) when it first matters to a query, and kept.
 
     region : of the places that a prior allows, see `within`. whole : the index without the prior.
-    points_of : the points of the maps, which answers are refined and checked with; None if they have none.
+    surface_of : the points of the maps, which answers are refined and checked with; None if they have none.
     """
 
     region: Region | None = None
     whole: MapIndex | None = None
-    points_of: PointsOf | None = None
+    surface_of: SurfaceOf | None = None
 
     def __init__(
         self,
@@ -125,7 +126,7 @@ class MapIndex:
         index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored, frames)
         if is_large:
             index.places.without_histograms()
-        index.points_of = points_reader(database)
+        index.surface_of = surface_reader(database)
         with observer.step("prepare places"):
             index.places.index(observer.on_progress)
         if lacking:
@@ -135,9 +136,9 @@ class MapIndex:
             )
         return index
 
-    def points(self, session_index: int) -> PointMap | None:
-        """The points of a session; None if it has none."""
-        return None if self.points_of is None else self.points_of(self.sessions[session_index])
+    def surface(self, session_index: int) -> MapSurface | None:
+        """The points of a session in space; None if it has none."""
+        return None if self.surface_of is None else self.surface_of(self.sessions[session_index])
 
     @property
     def prior(self) -> Prior | None:

@@ -71,7 +71,8 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Expected]:
     for name, length_m, seed in (("monday", 9.0, 1), ("long", 3.5, 2)):
         config = SimulationConfig.model_validate({"length_m": length_m, "seed": seed, **SIMULATION})
         simulate_session(folder / f"{name}.mcap", sensor="lidar", grid=office(), config=config)
-    run("convert", folder / "monday.mcap", "-o", folder / "monday.submaps", "--points", "0.1")
+    database, settings = folder / "monday.submaps", ("--set", "projection.points_voxel_m=0.1")
+    run("convert", folder / "monday.mcap", "-o", database, *settings)
     said = run("watch", folder / "long.mcap", "-d", folder / "monday.submaps", "--json", "--keep")
     last: Expected = json.loads(said.splitlines()[-1])
     cut(folder / "long.mcap", folder / "tuesday.mcap", last["stamp_ns"])

@@ -26,11 +26,9 @@ _Building = Annotated[
     str | None, typer.Option("--building", metavar="NAME", help="where it was recorded; answers name it")
 ]
 _Floor = Annotated[str | None, typer.Option("--floor", metavar="NAME", help="the same, within it")]
-_Points = Annotated[
-    float | None,
-    typer.Option(
-        "--points", metavar="VOXEL_M", min=0.01, max=1.0, help="keep the 3D points too, one a voxel"
-    ),
+_NoPoints = Annotated[
+    bool,
+    typer.Option("--no-points", help="leave out the 3D points of lidars and depth cameras"),
 ]
 _Add = Annotated[bool, typer.Option("--add", help="add to an existing database")]
 _Join = Annotated[
@@ -51,7 +49,7 @@ def convert_command(
     name: _Name = None,
     building: _Building = None,
     floor: _Floor = None,
-    points: _Points = None,
+    no_points: _NoPoints = False,
     add: _Add = False,
     join: _Join = None,
     dask: options.Dask = None,
@@ -79,7 +77,7 @@ def convert_command(
         odometry=odometry,
         imu=imu,
         assume_identity=assume_identity,
-        points_voxel_m=points,
+        no_points=no_points,
         preset=preset,
     )
     label, span = Label(building=building, floor=floor), TimeSpan(start, duration)

@@ -59,6 +59,8 @@ def _line(s: SessionInfo) -> str:
     label = s.provenance.label
     where = f", {label}" if label.building or label.floor else ""
     line = f"  {s.name} ({s.sensor}{where}): {counted(s.submaps, 'submap')}, {s.area_m2:.0f} m2 free{travel}"
+    if s.points:
+        line += f", {s.points / 1e6:.2f} million points in space"
     if s.consistency is not None and s.consistency.bent:
         line += f", bent: contradicts itself along {s.consistency.contradicted:.0%} of the travel"
     if s.precision is not None and s.precision.loose:

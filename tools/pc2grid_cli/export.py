@@ -79,7 +79,7 @@ _Cloud = Annotated[
     typer.Option(
         "--cloud",
         metavar="OUT.ply|.pcd",
-        help="the 3D points that convert --points kept, else the walls at z = 0",
+        help="the 3D points of the session, if it has any, else the walls at z = 0",
     ),
 ]
 _Graph = Annotated[
@@ -355,4 +355,4 @@ def _write_cloud(
         terminal.note(f"{path}: {len(cloud)} points, one a voxel of {voxel_m:g} m")
         return
     write_cloud(path, wall)
-    terminal.note(f"{path}: {len(wall)} occupied cells at z = 0; `convert --points 0.05` keeps 3D points")
+    terminal.note(f"{path}: {len(wall)} occupied cells at z = 0; the database keeps no 3D points")

@@ -104,7 +104,7 @@ def make_config(
     odometry: str | None = None,
     imu: str | None = None,
     assume_identity: bool = False,
-    points_voxel_m: float | None = None,
+    no_points: bool = False,
     preset: PresetName = "default",
 ) -> Config:
     """Flags override --set, which overrides the file, which overrides the preset. Raises ConfigError."""
@@ -115,7 +115,7 @@ def make_config(
     config = load_settings(Config, file, assignments or (), preset=base)
     given = {"topic": topic, "odometry": odometry, "imu": imu, "assume_identity": assume_identity or None}
     read = {name: value for name, value in given.items() if value is not None}
-    kept = {} if points_voxel_m is None else {"points_voxel_m": points_voxel_m}
+    kept = {"points_voxel_m": None} if no_points else {}
     sections = {
         "read": config.read.model_copy(update=read),
         "projection": config.projection.model_copy(update=kept),

@@ -393,10 +393,10 @@ def _warn_of_missing_points(found: Found, database: SubmapDatabase) -> None:
     if found.answer.status == "located" or found.about["sensor"] not in in_space:
         return
     infos = [info for info in database.sessions() if info.sensor in in_space]
-    if infos and not any(info.provenance.config.projection.points_voxel_m for info in infos):
+    if infos and not any(info.points for info in infos):
         console.warn(
-            "the map keeps no points in space; `pc2grid convert --points 0.05` keeps them: what the sensor"
-            " sees above and below the plane of the map then tells places apart, too"
+            "the map was made with --no-points; with points, what the sensor sees above and below the plane"
+            " of the map tells places apart, too"
         )
 
 

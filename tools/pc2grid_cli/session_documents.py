@@ -62,10 +62,11 @@ class Converted(Mapped):
 
 
 class StoredInfo(Mapped):
-    """A session of a database, with the versions and settings that made it."""
+    """A session of a database, with the versions and settings that made it. points: how many in space."""
 
     name: str
     resolution_m: float
+    points: int
     lossy: bool
     warnings: list[str]
     versions: dict[str, str]
@@ -119,6 +120,7 @@ def stored_document(s: SessionInfo) -> StoredInfo:
         "path_m": s.path_m,
         "duration_s": s.duration_s,
         "scans": s.scans,
+        "points": s.points,
         "lossy": s.lossy,
         "consistency": s.consistency,
         "odometry": s.odometry,

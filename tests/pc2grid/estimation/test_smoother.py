@@ -274,7 +274,7 @@ def test_a_gyroscope_replaces_the_turn_of_the_motion_before() -> None:
 
 
 def test_how_far_a_hand_goes_unseen_does_not_depend_on_how_often_it_is_looked_for() -> None:
-    """Nothing is known of a second but the motion before it: the standard deviation is that of 5 and 20 Hz."""
+    """Of one second nothing is known but the motion before: its deviation is the same at 5 and 20 Hz."""
     sigmas = []
     for rate in (5, 20):
         smoother = Smoother(SPATIAL, IN_THE_HAND)

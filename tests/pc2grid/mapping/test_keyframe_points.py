@@ -76,7 +76,7 @@ def test_point_map_keeps_one_point_a_voxel_within_a_millimetre() -> None:
     assert len(PointMap.of(np.empty((0, 3)), 0.05)) == 0
 
 
-def test_a_recording_keeps_its_points_when_asked(tmp_path_factory: pytest.TempPathFactory) -> None:
+def test_a_recording_keeps_its_points_by_default(tmp_path_factory: pytest.TempPathFactory) -> None:
     from pc2grid.io import open_log
 
     log_file = tmp_path_factory.mktemp("points") / "lidar.mcap"
@@ -84,10 +84,10 @@ def test_a_recording_keeps_its_points_when_asked(tmp_path_factory: pytest.TempPa
         {"length_m": 2.0, "seed": 4, "clutter": 0, "lidar": {"rate_hz": 4.0, "columns": 360}}
     )
     simulate_session(log_file, sensor="lidar", grid=office(), config=drive)
-    asked = Config(projection=ProjectionConfig(points_voxel_m=0.1))
+    without = Config(projection=ProjectionConfig(points_voxel_m=None))
     with open_log(log_file) as log:
-        plain = build_map(log, session="a")
-        kept = build_map(log, asked, session="a")
+        plain = build_map(log, without, session="a")
+        kept = build_map(log, session="a")
     assert plain.points is None
     assert kept.points is not None and np.array_equal(plain.grid.cells, kept.grid.cells)
     points = kept.points.points_m()

@@ -9,7 +9,7 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, invert_pose, pose_from_rotation_vector, rotation_vector, transform_points
-from pc2grid.matching.icp_in_space import SpatialView, register_in_space
+from pc2grid.matching.icp_in_space import MapSurface, SpatialView, register_in_space
 from pc2grid.model import PointMap
 from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
@@ -31,7 +31,7 @@ def asked(height_m: float) -> tuple[QueryInSpace, SE2, F64, F64]:
 @pytest.mark.parametrize(("height_m", "x_m"), [(HEIGHTS_M[0], 0.0), (HEIGHTS_M[1], APART_M)])
 def test_pose_in_space_is_exact_to_a_centimetre(height_m: float, x_m: float) -> None:
     query, T_room_odom, T_room_base, T_odom_base = asked(height_m)
-    fit = register_in_space(query.views, twin_map(), SE2(x_m, 0.0, 0.0) @ T_room_odom @ OFF)
+    fit = register_in_space(query.views, MapSurface(twin_map()), SE2(x_m, 0.0, 0.0) @ T_room_odom @ OFF)
     assert fit is not None
     true = T_room_base.copy()
     true[0, 3] += x_m
@@ -54,7 +54,7 @@ def test_a_query_that_is_not_level_is_tilted_with_its_floor() -> None:
         )
         for view in query.views
     ]
-    fit = register_in_space(tilted, twin_map(), T_room_odom)
+    fit = register_in_space(tilted, MapSurface(twin_map()), T_room_odom)
     assert fit is not None
     error = invert_pose(T_room_base) @ fit.T_map_query @ tilt @ T_odom_base
     assert np.linalg.norm(error[:3, 3]) < 0.02
@@ -71,7 +71,7 @@ def test_a_hall_that_is_mostly_floor_is_registered() -> None:
     points_m = np.concatenate([box_surface((-8, -8, 0), (8, 8, 0)), *(box_surface(*side) for side in sides)])
     assert np.median(points_m[:, 2]) < 0.05
     view = SpatialView(sensor_m=np.array([1.0, 0.5, 1.0]), points_m=points_m)
-    fit = register_in_space([view], PointMap.of(points_m, 0.05), OFF)
+    fit = register_in_space([view], MapSurface(PointMap.of(points_m, 0.05)), OFF)
     assert fit is not None and fit.on > 0.97
     assert np.linalg.norm(fit.T_map_query[:3, 3]) < 0.02
 
@@ -84,7 +84,7 @@ def test_twin_rooms_of_other_height_are_told_apart() -> None:
     ):
         query, T_room_odom, *_ = asked(height_m)
         own, other = (
-            register_in_space(query.views, twin_map(), SE2(x_m, 0.0, 0.0) @ T_room_odom)
+            register_in_space(query.views, MapSurface(twin_map()), SE2(x_m, 0.0, 0.0) @ T_room_odom)
             for x_m in (own_m, other_m)
         )
         assert own is not None and other is not None
@@ -99,8 +99,8 @@ def test_a_shelf_is_no_wall() -> None:
     with_wall = np.concatenate([*walls, box_surface((4, 0, 0), (4, 4, 2.8))])
     shelf = [box_surface((4, 0, 0), (4, 4, 1.8)), box_surface((5, 0, 1.8), (5, 4, 2.8))]
     view = SpatialView(sensor_m=np.array([2.0, 2.0, 1.2]), points_m=np.concatenate([*walls, *shelf]))
-    through = register_in_space([view], PointMap.of(with_wall, 0.05), SE2())
-    right = register_in_space([view], PointMap.of(view.points_m, 0.05), SE2())
+    through = register_in_space([view], MapSurface(PointMap.of(with_wall, 0.05)), SE2())
+    right = register_in_space([view], MapSurface(PointMap.of(view.points_m, 0.05)), SE2())
     assert through is not None and right is not None
     assert through.through > 0.05 and right.through == 0.0
     assert right.on > through.on + 0.05
@@ -112,7 +112,7 @@ def test_one_free_direction_is_uncertain() -> None:
     cloud = np.concatenate([*walls, box_surface((0, 0, 0), (20, 2, 0))])
     seen = cloud[np.abs(cloud[:, 0] - 10.0) < 4.0]
     view = SpatialView(sensor_m=np.array([10.0, 1.0, 1.0]), points_m=seen)
-    fit = register_in_space([view], PointMap.of(cloud, 0.05), SE2())
+    fit = register_in_space([view], MapSurface(PointMap.of(cloud, 0.05)), SE2())
     assert fit is not None
     sigma = np.sqrt(np.diag(fit.covariance_at(np.eye(4))))
     assert sigma[0] > 10.0 * max(sigma[1:3])
@@ -120,5 +120,5 @@ def test_one_free_direction_is_uncertain() -> None:
 
 def test_nothing_is_said_where_there_is_no_map() -> None:
     query, T_room_odom, *_ = asked(HEIGHTS_M[0])
-    assert register_in_space(query.views, twin_map(), SE2(100.0, 0.0, 0.0) @ T_room_odom) is None
-    assert register_in_space([], twin_map(), T_room_odom) is None
+    assert register_in_space(query.views, MapSurface(twin_map()), SE2(100.0, 0.0, 0.0) @ T_room_odom) is None
+    assert register_in_space([], MapSurface(twin_map()), T_room_odom) is None

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, invert_pose
-from pc2grid.matching.icp_in_space import register_in_space
+from pc2grid.matching.icp_in_space import MapSurface, register_in_space
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import Health, PointMap
 from signature.localization.answer import Verdict
@@ -27,8 +27,8 @@ from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, t
 
 
 @pytest.fixture(scope="module")
-def points() -> PointMap:
-    return twin_map()
+def points() -> MapSurface:
+    return MapSurface(twin_map())
 
 
 def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[QueryInSpace, Verdict]:
@@ -68,11 +68,11 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
     return query, verdict
 
 
-def other_walls() -> PointMap:
+def other_walls() -> MapSurface:
     """A map with the same floor, and walls that stand elsewhere."""
     floor = box_surface((-5, -5, 0), (10, 10, 0)), box_surface((-5, -5, 4.0), (10, 10, 4.0))
     walls = box_surface((4.0, -5, 0), (4.0, 10, 4.0)), box_surface((-5, 1.0, 0), (10, 1.0, 4.0))
-    return PointMap.of(np.concatenate((*floor, *walls)), 0.05)
+    return MapSurface(PointMap.of(np.concatenate((*floor, *walls)), 0.05))
 
 
 def base_of(verdict: Verdict, query: QueryInSpace) -> SE2:
@@ -83,7 +83,7 @@ def base_of(verdict: Verdict, query: QueryInSpace) -> SE2:
 
 @pytest.mark.parametrize(("height_m", "x_m"), [(HEIGHTS_M[0], 0.0), (HEIGHTS_M[1], APART_M)])
 def test_twins_in_the_plane_are_told_apart_by_their_height(
-    height_m: float, x_m: float, points: PointMap
+    height_m: float, x_m: float, points: MapSurface
 ) -> None:
     query, verdict = ask(height_m, 0.0, APART_M)
     settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
@@ -97,7 +97,7 @@ def test_twins_in_the_plane_are_told_apart_by_their_height(
     assert in_space.T_map_base[2, 3] == pytest.approx(0.0, abs=0.02)
 
 
-def test_equal_twins_stay_ambiguous(points: PointMap) -> None:
+def test_equal_twins_stay_ambiguous(points: MapSurface) -> None:
     """Both hypotheses in the same room, which is taken for two places."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, 0.0)
     settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
@@ -108,7 +108,7 @@ def test_equal_twins_stay_ambiguous(points: PointMap) -> None:
 def test_furniture_does_not_tell_twins_apart() -> None:
     """The query is in the second room, or in the first one, into which a cupboard was brought since."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M, cupboard=True)
-    points = furnished_map()
+    points = MapSurface(furnished_map())
     fits = [register_in_space(query.views, points, h.fit.T_map_query) for h in verdict.hypotheses]
     assert fits[0] is not None and fits[1] is not None
     assert fits[1].on - fits[0].on > 0.05
@@ -117,7 +117,7 @@ def test_furniture_does_not_tell_twins_apart() -> None:
     assert settled.status == "ambiguous" and settled.masses == pytest.approx((0.5, 0.5), abs=0.01)
 
 
-def test_a_located_pose_is_refined_and_becomes_surer(points: PointMap) -> None:
+def test_a_located_pose_is_refined_and_becomes_surer(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     first = verdict.hypotheses[0]
     moved = replace(first, fit=replace(first.fit, T_map_query=first.fit.T_map_query @ SE2(0.1, -0.05, 0.03)))
@@ -136,7 +136,7 @@ def test_a_place_that_the_points_contradict_is_turned_down() -> None:
     assert in_space is not None and in_space.status == "contradicts"
 
 
-def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: PointMap) -> None:
+def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: MapSurface) -> None:
     """Its mass in the plane is small, as if its things had been moved; a wrong place has more."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M + 3.0)
     unsure = replace(verdict, status="not_found", confidence=0.2, places=(1, 0), masses=(0.2, 0.02))
@@ -146,7 +146,7 @@ def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: Poi
     assert base_of(settled, query).x < 4.9
 
 
-def test_a_place_that_is_not_compared_keeps_its_odds(points: PointMap) -> None:
+def test_a_place_that_is_not_compared_keeps_its_odds(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     fit = register_in_space(query.views, points, verdict.hypotheses[0].fit.T_map_query)
     assert fit is not None
@@ -166,11 +166,11 @@ def test_a_place_that_is_turned_down_is_not_kept_for_one_that_is_not_compared() 
     assert in_space is not None and in_space.status == "contradicts"
 
 
-def test_only_what_can_matter_is_compared(points: PointMap) -> None:
+def test_only_what_can_matter_is_compared(points: MapSurface) -> None:
     """A place that is certain whatever the others are; not one of two twins."""
     asked: list[int] = []
 
-    def points_of(session_index: int) -> PointMap:
+    def points_of(session_index: int) -> MapSurface:
         asked.append(session_index)
         return points
 
@@ -182,7 +182,7 @@ def test_only_what_can_matter_is_compared(points: PointMap) -> None:
     assert len(asked) == 3
 
 
-def test_without_points_on_a_side_nothing_changes(points: PointMap) -> None:
+def test_without_points_on_a_side_nothing_changes(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     assert settle_in_space(verdict, query, lambda _: None, accept=0.9) == (verdict, None)
     assert settle_in_space(verdict, QueryInSpace(), lambda _: points, accept=0.9) == (verdict, None)

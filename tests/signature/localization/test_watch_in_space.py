@@ -8,7 +8,7 @@ from collections.abc import Mapping
 
 import pytest
 
-from pc2grid.model import PointMap
+from pc2grid.matching.icp_in_space import MapSurface
 from signature.database import Label
 from signature.localization.follower import Follower
 from signature.localization.localizer import Estimate, Localizer
@@ -23,19 +23,19 @@ TWINS = building(
 ALONE = building({"high": office()})
 
 
-def with_points(index: MapIndex, maps: Mapping[str, PointMap]) -> MapIndex:
+def with_points(index: MapIndex, maps: Mapping[str, MapSurface]) -> MapIndex:
     index = copy.copy(index)
-    index.points_of = maps.get
+    index.surface_of = maps.get
     return index
 
 
 @pytest.fixture(scope="module")
-def maps() -> dict[str, PointMap]:
-    return {"low": points(LOW_M), "high": points(HIGH_M)}
+def maps() -> dict[str, MapSurface]:
+    return {"low": MapSurface(points(LOW_M)), "high": MapSurface(points(HIGH_M))}
 
 
 @pytest.mark.parametrize(("height_m", "name"), [(LOW_M, "low"), (HIGH_M, "high")])
-def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict[str, PointMap]) -> None:
+def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict[str, MapSurface]) -> None:
     plain, spatial = Localizer(TWINS), Localizer(with_points(TWINS, maps))
     answers: list[Estimate] = []
     for registered, planar_scan, _ in lidar_drive(height_m):
@@ -49,7 +49,7 @@ def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict
     assert all(estimate.answer.in_space is not None for estimate in located)
 
 
-def test_a_thread_refines_a_located_robot(maps: dict[str, PointMap]) -> None:
+def test_a_thread_refines_a_located_robot(maps: dict[str, MapSurface]) -> None:
     """The thread gets the points of a scan every 0.2 m; the pose is that of space."""
     localizer = Localizer(with_points(ALONE, maps))
     truth, errors_m = {}, []

@@ -52,7 +52,7 @@ class Recording:
 
     file : below the data folder. building : recordings of one building are one group of the statistics.
     drive : what is recorded in the 3D scan `file`; None: the file is the recording.
-    options : of `convert` and of `relocalize`; map_options : of `convert` only. every : only every nth of
+    options : of `convert` and of `relocalize`. every : only every nth of
         its scans is used. mapped : whether all of it becomes a map, which is a row of the page.
     truth : what its trajectory is compared with, relations or poses; None: there is none.
     same_place : numbers of scans between which the sensor came back to where it was.
@@ -70,7 +70,6 @@ class Recording:
     sensor: Source
     drive: Drive | None = None
     options: tuple[str, ...] = ()
-    map_options: tuple[str, ...] = ()
     every: int = 1
     mapped: bool = True
     truth: str | None = None
@@ -147,18 +146,14 @@ def _jarvis(lasers: str, *, late_s: float = 0.0, quick: bool = False) -> Recordi
     )
 
 
-_POINTS = ("--points", "0.05")
-
-
-def _phone(name: str, *, odometry: bool = True, points: bool = False, quick: bool = False) -> Recording:
+def _phone(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
     poses = f"depth/room/{name}.tum"
     return Recording(
-        name=name + (" with points" if points else "" if odometry else " without odometry"),
+        name=name + ("" if odometry else " without odometry"),
         file=f"depth/room/{name}.mcap",
         building="room",
         sensor="depth",
         options=() if odometry else ("--odometry", "none"),
-        map_options=_POINTS if points else (),
         truth=poses,
         poses=poses,
         of_base=True,
@@ -170,13 +165,12 @@ def _kidnap(name: str, file: str, *, quick: bool = False) -> Recording:
     return _laser(name, "kidnap", file=f"laser/kidnap/{file}", quick=quick)
 
 
-def _kitchen(name: str, *, map_options: tuple[str, ...] = ()) -> Recording:
+def _kitchen(name: str) -> Recording:
     return Recording(
         name=name,
         file="depth/kitchen.mcap",
         building="kitchen",
         sensor="depth",
-        map_options=map_options,
         truth="depth/kitchen.tum",
         poses="depth/kitchen.tum",
     )
@@ -219,13 +213,12 @@ def _driven(name: str, sensor: SensorKind, length_m: float, seed: int, *, mapped
     )
 
 
-def _hall(every: int, name: str, *, map_options: tuple[str, ...] = (), quick: bool = False) -> Recording:
+def _hall(every: int, name: str, *, quick: bool = False) -> Recording:
     return Recording(
         name=name,
         file="lidar/hall.mcap",
         building="hall",
         sensor="lidar",
-        map_options=map_options,
         every=every,
         truth="lidar/hall.tum",
         poses="lidar/hall.tum",
@@ -235,7 +228,6 @@ def _hall(every: int, name: str, *, map_options: tuple[str, ...] = (), quick: bo
 
 RECORDINGS: tuple[Recording, ...] = (
     _hall(1, "hall", quick=True),
-    _hall(1, "hall with points", map_options=_POINTS),
     _hall(2, "hall, every 2nd scan", quick=True),
     _hall(3, "hall, every 3rd scan", quick=True),
     Recording(
@@ -250,10 +242,7 @@ RECORDINGS: tuple[Recording, ...] = (
     _phone("room_a", odometry=False),
     _phone("room_b", quick=True),
     _phone("room_b", odometry=False, quick=True),
-    _phone("room_a", points=True),
-    _phone("room_b", points=True),
     _kitchen("kitchen"),
-    _kitchen("kitchen with points", map_options=_POINTS),
     _corridor("corridor", quick=True),
     _corridor("corridor without odometry", odometry=False),
     _corrected("fr079", "fr079"),
@@ -345,11 +334,9 @@ PAIRS: tuple[Pair, ...] = (
     # Windows of 3 to 8 m of travel, or 20 s where the robot hardly moves.
     _later("hall", 10.0, 4.0, 4),
     _pair("fewer scans", "hall, every 2nd scan", "hall", 6.0, 6, quick=True),
-    _pair("fewer scans", "hall, every 2nd scan", "hall with points", 6.0, 6),
     _pair("fewer scans", "hall, every 3rd scan", "hall", 9.0, 4),
     _later("e1r_office_a", 10.0, 4.0, 4),
     _later("kitchen", 4.0, 2.0, 3),
-    _later("kitchen with points", 4.0, 2.0, 3),
     _later("fr079", 600.0, 20.0, 10),
     _later("intel", 900.0, 25.0, 10),
     _later("csail", 250.0, 6.0, 10, quick=True),
@@ -370,8 +357,6 @@ PAIRS: tuple[Pair, ...] = (
     _pair("other day", "hallway2", "hallway", 6.0, 6),
     _pair("other day", "room_b", "room_a", 5.0, 4, quick=True),
     _pair("other day", "room_a", "room_b", 5.0, 8),
-    _pair("other day", "room_b", "room_a with points", 5.0, 4),
-    _pair("other day", "room_a", "room_b with points", 5.0, 8),
     _pair("other sensor", "jarvis safety", "jarvis nav", 6.0, 6, quick=True),
     _pair("other sensor", "jarvis nav", "jarvis safety", 6.0, 6, quick=True),
     # Lidar and depth camera are driven through the real 3D scan of the floor; the laser and its log are real.
@@ -403,8 +388,7 @@ PAIRS: tuple[Pair, ...] = (
     _pair("elsewhere", "hall", "fr079", 6.0, 2),
     _pair("elsewhere", "room_b", "kitchen", 5.0, 2),
     _pair("elsewhere", "room_a", "hall", 5.0, 8),
-    _pair("elsewhere", "room_a", "hall with points", 5.0, 8),
-    _pair("elsewhere", "e1r_office_a", "room_b with points", 4.0, 4),
+    _pair("elsewhere", "e1r_office_a", "room_b", 4.0, 4),
     _pair("elsewhere", "jarvis nav", "room_a", 6.0, 2),
     _under_nav("fr079", 20.0),
     _under_nav("intel", 25.0),

@@ -211,7 +211,6 @@ def _convert(folder: Folder, name: str, recording: Recording, until_s: float | N
     database, source = folder.map(name), folder.source(recording)
     options: list[str | Path] = [
         *recording.options,
-        *recording.map_options,
         "--name",
         "map",
         "--json",
