@@ -9,7 +9,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import Config
+from pc2grid.config import Config, ProjectionConfig
 from pc2grid.errors import NoScans
 from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.geometry import SE2
@@ -248,14 +248,12 @@ def _map(
     projection = config.projection
     rest = iter(scans)
     beginning = _begin(rest)
-    models = [SENSOR_MODELS[scan.sensor] for scan in beginning.scans[:1]]
-    narrow = any(model.narrow for model in models)
+    narrow = any(SENSOR_MODELS[scan.sensor].narrow for scan in beginning.scans[:1])
     in_hand = not all(is_rolling(scan) for scan in beginning.scans[:1])
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
-        points = None
-        if projection.points_voxel_m is not None and not any(model.planar for model in models):
-            points = KeyframePoints(projection.points_voxel_m, projection.max_range_m)
+        points = _keyframe_points(projection, beginning.scans[:1])
+        if points is not None:
             stack.enter_context(closing(points))
         closer = LoopCloser(
             keyframes,
@@ -301,6 +299,14 @@ def _begin(scans: Iterator[Scan]) -> Beginning:
     from pc2grid.estimation.carried import begin
 
     return begin(scans)
+
+
+def _keyframe_points(projection: ProjectionConfig, first: Sequence[Scan]) -> KeyframePoints | None:
+    """What keeps the points in space of a session; None if they are not wanted, and of a laser."""
+    planar = all(SENSOR_MODELS[scan.sensor].planar for scan in first)
+    if projection.points_voxel_m is None or planar:
+        return None
+    return KeyframePoints(projection.points_voxel_m, projection.max_range_m)
 
 
 def _tracker(config: Config) -> Tracker:

@@ -122,11 +122,10 @@ class Tracker:
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
         placed = Placer(self._sensor, self._parameters).place(scan, points, expected)
         between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
-        estimate = self._estimated(placed, Evidence(seconds, reading, continues, placed.alone, between))
+        evidence = Evidence(seconds, reading, continues, placed.alone, between)
+        estimate = self._estimated(placed, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
-        bridged = placed.motion is not None or (reading is not None and continues)
-        unaided = estimate if self.carried and reading is None else None
-        health = self._health.judge(placed, unaided, bridged=bridged)
+        health = self._judged(placed, estimate, evidence)
         pose = self._sensor.levelled(estimate.pose)
         tracked = self._finish(scan, points, pose, health)
         if self._health.gives_up:
@@ -139,6 +138,13 @@ class Tracker:
             return self._smoother.add(placed.pose, evidence)
         self._smoother.start(self._flat(placed.pose), evidence.T_odom_base, self._smoother.speed)
         return self._smoother.belief
+
+    def _judged(self, placed: Placed, estimate: Belief, evidence: Evidence) -> Health:
+        """What the pose of a scan is worth."""
+        read = evidence.T_odom_base is not None
+        bridged = placed.motion is not None or (read and evidence.continues)
+        unaided = estimate if self.carried and not read else None
+        return self._health.judge(placed, unaided, bridged=bridged)
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
         """Extend the maps by a scan if it is worth it, and remember its final pose."""
