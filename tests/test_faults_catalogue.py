@@ -543,9 +543,9 @@ def a_stamp_a_day_ahead(folder: Path) -> str:
 
 @fault(34, 0, None, "gaps of more than 5 s")
 def gap(folder: Path) -> str:
-    late = 30 * 10**9
-    again = [m._replace(log_time_ns=m.log_time_ns + late) for m in CLOUDS]
-    log(folder, recording([*CLOUDS, *(cloud(i + 300) for i in range(len(again)))]))
+    later = range(300, 300 + SCANS)
+    odometry = [ros().odometry("/odom", T0 + i * STEP, 0.1 * i) for i in later]
+    log(folder, recording([*CLOUDS, *map(cloud, later)], *odometry))
     return CONVERT
 
 
