@@ -43,9 +43,9 @@ class SmootherParameters:
     drift : standard deviation of odometry over one metre (m), over one radian and, for the turn, over one
         metre (rad); it grows with the square root of the way. drift_turn_m : that of the position over a turn
         of one radian.
-    unsteady : in m/s and rad/s; without odometry, the change of the motion from one scan to the next is this
-        times the time between them: a robot indoors starts, stops and turns. growth : and times the time to
-        this power, so that it does not depend on how often a hand is seen.
+    unsteady, growth : without odometry, the change of the motion from one scan to the next is `unsteady`, in
+        m/s and rad/s, times the time between them to the power of 1 + `growth`: a robot indoors starts, stops
+        and turns. With a growth of 0.5, that of a hand does not depend on the rate of the scans.
     gyroscope_radps : of a gyroscope, with its bias.
     steady_s : the motion before is taken over this time, so that an error of one pose does not come back in
         the next with the other sign.
@@ -196,7 +196,7 @@ class Smoother:
         reading = T_session_base if T_odom_base is None else T_odom_base
         self._state = _State(T_session_base[None].copy(), reading[None].copy(), np.zeros(_ERRORS))
         self._window = self._row(Evidence(seconds=0.0), T_session_base, reading)
-        self._begins = True  # the sensor has not been seen to move since
+        self._begins = True  # no scan has been added since
         errors = np.array([p.scale, p.direction_rad, p.yaw_rad_per_m, p.turn])
         own = np.concatenate((np.full(d, 1e-4), self._noise(p.reading_m, p.reading_rad)))
         information = np.diag(np.concatenate((errors, own)) ** -2)

@@ -211,19 +211,19 @@ class Places:
         return cKDTree(np.column_stack((self.table.center_m, self.table.session_index * _APART_M)))
 
     def _ground(self, session: int) -> tuple[F64, I64]:
-        squares_m = free_squares(self._grids[session])
+        squares_m = ground_squares(self._grids[session])
         return squares_m, self.nearest(session, squares_m)[1]
 
 
-def free_squares(grid: OccupancyGrid) -> F64:
-    """Centres (K, 2) of the squares of `SQUARE_M` of a grid that hold any free space, map frame."""
+def ground_squares(grid: OccupancyGrid) -> F64:
+    """Centres (K, 2) of the squares of `SQUARE_M` of a grid that hold any ground, map frame."""
     n = max(1, round(SQUARE_M / grid.resolution_m))
     height, width = grid.cells.shape
     if not height or not width:
         return np.empty((0, 2))
     rows, columns = np.arange(0, height, n), np.arange(0, width, n)
-    free = np.add.reduceat(np.add.reduceat(grid.ground.astype(np.int32), rows, axis=0), columns, axis=1)
-    corners = np.argwhere(free > 0)[:, ::-1] * (n * grid.resolution_m)
+    ground = np.add.reduceat(np.add.reduceat(grid.ground.astype(np.int32), rows, axis=0), columns, axis=1)
+    corners = np.argwhere(ground > 0)[:, ::-1] * (n * grid.resolution_m)
     return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
 
 
