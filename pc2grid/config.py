@@ -69,11 +69,19 @@ class ReadConfig(Section):
 class RegistrationConfig(Section):
     """Scans -> poses."""
 
+    icp: Literal["kiss-icp", "none"] = Field(
+        default="kiss-icp",
+        description="what brings a scan near; none: its predicted pose, as a control of what KISS-ICP does",
+    )
     voxel_m: float | None = Field(
-        default=None, gt=0, description="KISS-ICP voxel; null: a hundredth of its range"
+        default=None,
+        gt=0,
+        description="KISS-ICP voxel; null: a hundredth of its range, in the hand by the first ranges",
     )
     min_range_m: float = Field(default=0.3, ge=0, description="nearer returns are from the robot itself")
-    max_range_m: float | None = Field(default=None, gt=0, description="of KISS-ICP; null: its own, 100 m")
+    max_range_m: float | None = Field(
+        default=None, gt=0, description="of KISS-ICP; null: its own, 100 m; in the hand twice that of the map"
+    )
     deskew: bool = Field(
         default=True, description="undo the motion within a scan where per-point times exist"
     )

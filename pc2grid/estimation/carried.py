@@ -1,10 +1,10 @@
 """A carried sensor: followed in space, and reduced to the plane by the map of its last metres.
 
 A narrow, tilted, noisy view shows neither where the floor is nor what is a wall. So each scan is registered
-to the surfaces seen before, with the odometry of the device, where there is one, as what it is: six degrees
-of freedom that drift. The planar scan is cut out of the map (`SpaceMap`). A scan that does not fit is
-searched for in all headings, and what then agrees with the surfaces and the free space of the map is
-believed, else it is lost.
+to what was seen before, by KISS-ICP and then by the shapes of the surfaces, with the odometry of the device,
+where there is one, as what it is: six degrees of freedom that drift. The planar scan is cut out of the map
+(`SpaceMap`). A scan that does not fit is searched for in all headings, and what then agrees with the surfaces
+and the free space of the map is believed, else it is lost.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pc2grid.arrays import F32, F64
 from pc2grid.clouds.level import LEVEL
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import level_floor
-from pc2grid.config import ProjectionConfig
+from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.estimation.belief import KERNEL, SPATIAL, Belief
 from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.estimation.manifold import moved, steps
@@ -60,11 +60,13 @@ class CarriedSensor:
 
     def __init__(
         self,
+        registration: RegistrationConfig,
         projection: ProjectionConfig,
         parameters: CarriedParameters = CARRIED,
         tracking: TrackingParameters = TRACKING_PARAMETERS,
     ) -> None:
-        self._projection, self._parameters, self._tracking = projection, parameters, tracking
+        self._registration, self._projection = registration, projection
+        self._parameters, self._tracking = parameters, tracking
         self._map: SpaceMap | None = None
         self._last: F64 = np.eye(4)  # pose of the last scan that was not lost
         self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0))  # the scan taken last
@@ -81,8 +83,7 @@ class CarriedSensor:
     def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
         """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
         levelled."""
-        self._map = SpaceMap(scan, points_m, self._projection)
-        self._thinned = self._map.thin(scan, points_m)
+        self.take(scan, points_m)
         return at.lift() @ first_pose(scan, points_m)
 
     def levelled(self, pose: F64) -> F64:
@@ -93,16 +94,15 @@ class CarriedSensor:
         """Whether there is a local map."""
         return bool(self._map)
 
-    def take(self, scan: Scan, points_m: F32, expected: Belief) -> None:
+    def take(self, scan: Scan, points_m: F32) -> None:
         """See `PlacingSensor`."""
-        del expected
         if self._map is None:
-            self._map = SpaceMap(scan, points_m, self._projection)
+            self._map = SpaceMap(scan, points_m, self._registration, self._projection)
         self._thinned = self._map.thin(scan, points_m)
 
-    def match(self, belief: Belief, *, wide: bool) -> list[Fit]:
-        """See `PlacingSensor`. The coarse map smooths surfaces, so a scan slides along them there."""
-        return [self._matched(belief.pose, belief, wide=wide)]
+    def match(self, belief: Belief, *, registered: bool) -> Fit:
+        """See `PlacingSensor`."""
+        return self._matched(belief.pose, belief, registered=registered)
 
     def search(self, belief: Belief) -> Iterator[Fit]:
         """Match in all headings around the last pose, with its height and tilt.
@@ -114,12 +114,12 @@ class CarriedSensor:
         window_m = min(step_m + KERNEL * belief.sigmas[0], t.search_most_m)
         covariance = np.diag([window_m**2] * 3 + [p.turned_rad**2] * 3)
         for guess in self._space.search(self._thinned, self._last, window_m, p.starts):
-            yield self._matched(guess, Belief(guess, covariance, belief.free), wide=True)
+            yield self._matched(guess, Belief(guess, covariance, belief.free))
 
-    def _matched(self, guess: F64, held: Belief, *, wide: bool) -> Fit:
+    def _matched(self, guess: F64, held: Belief, *, registered: bool = True) -> Fit:
         """The scan taken last matched with the map from a guess (4, 4), held to a belief."""
         space = self._space
-        found = space.match(self._thinned, guess, held, wide=wide)
+        found = space.match(self._thinned, guess, held, registered=registered)
         of_known, of_all = space.agreement(self._thinned, found.pose)
         quality = of_all - self._parameters.residual_weight_per_m * found.residual_m
         return Fit(

@@ -48,19 +48,16 @@ class MatchingMaps:
         found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
         return [pose for _, pose in found]
 
-    def match(
-        self, planar_scan: PlanarScan, guess: SE2, prior: SE2, information: F64, *, wide: bool = True
-    ) -> Match:
-        """Match a planar scan from a guess T_session_base.
+    def match(self, planar_scan: PlanarScan, near: SE2, prior: SE2, information: F64) -> Match:
+        """Match a planar scan that has been brought near where it fits, T_session_base.
 
         prior, information : pose that the result is held to, and its information (3, 3) of x, y, yaw.
-        wide : the neighbourhoods of the matching; else only the narrowest of them, in as many iterations.
         """
-        radii = self._matching.radii_cells
+        grid = self._maps[0][0]
         chosen = evenly(len(planar_scan.hits_m), self._parameters.matched_hits)
         hits, normals = planar_scan.hits_m[chosen], planar_scan.normal_rad[chosen]
-        radii = radii if wide else (radii[-1],) * len(radii)
-        return self._maps[0][0].match(hits, normals, guess, prior, information, radii=radii)
+        guess = grid.weighed(hits, normals, near, prior, information)
+        return grid.match(hits, normals, guess, prior, information)
 
     def extend(self, planar_scan: PlanarScan, pose: SE2) -> None:
         """Add a planar scan at its final pose T_session_base."""

@@ -48,10 +48,10 @@ class SensorOnWheels:
         self._floor = GroundModel(None, parameters)
         self._matching = MATCHING_PARAMETERS
         self._maps = MatchingMaps(projection.max_range_m, parameters)
-        self.kiss = KissRegistration(registration)
-        # Of the scan taken last: reduced to the plane, where KISS-ICP puts it, whether it has no odometry.
+        self._kiss = KissRegistration(registration)
+        # Of the scan taken last: reduced to the plane, its points without the floor, whether it has odometry.
         self._planar_scan: PlanarScan
-        self._registered, self._unaided = SE2(), True
+        self._points_m, self._unaided = np.empty((0, 3), np.float32), True
         self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)
 
     def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
@@ -61,15 +61,14 @@ class SensorOnWheels:
         narrow = SENSOR_MODELS[scan.sensor].narrow  # the sensor sees a part of its surroundings only
         self._matching = CAMERA_MATCHING if narrow else MATCHING_PARAMETERS
         self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
-        pose = self.levelled(at.lift())
-        self.kiss.register(self._floor.remove(points_m), pose)
+        self._points_m = self._floor.remove(points_m)
         self._planar_scan = self._project(scan, points_m)
-        return pose
+        return self.levelled(at.lift())
 
     def restart(self) -> None:
         """Forget the local maps: the next keyframe begins new ones."""
         self._maps.restart()
-        self.kiss = KissRegistration(self._registration)
+        self._kiss = KissRegistration(self._registration)
 
     def levelled(self, pose: F64) -> F64:
         """A pose (4, 4) in the plane with tilt and height from the floor: walls alone let them drift."""
@@ -79,18 +78,18 @@ class SensorOnWheels:
         """Whether there is a local map."""
         return bool(self._maps)
 
-    def take(self, scan: Scan, points_m: F32, expected: Belief) -> None:
+    def take(self, scan: Scan, points_m: F32) -> None:
         """See `PlacingSensor`."""
         self._floor.follow(points_m, scan)
-        near = self.kiss.register(self._floor.remove(points_m), self.levelled(expected.pose))
-        self._registered = SE2.from_matrix(near)
+        self._points_m = self._floor.remove(points_m)
         self._planar_scan, self._unaided = self._project(scan, points_m), scan.T_odom_base is None
 
-    def match(self, belief: Belief, *, wide: bool) -> list[Fit]:
-        """See `PlacingSensor`. KISS-ICP slides along walls, so it is not the only beginning."""
-        prior = SE2.from_matrix(belief.pose)
-        starts = (prior, self._registered) if wide else (prior,)
-        return [self._matched(self._maps, start, belief, wide=wide) for start in starts]
+    def match(self, belief: Belief, *, registered: bool) -> Fit:
+        """See `PlacingSensor`."""
+        near = self.levelled(belief.pose)
+        if registered:
+            near = self._kiss.register(self._points_m, near)
+        return self._matched(self._maps, SE2.from_matrix(near), belief)
 
     def search(self, belief: Belief) -> Iterator[Fit]:
         """See `PlacingSensor`."""
@@ -116,7 +115,7 @@ class SensorOnWheels:
         motion = self._last.inverse() @ SE2.from_matrix(at)
         return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible else None
 
-    def _matched(self, maps: MatchingMaps, guess: SE2, belief: Belief, *, wide: bool = True) -> Fit:
+    def _matched(self, maps: MatchingMaps, guess: SE2, belief: Belief) -> Fit:
         """The planar scan matched with local maps from a guess, held to a belief.
 
         Ground that the map does not know speaks neither for nor against a placement: what lies there counts
@@ -125,7 +124,7 @@ class SensorOnWheels:
         """
         p, prior = self._parameters, SE2.from_matrix(belief.pose)
         information = _turned(belief.information, -prior.yaw)  # in the axes of the session frame
-        match = maps.match(self._planar_scan, guess, prior, information, wide=wide)
+        match = maps.match(self._planar_scan, guess, prior, information)
         unknown = 1.0 - match.overlap - match.contradicted
         return Fit(
             pose=match.pose.lift(),
@@ -156,7 +155,7 @@ class SensorOnWheels:
     def extend(self, pose: F64) -> None:
         """Add the scan taken last to the local maps at its final pose (4, 4)."""
         self._maps.extend(self._planar_scan, SE2.from_matrix(pose))
-        self.kiss.update_map(pose)
+        self._kiss.add(self._points_m, pose)
 
     def _project(self, scan: Scan, points_m: F32) -> PlanarScan:
         """Reduce points (N, 3) of the base frame to the plane."""

@@ -18,12 +18,14 @@ class MatchingParameters:
         not measured.
     residual_scale_m : scale of the Cauchy weight of a point, times the radius of its neighbourhood in cells.
     prior_scale : scale of the Cauchy weight of the prior, in standard deviations.
+    near_sigma_m : the same of a point that KISS-ICP has brought near.
     radii_cells : half width of the neighbourhood that gives each point its line, one entry an iteration:
         wide first for a large basin of convergence, then narrow for accuracy.
     converged : the iterations end when x, y (m) and yaw (rad) change by less than this in sum.
     """
 
     cell_m: float = 0.1
+    near_sigma_m: float = 0.4
     sectors: int = 8
     least_points: float = 0.44
     residual_scale_m: float = 0.05

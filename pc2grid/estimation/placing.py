@@ -1,10 +1,10 @@
 """Where a scan lies on the local map of the last metres: the most probable of several matches.
 
 A sensor matches (`PlacingSensor`: in the plane, or in space); what is made of its matches is the same with
-three and with six degrees of freedom. They begin where the base is expected. If none fits there, the scan is
-searched for. Each match has a posterior density: by how the scan fits, and by what was expected. The best one
-is taken, and the covariance of all says how far it is to be believed: of two places that fit alike neither
-is known.
+three and with six degrees of freedom. KISS-ICP brings the scan near, from where the base is expected; the
+matches begin there. If none fits, the scan is searched for. Each match has a posterior density: by how the
+scan fits, and by what was expected. The best one is taken, and the covariance of all says how far it is to be
+believed: of two places that fit alike neither is known.
 """
 
 from __future__ import annotations
@@ -60,17 +60,16 @@ class PlacingSensor(Protocol):
         """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
         levelled."""
 
-    def take(self, scan: Scan, points_m: F32, expected: Belief) -> None:
+    def take(self, scan: Scan, points_m: F32) -> None:
         """Take in a scan."""
 
     def __bool__(self) -> bool:
         """Whether there is a local map."""
 
-    def match(self, belief: Belief, *, wide: bool) -> list[Fit]:
-        """Match the scan taken last with the local map; the matches are held to a belief.
+    def match(self, belief: Belief, *, registered: bool) -> Fit:
+        """Match the scan taken last with the local map; the match is held to a belief.
 
-        wide : they begin where registration puts the scan, too, and reach far; else only at the belief, and
-        what is far from there does not count.
+        registered : it begins where KISS-ICP puts the scan from there, else at the belief.
         """
 
     def search(self, belief: Belief) -> Iterator[Fit]:
@@ -138,7 +137,7 @@ class Placer:
         scan that fits nowhere, or shows nothing, is placed there.
         """
         p, belief = self._parameters, expected[0]
-        self._sensor.take(scan, points_m, belief)
+        self._sensor.take(scan, points_m)
         if not self._sensor:
             return Placed(belief.pose, first=True)
         found = self._hypotheses(expected)
@@ -155,14 +154,15 @@ class Placer:
     def _hypotheses(self, expected: Sequence[Belief]) -> list[_Hypothesis]:
         """Where the scan taken last may lie.
 
-        Wide matches slide along surfaces, so it is also matched without, where these do not settle it. Where
-        it fits nowhere else that the base may be, it is searched for.
+        Where KISS-ICP does not settle it, the scan is also matched from where it is expected. Where it fits
+        nowhere there, it is searched for.
         """
         found: list[_Hypothesis] = []
         first = expected[0]
         for belief in expected:
-            for wide in (True, False):
-                found += [self._hypothesis(fit, expected) for fit in self._sensor.match(belief, wide=wide)]
+            for registered in (True, False):
+                fit = self._sensor.match(belief, registered=registered)
+                found.append(self._hypothesis(fit, expected))
                 if max(found).sure and max(found).near and not self._is_vague(belief):
                     return found
         if not max(found).sure and (self._is_vague(first) or not max(found).near):

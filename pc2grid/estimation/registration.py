@@ -1,9 +1,10 @@
 """KISS-ICP (Vizzo et al. 2023) per scan. The only file that imports kiss_icp.
 
 `KissRegistration` is composed of the public parts of kiss_icp, in the order of `KissICP.register_frame`.
-Three things differ. The initial guess comes from outside (odometry where the log has it). The local map is
-updated by a call of its own, once the pose of the scan is final. Floor and ceiling are removed before: the
-rings of a lidar on the floor move with the sensor and pull point-to-point ICP towards standing still.
+Three things differ. The initial guess comes from outside (the prediction of the smoother). A scan is added to
+the local map by a call of its own, once its pose is final. And on wheels, floor and ceiling are removed
+before: the rings of a lidar on the floor move with the sensor and pull point-to-point ICP towards standing
+still.
 """
 
 from __future__ import annotations
@@ -25,13 +26,15 @@ _EXACT = 1e-12
 class KissRegistration:
     """KISS-ICP with a given initial guess, in one thread and hence repeatable.
 
-    Voxel and range are its defaults, unless `config` fixes them: a refinement in the plane follows, so
+    voxel_m, max_range_m : where `config` does not say; None: as KISS-ICP has it. A refinement follows, so
     coarse voxels are enough.
     """
 
-    def __init__(self, config: RegistrationConfig) -> None:
+    def __init__(
+        self, config: RegistrationConfig, voxel_m: float | None = None, max_range_m: float | None = None
+    ) -> None:
         self._config = config
-        self._pending: F64 | None = None  # the last scan, downsampled, until its pose is final
+        self._voxel_m, self._max_range_m = config.voxel_m or voxel_m, config.max_range_m or max_range_m
         self._kiss_config: Any = None
         self._registration: Any = None
         self._threshold: Any = None
@@ -40,70 +43,62 @@ class KissRegistration:
     def register(self, points_m: NDArray[np.floating], guess: F64) -> F64:
         """Align one scan to the local map.
 
-        points_m : (N, 3) deskewed, without floor and ceiling, in the base frame. guess : (4, 4) initial
-        T_session_base.
+        points_m : (N, 3) deskewed, in the base frame. guess : (4, 4) initial T_session_base.
 
-        Returns T_session_base (4, 4); the guess for the first scan, and for scans without enough points.
-        The scan becomes part of the local map only by `update_map`.
+        Returns T_session_base (4, 4); the guess if there is no map yet, or if the points do not determine a
+        pose. The scan becomes part of the local map only by `add`.
         """
-        self._pending = None
         guess = _proper(guess)
-        if not len(points_m):
+        if self._map is None or not len(points_m) or self._config.icp == "none":
             return guess
-        points = np.ascontiguousarray(points_m, dtype=np.float64)
-        if self._map is None:
-            self._start(points, guess)
-            return guess
-        near = np.einsum("ij,ij->i", points, points) < self._kiss_config.data.max_range**2
-        frame = self._downsample(points[near])
-        pose = self._align(self._downsample(frame, 1.5), guess)
-        if not np.isfinite(pose).all():
-            return guess
-        self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
-        self._pending = frame
-        return pose
-
-    def _align(self, source: F64, guess: F64) -> F64:
-        """The pose (4, 4) of points (N, 3) on the local map, by ICP from an initial guess."""
         sigma = self._threshold.get_threshold()
         pose: F64 = self._registration.align_points_to_map(
-            points=source,
+            points=self._downsample(self._frame(points_m), 1.5),
             voxel_map=self._map,
-            initial_guess=_proper(guess),
+            initial_guess=guess,
             max_correspondance_distance=3.0 * sigma,
             kernel=sigma,
         )
+        if not np.isfinite(pose).all():
+            return guess
+        self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
         return pose
 
-    def update_map(self, T_session_base: F64) -> None:
-        """Add the scan registered last to the local map, at its final pose (4, 4)."""
-        if self._pending is not None:
-            self._map.update(self._pending, _proper(T_session_base))
-            self._pending = None
+    def add(self, points_m: NDArray[np.floating], T_session_base: F64) -> None:
+        """Add the points (N, 3) of a scan to the local map, at its final pose (4, 4)."""
+        if self._map is None:
+            self._start()
+        if len(points_m):
+            self._map.update(self._frame(points_m), _proper(T_session_base))
 
-    def _downsample(self, points: F64, voxels: float = 0.5) -> F64:
+    def _frame(self, points_m: NDArray[np.floating]) -> F64:
+        """The points (N, 3) that are near enough, thinned for the local map."""
+        points = np.ascontiguousarray(points_m, dtype=np.float64)
+        near = np.einsum("ij,ij->i", points, points) < self._kiss_config.data.max_range**2
+        return self._downsample(points[near], 0.5)
+
+    def _downsample(self, points: F64, voxels: float) -> F64:
         """One point for each cube with an edge of so many voxels of the local map."""
         from kiss_icp.voxelization import voxel_down_sample
 
         sampled: F64 = voxel_down_sample(points, voxels * self._kiss_config.mapping.voxel_size)
         return sampled
 
-    def _start(self, points: F64, pose: F64) -> None:
-        """Begin the local map with the first scan."""
+    def _start(self) -> None:
+        """Begin the local map."""
         from kiss_icp.config import KISSConfig
         from kiss_icp.mapping import get_voxel_hash_map
         from kiss_icp.registration import get_registration
         from kiss_icp.threshold import get_threshold_estimator
 
         config = KISSConfig()
-        config.data.max_range = self._config.max_range_m or config.data.max_range
-        config.mapping.voxel_size = self._config.voxel_m or 0.01 * config.data.max_range  # its default
+        config.data.max_range = self._max_range_m or config.data.max_range
+        config.mapping.voxel_size = self._voxel_m or 0.01 * config.data.max_range  # its default
         config.registration.max_num_threads = 1
         self._kiss_config = config
         self._registration = get_registration(config)
         self._threshold = get_threshold_estimator(config)
         self._map = get_voxel_hash_map(config)
-        self._map.update(self._downsample(points), pose)
 
 
 class BareKissIcp:

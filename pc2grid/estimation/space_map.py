@@ -16,7 +16,7 @@ from pc2grid.arrays import F32, F64, BoolGrid
 from pc2grid.clouds.column_map import ColumnMap
 from pc2grid.clouds.level import floor_height
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import ProjectionConfig
+from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.estimation.belief import Belief
 from pc2grid.estimation.point_to_line import best_placements, evenly
 from pc2grid.estimation.surface_map import Placement, SurfaceMap
@@ -74,6 +74,7 @@ class SpaceMap:
         self,
         scan: Scan,
         points_m: F32,
+        registration: RegistrationConfig,
         projection: ProjectionConfig,
         parameters: SpaceMapParameters = SPACE_MAP,
     ) -> None:
@@ -83,7 +84,7 @@ class SpaceMap:
         noise_range_m = SENSOR_MODELS[scan.sensor].range_of_noise_m(parameters.noise_m)
         self._reach_m = min(projection.max_range_m, noise_range_m)
         ranges_m = np.linalg.norm(points_m - scan.T_base_sensor[:3, 3], axis=1)
-        self._surfaces = SurfaceMap.of_first_scan(ranges_m, 2.0 * projection.max_range_m)
+        self._surfaces = SurfaceMap.of_first_scan(ranges_m, 2.0 * projection.max_range_m, registration)
         self._columns = ColumnMap(self._reach_m, scan.sensor, projection)
         self._added_at: F64 | None = None  # pose of the last scan that joined
         self.floor_m: float | None = None
@@ -103,9 +104,11 @@ class SpaceMap:
         sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
         return ThinnedScan(thinned, 1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2))
 
-    def match(self, thinned: ThinnedScan, guess: F64, prior: Belief, *, wide: bool) -> Placement:
-        """Register a scan from a guess (4, 4); it is held to a prior. wide : see `SurfaceMap.match`."""
-        return self._surfaces.match(thinned.points_m, thinned.weights, guess, prior, wide=wide)
+    def match(self, thinned: ThinnedScan, guess: F64, prior: Belief, *, registered: bool) -> Placement:
+        """Register a scan from a guess (4, 4); it is held to a prior. registered : by KISS-ICP first."""
+        surfaces = self._surfaces
+        near = surfaces.near(thinned.points_m, thinned.weights, guess, prior) if registered else guess
+        return surfaces.match(thinned.points_m, thinned.weights, near, prior)
 
     def held(self, thinned: ThinnedScan, placement: Placement) -> Placement:
         """A placement of a scan with the information that surfaces give; see `SurfaceMap.held`."""

@@ -4,8 +4,7 @@ The local map is a hash map of voxels. Each voxel keeps the moments of the point
 adding a scan costs one pass over its points, and the shape of the surface in a voxel (plane, edge, neither)
 is known better with every scan. A scan is aligned by Gauss-Newton: each of its points is held by the voxel
 it falls into, in the directions in which that is thin (Biber and Strasser 2003; Koide et al., "Voxelized
-GICP", 2021). A coarse map, with voxels four times as wide, brings a scan near, and the fine one makes it
-exact.
+GICP", 2021). KISS-ICP brings a scan near, and this makes it exact.
 
 The pose comes with its information, the Hessian (6, 6) of the points, so that odometry or the motion before
 decides in the directions that the points do not fix.
@@ -21,9 +20,11 @@ from scipy.linalg import eigh
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.clouds.sampling import random_subset
+from pc2grid.config import RegistrationConfig
 from pc2grid.estimation import _surface_kernels as kernels
 from pc2grid.estimation.belief import Belief
 from pc2grid.estimation.manifold import moved, steps, weakest
+from pc2grid.estimation.registration import KissRegistration
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,14 +34,16 @@ class SurfaceParameters:
     edge_per_range, edge_m : the edge of a voxel is this times the 75th percentile of the first ranges, within
         these bounds: a room needs finer voxels than a hall.
     thinning : a scan is reduced to one point for each cube of this many edges.
-    coarse : edge of a coarse voxel over that of a fine one.
-    points, coarse_points : of a scan that are aligned with the fine and the coarse map, at most.
+    kiss : edge of a voxel of KISS-ICP over that of this map.
+    points : of a scan that are aligned, at most. few_points : of which it is asked what holds the scan.
     least : points from which on a voxel has a shape. most : a voxel with more forgets the oldest in
         proportion.
     noise_m : a voxel holds points in the directions in which its own have a deviation below this.
     point_sigma_m : standard deviation that one point counts with. It is far above the noise of a range, since
         the errors of neighbours on one surface are not independent (as `MatchingParameters.point_sigma_m`).
-    rounds, coarse_rounds : scale (m) of the Cauchy weight of a distance in each iteration.
+    near_sigma_m : the same of one that KISS-ICP has brought near. near_scale : of the Cauchy weight there, in
+        edges.
+    rounds : scale (m) of the Cauchy weight of a distance in each iteration.
     converged : the iterations end when a step, in rad and m, is smaller.
     least_points : with less information than that of so many points along it, a direction of the position is
         not measured.
@@ -54,15 +57,16 @@ class SurfaceParameters:
     edge_per_range: float = 0.04
     edge_m: tuple[float, float] = (0.1, 0.5)
     thinning: float = 0.5
-    coarse: float = 4.0
+    kiss: float = 2.0
     points: int = 2000
-    coarse_points: int = 600
+    few_points: int = 600
     least: float = 4.0
     most: float = 200.0
     noise_m: float = 0.02
     point_sigma_m: float = 0.1
+    near_sigma_m: float = 0.4
+    near_scale: float = 3.0
     rounds: tuple[float, ...] = (0.3, 0.3, 0.3, 0.1, 0.1, 0.1, *(0.05,) * 8)
-    coarse_rounds: tuple[float, ...] = (0.5, 0.5, 0.5, 0.2, 0.2, 0.2, 0.2)
     converged: float = 2e-4
     least_points: float = 5.0
     aside: float = 0.5
@@ -179,22 +183,31 @@ class VoxelShapes:
 class SurfaceMap:
     """The surfaces that a carried sensor has seen within `reach_m` of where it is."""
 
-    def __init__(self, edge_m: float, reach_m: float, parameters: SurfaceParameters = SURFACES) -> None:
+    def __init__(
+        self,
+        edge_m: float,
+        reach_m: float,
+        registration: RegistrationConfig,
+        parameters: SurfaceParameters = SURFACES,
+    ) -> None:
         p = self._parameters = parameters
         self._reach_m = reach_m
         self._cleared_at: F64 | None = None
         self.fine = VoxelShapes(edge_m, p.least, p.most, p.noise_m)
-        coarse_noise_m = p.noise_m * p.coarse**0.5  # a wide voxel holds a surface that is not flat
-        self._coarse = VoxelShapes(p.coarse * edge_m, 2.0 * p.least, p.coarse * p.most, coarse_noise_m)
+        self._kiss = KissRegistration(registration, p.kiss * edge_m, reach_m)
 
     @classmethod
     def of_first_scan(
-        cls, ranges_m: NDArray[np.floating], reach_m: float, parameters: SurfaceParameters = SURFACES
+        cls,
+        ranges_m: NDArray[np.floating],
+        reach_m: float,
+        registration: RegistrationConfig,
+        parameters: SurfaceParameters = SURFACES,
     ) -> SurfaceMap:
         """An empty map whose voxels fit the surroundings that the ranges (N,) of a first scan show."""
         p = parameters
         middle_m = float(np.percentile(ranges_m, 75)) if len(ranges_m) else 0.0
-        return cls(float(np.clip(p.edge_per_range * middle_m, *p.edge_m)), reach_m, p)
+        return cls(float(np.clip(p.edge_per_range * middle_m, *p.edge_m)), reach_m, registration, p)
 
     def __bool__(self) -> bool:
         return len(self.fine) > 0
@@ -206,30 +219,32 @@ class SurfaceMap:
 
     def add(self, points_m: F64, pose: F64) -> None:
         """Add thinned points (N, 3) at their pose (4, 4); what has become far is forgotten now and then."""
-        placed = points_m @ pose[:3, :3].T + pose[:3, 3]
         here = pose[:3, 3]
-        for voxels in (self.fine, self._coarse):
-            voxels.add(placed)
+        self.fine.add(points_m @ pose[:3, :3].T + here)
+        self._kiss.add(points_m, pose)
         if self._cleared_at is None:
             self._cleared_at = here
         elif np.linalg.norm(here - self._cleared_at) > 0.25 * self._reach_m:
             self._cleared_at = here
-            for voxels in (self.fine, self._coarse):
-                voxels.forget_beyond(here, 1.25 * self._reach_m)
+            self.fine.forget_beyond(here, 1.25 * self._reach_m)
 
-    def match(
-        self, points_m: F64, weights: F64, guess: F64, prior: Belief, *, wide: bool = True
-    ) -> Placement:
+    def match(self, points_m: F64, weights: F64, guess: F64, prior: Belief) -> Placement:
         """Place thinned points (N, 3), base frame, from a guess (4, 4); they are held to a prior.
 
-        weights : (N,) of the points, 0..1, by their noise. wide : whether the coarse map brings them near.
+        weights : (N,) of the points, 0..1, by their noise.
         """
-        p = self._parameters
-        fine = random_subset(len(points_m), p.points)
-        if wide:
-            few = fine[random_subset(len(fine), p.coarse_points)]
-            guess = self._align(self._coarse, points_m[few], weights[few], guess, prior, p.coarse_rounds).pose
-        return self._align(self.fine, points_m[fine], weights[fine], guess, prior, p.rounds)
+        chosen = random_subset(len(points_m), self._parameters.points)
+        return self._align(points_m[chosen], weights[chosen], guess, prior)
+
+    def near(self, points_m: F64, weights: F64, guess: F64, prior: Belief) -> F64:
+        """Where KISS-ICP puts thinned points (N, 3) from a guess (4, 4), weighed against a prior by how the
+        surfaces there hold it: in the directions that they leave open it slides."""
+        p, registered = self._parameters, self._kiss.register(points_m, guess)
+        few = random_subset(len(points_m), p.few_points)
+        H = self.fine.equations(points_m[few], weights[few], registered, p.near_scale * self.fine.edge_m)[0]
+        step = _step(registered, H / p.near_sigma_m**2, np.zeros(6), prior)
+        near: F64 = moved(registered[None], step[None])[0]
+        return near
 
     def held(self, points_m: F64, weights: F64, placement: Placement) -> Placement:
         """A placement of thinned points (N, 3), with the information that the surfaces truly give.
@@ -240,7 +255,7 @@ class SurfaceMap:
         pose, in metres by which these displace the points. What is not held tells nothing.
         """
         p = self._parameters
-        few = random_subset(len(points_m), p.coarse_points)
+        few = random_subset(len(points_m), p.few_points)
         points, own, aside_m = points_m[few], weights[few], p.aside * self.fine.edge_m
 
         def at(step: F64) -> tuple[F64, F64]:
@@ -262,37 +277,35 @@ class SurfaceMap:
             measured=placement.measured and not loose.size,
         )
 
-    def _align(
-        self,
-        voxels: VoxelShapes,
-        points_m: F64,
-        weights: F64,
-        guess: F64,
-        prior: Belief,
-        rounds: tuple[float, ...],
-    ) -> Placement:
-        """Gauss-Newton on one of the two maps."""
+    def _align(self, points_m: F64, weights: F64, guess: F64, prior: Belief) -> Placement:
+        """Gauss-Newton from a guess."""
         p = self._parameters
-        sigma_m = p.point_sigma_m * voxels.edge_m / self.fine.edge_m
+        unit = p.point_sigma_m**-2
         pose, information, found, distance_m = guess, np.zeros((6, 6)), 0.0, 0.0
-        for scale_m in rounds:
-            H, g, found, distance_m = voxels.equations(points_m, weights, pose, scale_m)
-            information = H / sigma_m**2
-            away, _, J = (of_prior[0] for of_prior in steps(prior.pose[None], pose[None]))
-            step = -np.linalg.solve(
-                information + J.T @ prior.information @ J + 1e-3 * np.eye(6),
-                g / sigma_m**2 + J.T @ prior.information @ away,
-            )
+        for scale_m in p.rounds:
+            H, g, found, distance_m = self.fine.equations(points_m, weights, pose, scale_m)
+            information = unit * H
+            step = _step(pose, information, unit * g, prior)
             pose = moved(pose[None], step[None])[0]
-            if scale_m == rounds[-1] and np.abs(step).sum() < p.converged:
+            if scale_m == p.rounds[-1] and np.abs(step).sum() < p.converged:
                 break
         return Placement(
             pose,
             information,
             found / max(len(points_m), 1),
             distance_m / max(found, 1.0),
-            weakest(information, 3) > p.least_points / sigma_m**2,
+            weakest(information, 3) > p.least_points * unit,
         )
+
+
+def _step(pose: F64, information: F64, gradient: F64, prior: Belief) -> F64:
+    """The Gauss-Newton step (6,) from a pose (4, 4) of what is measured there and of a prior."""
+    away, _, J = (of_prior[0] for of_prior in steps(prior.pose[None], pose[None]))
+    step: F64 = -np.linalg.solve(
+        information + J.T @ prior.information @ J + 1e-3 * np.eye(6),
+        gradient + J.T @ prior.information @ away,
+    )
+    return step
 
 
 def _displacement(points_m: F64) -> F64:

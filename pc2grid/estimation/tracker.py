@@ -94,7 +94,7 @@ class Tracker:
         if rolling:
             self._sensor = SensorOnWheels(self._config, self._projection, self._parameters)
         else:
-            self._sensor = CarriedSensor(self._projection)
+            self._sensor = CarriedSensor(self._config, self._projection)
         self._health = HealthJudge(self._parameters)
         pose = self._sensor.start(scan, points, at)
         self._smoother = Smoother(self._sensor.free, SMOOTHER if rolling else IN_THE_HAND)

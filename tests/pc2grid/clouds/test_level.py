@@ -7,6 +7,7 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.clouds.level import floor_height
+from pc2grid.config import RegistrationConfig
 from pc2grid.estimation.surface_map import SurfaceMap
 
 EDGE_M = 0.15
@@ -28,7 +29,7 @@ def wall(x: float, seed: int = 1) -> F64:
 
 
 def shapes_of(*points_m: F64) -> F64:
-    surfaces = SurfaceMap(EDGE_M, 20.0)
+    surfaces = SurfaceMap(EDGE_M, 20.0, RegistrationConfig())
     surfaces.add(np.concatenate(points_m), np.eye(4))
     return surfaces.fine.shapes
 

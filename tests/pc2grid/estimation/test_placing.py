@@ -37,7 +37,7 @@ def expected(x: float, sigma: float) -> Belief:
 class Sensor:
     """Its matches are given: near where it is expected, and by search."""
 
-    near: Sequence[Fit]
+    near: Fit
     elsewhere: Sequence[Fit] = ()
     searched: int = 0
     free = PLANAR
@@ -51,8 +51,8 @@ class Sensor:
 
     def take(self, *of_scan: object) -> None: ...
 
-    def match(self, belief: Belief, *, wide: bool) -> list[Fit]:
-        return list(self.near)
+    def match(self, belief: Belief, *, registered: bool) -> Fit:
+        return self.near
 
     def search(self, belief: Belief) -> Iterator[Fit]:
         self.searched += 1
@@ -78,14 +78,14 @@ def placed(sensor: Sensor, belief: Belief) -> Placed:
 
 
 def test_what_fits_where_it_is_expected_is_not_searched_for() -> None:
-    sensor = Sensor([fit_at(0.01, evidence=100.0)], [fit_at(2.0, evidence=200.0)])
+    sensor = Sensor(fit_at(0.01, evidence=100.0), [fit_at(2.0, evidence=200.0)])
     found = placed(sensor, expected(0.0, 0.02))
     assert found.alone is not None and found.alone[0][0, 3] == 0.01
     assert found.alone[1] == pytest.approx(EXACT) and not sensor.searched
 
 
 def test_what_may_be_far_off_and_does_not_fit_is_searched_for() -> None:
-    sensor = Sensor([fit_at(0.0, evidence=10.0, fits=False)], [fit_at(1.0, evidence=100.0)])
+    sensor = Sensor(fit_at(0.0, evidence=10.0, fits=False), [fit_at(1.0, evidence=100.0)])
     found = placed(sensor, expected(0.0, 0.5))
     assert sensor.searched and found.pose[0, 3] == 1.0
 
@@ -93,7 +93,7 @@ def test_what_may_be_far_off_and_does_not_fit_is_searched_for() -> None:
 def test_of_two_places_that_fit_alike_neither_is_known() -> None:
     """The map may have it at either; the scans that follow decide."""
     here, there = fit_at(-0.5, evidence=100.0, fits=False), fit_at(0.5, evidence=100.5)
-    found = placed(Sensor([here], [there]), expected(0.0, 0.5))
+    found = placed(Sensor(here, [there]), expected(0.0, 0.5))
     assert found.alone is not None
     sigma_m = np.sqrt(np.linalg.inv(found.alone[1]).diagonal())
     assert sigma_m[0] > 0.5  # of masses that are equal; a third of it is 0.58 m
@@ -106,11 +106,11 @@ def test_new_ground_may_explain_a_scan_better_than_what_was_searched_for(
 ) -> None:
     """A sensor that may see what its map does not know offers that as a match without overlap."""
     nothing = replace(fit_at(0.0, evidence=new_ground, fits=False), overlap=0.0)
-    sensor = Sensor([fit_at(0.0, evidence=0.0, fits=False)], [fit_at(0.4, evidence=100.0), nothing])
+    sensor = Sensor(fit_at(0.0, evidence=0.0, fits=False), [fit_at(0.4, evidence=100.0), nothing])
     assert (placed(sensor, expected(0.0, 0.5)).alone is not None) is believed
 
 
 def test_what_fits_neither_here_nor_elsewhere_is_not_placed() -> None:
     belief = expected(0.0, 0.02)
-    found = placed(Sensor([fit_at(0.5, evidence=10.0, fits=False)]), belief)
+    found = placed(Sensor(fit_at(0.5, evidence=10.0, fits=False)), belief)
     assert found.alone is None and np.array_equal(found.pose, belief.pose)

@@ -192,3 +192,21 @@ def test_the_best_placement_is_where_the_points_lie() -> None:
     (score, pose), *others = best_placements(field, np.zeros(2), 0.1, points, SE2(), 0.6, math.radians(6.0))
     assert score > 0.95 and all(other < 0.5 for other, _ in others)
     assert (pose.x, pose.y, pose.yaw) == pytest.approx((truth.x, truth.y, truth.yaw))
+
+
+def test_what_walls_do_not_hold_is_not_taken_from_kiss_icp() -> None:
+    """Along a bare wall it slides; before a corner it knows."""
+    rng = np.random.default_rng(3)
+    wall = np.column_stack((rng.uniform(1.0, 7.0, 400), 2.0 + 0.005 * rng.standard_normal(400)))
+    side = np.column_stack((1.0 + 0.005 * rng.standard_normal(200), rng.uniform(2.0, 5.0, 200)))
+    north, east = np.full(400, 0.5 * np.pi), np.zeros(200)
+    prior, slid = SE2(), SE2(0.5, 0.0, 0.0)
+    information = np.diag([100.0, 100.0, 1000.0])
+    for points, normals, left_m in (
+        (wall, north, 0.0),
+        (np.concatenate((wall, side)), np.concatenate((north, east)), 0.4),
+    ):
+        grid = PointGrid((-2.0, -2.0), (10.0, 8.0))
+        grid.add(points + np.array((0.5, 0.0)), normals)
+        weighed = grid.weighed(points, normals, slid, prior, information)
+        assert weighed.x == pytest.approx(left_m, abs=0.1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
+from pc2grid.config import RegistrationConfig
 from pc2grid.estimation import _surface_kernels as kernels
 from pc2grid.estimation.belief import SPATIAL, Belief
 from pc2grid.estimation.manifold import weakest
@@ -31,7 +32,7 @@ def corner(seed: int, faces: tuple[int, ...] = (0, 1, 2)) -> F64:
 
 
 def seen(points_m: F64) -> SurfaceMap:
-    surfaces = SurfaceMap(EDGE_M, 20.0)
+    surfaces = SurfaceMap(EDGE_M, 20.0, RegistrationConfig())
     surfaces.add(points_m, np.eye(4))
     return surfaces
 
@@ -97,7 +98,7 @@ def test_a_scan_of_another_place_does_not_overlap() -> None:
 
 def test_what_is_far_behind_is_forgotten() -> None:
     """Five rooms, ten metres from one to the next, and a reach of eight: those of one and a half stay."""
-    surfaces, sizes = SurfaceMap(EDGE_M, 8.0), []
+    surfaces, sizes = SurfaceMap(EDGE_M, 8.0, RegistrationConfig()), []
     for k in range(5):
         surfaces.add(corner(k), pose_from_rotation_vector((0.0, 0.0, 0.0), (10.0 * k, 0.0, 0.0)))
         sizes.append(len(surfaces.fine))
@@ -118,7 +119,7 @@ def test_the_equations_are_those_of_points_and_planes() -> None:
     """One voxel with a plane x = 0.5: H, g and the distances by numpy, as the textbook says."""
     rng = np.random.default_rng(3)
     inside = np.column_stack((np.full(400, 0.5), rng.uniform(0.01, 0.99, (400, 2))))
-    surfaces = SurfaceMap(1.0, 20.0)
+    surfaces = SurfaceMap(1.0, 20.0, RegistrationConfig())
     surfaces.add(inside, np.eye(4))
     points = np.array([(0.6, 0.4, 0.5), (0.45, 0.6, 0.6)])
     H, g, found, distance_m = surfaces.fine.equations(points, np.ones(2), np.eye(4), 1e6)

@@ -226,18 +226,36 @@ def _hall(every: int, name: str, *, quick: bool = False) -> Recording:
     )
 
 
+def _with_control(recording: Recording) -> tuple[Recording, Recording]:
+    """A recording whose scans are far apart, and the same without KISS-ICP, which must do worse."""
+    without = ("--set", "registration.icp=none")
+    name = f"{recording.name}, without KISS-ICP"
+    return recording, replace(recording, name=name, options=recording.options + without, quick=False)
+
+
+_E1R = Recording(
+    name="e1r_office_a",
+    file="lidar/e1r_office_a.mcap",
+    building="e1r office",
+    sensor="lidar",
+    truth="lidar/e1r_office_a.tum",
+    poses="lidar/e1r_office_a.tum",
+)
+_CSAIL = _laser(
+    "csail without odometry",
+    "csail",
+    file="laser/csail.mcap",
+    options=("--odometry", "none"),
+    truth="laser/csail.relations",
+    poses="laser/csail_corrected.tum",
+)
+
 RECORDINGS: tuple[Recording, ...] = (
     _hall(1, "hall", quick=True),
-    _hall(2, "hall, every 2nd scan", quick=True),
-    _hall(3, "hall, every 3rd scan", quick=True),
-    Recording(
-        name="e1r_office_a",
-        file="lidar/e1r_office_a.mcap",
-        building="e1r office",
-        sensor="lidar",
-        truth="lidar/e1r_office_a.tum",
-        poses="lidar/e1r_office_a.tum",
-    ),
+    *_with_control(_hall(2, "hall, every 2nd scan", quick=True)),
+    *_with_control(_hall(3, "hall, every 3rd scan", quick=True)),
+    _E1R,
+    *_with_control(replace(_E1R, name="e1r_office_a, every 4th scan", every=4)),
     _phone("room_a"),
     _phone("room_a", odometry=False),
     _phone("room_b", quick=True),
@@ -249,14 +267,8 @@ RECORDINGS: tuple[Recording, ...] = (
     _corrected("intel", "intel"),
     _corrected("csail", "csail", quick=True),
     _corrected("killian", "killian", relations=False),
-    _laser(
-        "csail without odometry",
-        "csail",
-        file="laser/csail.mcap",
-        options=("--odometry", "none"),
-        truth="laser/csail.relations",
-        poses="laser/csail_corrected.tum",
-    ),
+    _CSAIL,
+    *_with_control(replace(_CSAIL, name="csail without odometry, every 4th scan", every=4)),
     _laser("aces", "aces", file="laser/aces_ros1.bag"),
     _sparse("acapulco"),
     _sparse("belgioioso"),
