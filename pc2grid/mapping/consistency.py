@@ -49,7 +49,7 @@ class ConsistencyParameters:
 
     `window_m`, `contradicted_from` and `bent_from` were chosen on real logs and simulated drives, whose poses
     were the true ones, those with loops closed, those without loops, and true poses bent on purpose
-    (`examples/consistency.md`).
+    (`examples/map-quality.md`).
     """
 
     reach_m: float = 12.0
