@@ -1,7 +1,4 @@
-"""Compiled twins of two steps of the description, where compiling pays.
-
-The readable definitions are `boundary.pair_distance_counts` and `freespace.in_sight`; the tests compare both.
-"""
+"""The two steps of the description where compiling pays. The tests compare them with plain forms in numpy."""
 
 from __future__ import annotations
 
@@ -16,7 +13,9 @@ from pc2grid.arrays import I64
 
 @numba.njit(cache=True)
 def pair_distance_counts(cells: I64, bins_per_cell: float, rounding_bins: float, bins: int) -> I64:
-    """`boundary.pair_distance_counts` is the definition; parameters and result are the same.
+    """How many pairs m < n of cells (N, 2) lie how far from each other, Eq. 1-2: (bins,).
+
+    Bin k holds the distances from k to k + 1 in units of the bin width, the last bin the longer ones as well.
 
     Measured: 0.7 against 4 ms for 1,150 cells; a disc of 8 m is described in 9.5 instead of 12 ms.
     """
@@ -39,7 +38,13 @@ def pair_distance_counts(cells: I64, bins_per_cell: float, rounding_bins: float,
 def in_sight(
     occupied: NDArray[np.bool_], cells: I64, first: NDArray[np.intp], second: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """`freespace.in_sight` is the definition; parameters and result are the same.
+    """Whether the straight lines between the centres of cells[first] and cells[second] meet no occupied cell.
+
+    occupied (H, W); cells (N, 2) as (row, column); first, second (P,) indices. Returns (P,).
+
+    Every cell that a line passes through is tested, so no line crosses a wall of one pixel. A line through
+    the common corner of four cells is blocked only if both cells beside the corner are occupied (Amanatides
+    and Woo 1987, in integers).
 
     Measured: a disc of 8 m is described in 9.5 instead of 75 ms, a view of 5 m in 1.1 instead of 6.4 ms.
     """

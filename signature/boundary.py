@@ -48,17 +48,6 @@ def boundary_histogram(points: I64, radius_m: float, resolution_m: float, config
     return normalized(_kernels.pair_distance_counts(cells, bins_per_cell, ROUNDING_BINS, bins))
 
 
-def pair_distance_counts(cells: I64, bins_per_cell: float, rounding_bins: float, bins: int) -> I64:
-    """How many pairs m < n of cells (N, 2) lie how far from each other, Eq. 1-2: (bins,).
-
-    Bin k holds the distances from k to k + 1 in units of the bin width, the last bin the longer ones as well.
-    """
-    from scipy.spatial.distance import pdist
-
-    at = (pdist(cells * bins_per_cell) + rounding_bins).astype(np.int64)
-    return np.bincount(np.minimum(at, bins - 1), minlength=bins)
-
-
 def normalized(counts: NDArray[np.generic]) -> F32:
     """Counts (N,) as shares, float32 of sum 1; all 0 stays all 0."""
     return np.asarray(counts / max(counts.sum(), 1), np.float32)

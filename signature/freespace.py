@@ -8,7 +8,6 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.model import OccupancyGrid, Submap
@@ -80,34 +79,6 @@ def visibility_graph(
         weight="length_m",
     )
     return graph
-
-
-def in_sight(
-    occupied: BoolGrid, cells: I64, first: NDArray[np.intp], second: NDArray[np.intp]
-) -> NDArray[np.bool_]:
-    """Whether the straight lines between the centres of cells[first] and cells[second] meet no occupied cell.
-
-    occupied (H, W); cells (N, 2) as (row, column); first, second (P,) indices. Returns (P,).
-
-    Every cell that a line passes through is tested, so no line crosses a wall of one pixel. A line through
-    the common corner of four cells is blocked only if both cells beside the corner are occupied. All lines
-    advance together, across one cell border in each turn (Amanatides and Woo 1987, in integers).
-    """
-    (row, column), (last_row, last_column) = cells[first].T, cells[second].T
-    rows, columns = np.abs(last_row - row), np.abs(last_column - column)
-    down, across = np.sign(last_row - row), np.sign(last_column - column)
-    visible: NDArray[np.bool_] = ~occupied[row, column]
-    # Positive: the line meets the border to the next row first; negative: to the next column; 0: a corner.
-    lead = rows - columns
-    while (moving := visible & ((row != last_row) | (column != last_column))).any():
-        corner = moving & (lead == 0)
-        beside = occupied[row + down * corner, column] & occupied[row, column + across * corner]
-        visible &= ~(corner & beside)
-        to_row, to_column = moving & (lead >= 0), moving & (lead <= 0)
-        row, column = row + down * to_row, column + across * to_column
-        lead = lead + 2 * (rows * to_column - columns * to_row)
-        visible &= ~occupied[row, column]
-    return visible
 
 
 def shortest_paths(graph: nx.Graph) -> F64:

@@ -179,7 +179,8 @@ def heights_seen(
     borders: F64,
     bearings: int,
 ) -> U8:
-    """Twin of `heights.heights_seen_plain`, which looks at the points of the `bearings` that matter alone."""
+    """As `heights.heights_seen`; of each obstacle, only the points of the `bearings` that matter are looked
+    at."""
     per_rad = bearings / (2.0 * math.pi)
     bearing_of, ranges = np.empty(len(points), dtype=np.int32), np.empty(len(points))
     for n in range(len(points)):

@@ -7,12 +7,10 @@ scan has a return from it, and those in which a ray went on behind it.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from pc2grid.arrays import F32, F64, U8
-from pc2grid.model import SLICE_BORDERS_M, SLICES
+from pc2grid.model import SLICE_BORDERS_M
 
 _BEARINGS = 720
 """Bearings that the returns are sorted by; as many as are fast."""
@@ -37,34 +35,3 @@ def heights_seen(
     from pc2grid.clouds._kernels import heights_seen as compiled
 
     return compiled(at_m, points_m, sensor_m, plane, band_m, depths, np.array(SLICE_BORDERS_M), _BEARINGS)
-
-
-def heights_seen_plain(
-    at_m: F32,
-    points_m: F32,
-    sensor_m: F64,
-    plane: F64,
-    band_m: tuple[float, float],
-    depths: tuple[float, float],
-    borders_m: F64,
-) -> U8:
-    """The definition of the compiled form, in plain numpy."""
-    away_m = points_m[:, :2].astype(np.float64) - sensor_m[:2]
-    ranges_m = np.hypot(away_m[:, 0], away_m[:, 1])
-    height_m = points_m.astype(np.float64) @ plane[:3] + plane[3]
-    sensor_height_m = float(sensor_m @ plane[:3] + plane[3])
-    heights = np.zeros(len(at_m), np.uint8)
-    for k, (x, y) in enumerate(at_m.astype(np.float64) - sensor_m[:2]):
-        r = math.hypot(x, y)
-        aside_m = np.abs(away_m @ (-y, x)) / np.maximum(ranges_m, 1e-9)
-        ahead, deep_m = away_m @ (x, y) > 0.0, depths[0] + depths[1] * r * r
-        returned = ahead & (aside_m <= 0.5 * depths[0]) & (np.abs(ranges_m - r) <= deep_m)
-        passed = ahead & (aside_m <= 0.25 * depths[0]) & (ranges_m > r + deep_m)
-        passing_m = sensor_height_m + (height_m - sensor_height_m) * r / np.maximum(ranges_m, 1e-9)
-        filled, empty = (
-            np.bitwise_or.reduce(1 << np.searchsorted(borders_m, inside, side="right"))
-            for some in (height_m[returned], passing_m[passed])
-            for inside in [some[(some >= band_m[0]) & (some <= band_m[1])]]
-        )
-        heights[k] = filled | (empty & ~filled) << SLICES
-    return heights

@@ -71,14 +71,3 @@ def _rotations(vectors: F64) -> F64:
     K = _skew(vectors)
     result: F64 = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * (K @ K)
     return result
-
-
-def _rotation_vectors(rotations: F64) -> F64:
-    """Rotation vectors (N, 3) of rotation matrices (N, 3, 3)."""
-    R = rotations
-    twice = np.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), axis=1)
-    twice_sine = np.linalg.norm(twice, axis=1)
-    angle = np.arctan2(twice_sine, np.einsum("naa->n", R) - 1.0)
-    small = twice_sine < 1e-9
-    result: F64 = twice * np.where(small, 0.5, angle / np.where(small, 1.0, twice_sine))[:, None]
-    return result

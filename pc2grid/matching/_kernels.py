@@ -1,4 +1,5 @@
-"""Compiled twins of the coarse search and of the refinement. Lengths are in cells, poses are (x, y, yaw)."""
+"""Compiled steps of the coarse search and of the refinement. Lengths are in cells, poses are (x, y, yaw). The
+tests compare them with plain forms in numpy."""
 
 from __future__ import annotations
 
@@ -156,8 +157,11 @@ def tile_bounds(
     inside: U16,
     turns: F64,
 ) -> I64:
-    """Twin of `window_search.plain_tile_bounds`. flat, shape : images, and the size of one; then the parts of
-    `Tiles`."""
+    """(T, K) the highest sum over the points at the centres of the squares of each tile, at each heading.
+
+    flat, shape : images, and the size of one. level : (N,) the image that each point is looked up in, -1: it
+    counts as on a wall. points : (N, 2). corner, yaw_rad, inside : as of `Tiles`. turns : (K,).
+    """
     bounds = np.empty((len(corner), len(turns)), np.int64)
     turned, at = np.empty((2, len(points))), np.empty(len(points), np.int64)
     counted, sums = np.empty(2, np.int64), np.empty((_ROWS, _COLUMNS), np.uint16)
@@ -185,8 +189,10 @@ def best_in_tiles(
     floor: float,
     keep: float,
 ) -> F64:
-    """Twin of `window_search.plain_best_in_tiles`, without blocks that do not reach `floor` or the share
-    `keep` of the best so far.
+    """(N, 4) the best pose of each block of squares at each heading, and its score, without blocks that do
+    not reach `floor` or the share `keep` of the best so far.
+
+    All cells of the squares count, at half a step of heading, `half_a_rad` / 2, to both sides.
 
     corners, yaws, tile, bounds : (B,) each tile at each heading, the highest bound first. tile : its number
     in `inside`.
@@ -238,7 +244,8 @@ def known_sums(
     pose: tuple[float, float, float],
     least: int,
 ) -> tuple[float, float, float]:
-    """Twin of `two_way_score.plain_known_sums`."""
+    """Of the wall points on known ground: their weight, the weighted sum of their likelihoods, 0..1, and the
+    weight of those seen from unknown ground. Points with a likelihood below `least` do not count."""
     height, width = values.shape
     c, s = math.cos(pose[2]), math.sin(pose[2])
     x, y = pose[0] - origin_m[0], pose[1] - origin_m[1]
@@ -261,7 +268,11 @@ def known_sums(
 def normal_equations(
     field: U8, x: F64, y: F64, tx: float, ty: float, yaw: float
 ) -> tuple[F64, F64, float, float]:
-    """Twin of `refinement.plain_normal_equations`."""
+    """Hessian (3, 3), gradient (3,), sum of squared misfits and number of the points that count.
+
+    A point counts if the interpolation has its four cells within the field and gives at least
+    `LEAST_LIKELIHOOD`; the value of a cell is that of its centre.
+    """
     height, width = field.shape
     c, s = math.cos(yaw), math.sin(yaw)
     right, top, unit = width - 1 - 1e-6, height - 1 - 1e-6, 1.0 / 255.0

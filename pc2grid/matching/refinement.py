@@ -111,29 +111,3 @@ def gauss_newton(
         if size < parameters.still_cells and abs(step[2]) < parameters.still_rad:
             break
     return pose, hessian, misfit
-
-
-def plain_normal_equations(
-    values: U8, x: F64, y: F64, tx: float, ty: float, yaw: float
-) -> tuple[F64, F64, float, float]:
-    """Hessian (3, 3), gradient (3,), sum of squared misfits and number of the points that count.
-
-    A point counts if the interpolation has its four cells within the field and gives at least
-    `LEAST_LIKELIHOOD`.
-    """
-    height, width = values.shape
-    c, s = math.cos(yaw), math.sin(yaw)
-    rx, ry = c * x - s * y, s * x + c * y
-    u, v = rx + tx - 0.5, ry + ty - 0.5  # the value of a cell is that of its centre
-    inside = (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
-    rx, ry, u, v = (along[inside] for along in (rx, ry, u, v))
-    j, i = u.astype(np.int64), v.astype(np.int64)
-    a, b = u - j, v - i
-    f00, f01 = values[i, j] / 255.0, values[i, j + 1] / 255.0
-    f10, f11 = values[i + 1, j] / 255.0, values[i + 1, j + 1] / 255.0
-    f = (1 - b) * ((1 - a) * f00 + a * f01) + b * ((1 - a) * f10 + a * f11)
-    du = (1 - b) * (f01 - f00) + b * (f11 - f10)
-    dv = (1 - a) * (f10 - f00) + a * (f11 - f01)
-    jacobian = np.column_stack((du, dv, dv * rx - du * ry))[f >= LEAST_LIKELIHOOD]
-    residual = 1.0 - f[f >= LEAST_LIKELIHOOD]
-    return jacobian.T @ jacobian, jacobian.T @ residual, float(residual @ residual), float(len(residual))

@@ -100,19 +100,10 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
 
 
 def _sums(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> F64:
-    """(3,) what `plain_known_sums` says of walls on a field."""
+    """(3,) what `_kernels.known_sums` says of walls on a field."""
     from pc2grid.matching._kernels import known_sums
 
     least = LIKELIHOOD.neutral_value + 1 if walls.only_explain else 0
     pose = T_field_walls.x, T_field_walls.y, T_field_walls.yaw
     on = field.values, field.known, field.resolution_m, field.origin_m
     return np.array(known_sums(*on, walls.points_m, walls.before_m, walls.weights, pose, least))
-
-
-def plain_known_sums(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> F64:
-    """(3,) of the wall points on known ground: their weight, the weighted sum of their likelihoods, 0..1, and
-    the weight of those that were seen from unknown ground."""
-    likelihood, known = field.at(T_field_walls.apply(walls.points_m), above=walls.only_explain)
-    _, before = field.at(T_field_walls.apply(walls.before_m))
-    weights = walls.weights[known].astype("f8")
-    return np.array([weights.sum(), weights @ likelihood[known], weights[~before[known]].sum()])

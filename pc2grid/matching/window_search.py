@@ -28,7 +28,7 @@ import cv2
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, U8, U16
-from pc2grid.matching.lattice import BLOCK, SQUARE, TILE
+from pc2grid.matching.lattice import SQUARE, TILE
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
 from pc2grid.matching.walls import Walls
 from pc2grid.model import OccupancyGrid
@@ -248,47 +248,6 @@ def levels_for(reach_cells: F64, resolution_m: float) -> I64:
     """
     reaches = np.asarray(REACHES_M) / resolution_m
     return np.asarray(np.searchsorted(reaches, reach_cells - 0.5).clip(max=len(reaches) - 1), np.int64)
-
-
-def plain_sums(images: U8, level: I64, points: F64, poses: F64) -> I64:
-    """(B,) the sum over the points, each in its image `level` (N,), at poses (B, 3) in cells; a point whose
-    level is -1 counts as on a wall."""
-    height, width = images.shape[-2:]
-    c, s = np.cos(poses[:, 2:]), np.sin(poses[:, 2:])
-    j = np.floor(c * points[:, 0] - s * points[:, 1] + poses[:, :1]).astype(np.int64)
-    i = np.floor(s * points[:, 0] + c * points[:, 1] + poses[:, 1:2]).astype(np.int64)
-    row, column = (i // SQUARE + TILE[0]).clip(0, height - 1), (j // SQUARE + TILE[1]).clip(0, width - 1)
-    values = images[level, i % SQUARE, j % SQUARE, row, column]
-    return np.asarray(np.where(level < 0, 255, values).sum(axis=1), np.int64)
-
-
-def plain_tile_bounds(images: U8, level: I64, points: F64, tiles: Tiles, turns: F64) -> I64:
-    """(T, K) the highest sum over the points at the centres of the squares of each tile, at each heading."""
-    found = np.zeros((len(tiles.corner), len(turns)), np.int64)
-    for t, k in np.ndindex(found.shape):
-        y, x = ((tiles.corner[t] + np.argwhere(tiles.inside[t]) + 0.5) * SQUARE).T
-        poses = np.column_stack((x, y, np.full(len(x), tiles.yaw_rad[t] + turns[k])))
-        found[t, k] = plain_sums(images, level, points, poses).max()
-    return found
-
-
-def plain_best_in_tiles(
-    images: U8, level: I64, points: F64, tiles: Tiles, turns: F64, half_a_rad: float
-) -> F64:
-    """(N, 4) the best pose of each block of squares at each heading, and its score; in cells. All cells are
-    scored, at half a step of heading to both sides. level : (N,) the image that each point is scored by."""
-    cells = np.indices((2, SQUARE, SQUARE)).reshape(3, -1).T
-    best = []
-    for t, k in np.ndindex(len(tiles.corner), len(turns)):
-        squares = np.argwhere(tiles.inside[t])
-        for block in np.unique(squares // BLOCK, axis=0):
-            of_block = squares[(squares // BLOCK == block).all(axis=1)] + tiles.corner[t]
-            y, x = (SQUARE * of_block[:, None] + cells[:, 1:] + 0.5).reshape(-1, 2).T
-            yaw = tiles.yaw_rad[t] + turns[k] + (np.tile(cells[:, 0], len(of_block)) - 0.5) * half_a_rad
-            poses = np.column_stack((x, y, yaw))
-            scores = plain_sums(images, level, points, poses) / (255.0 * len(points))
-            best.append([*poses[scores.argmax()], scores.max()])
-    return np.array(best)
 
 
 def _distinct(found: F64, parameters: SearchParameters) -> F64:

@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.distance import pdist
 
+from pc2grid.arrays import I64
 from signature import _kernels
 from signature.boundary import (
     ROUNDING_BINS,
@@ -14,12 +16,20 @@ from signature.boundary import (
     boundary_edges,
     boundary_histogram,
     boundary_points,
-    pair_distance_counts,
 )
 from signature.config import SignatureConfig
 from tests.helpers.rooms import RESOLUTION_M, rectangle, submap_of
 
 CONFIG = SignatureConfig()
+
+
+def pair_distance_counts(cells: I64, bins_per_cell: float, rounding_bins: float, bins: int) -> I64:
+    """How many pairs m < n of cells (N, 2) lie how far from each other, Eq. 1-2: (bins,).
+
+    Bin k holds the distances from k to k + 1 in units of the bin width, the last bin the longer ones as well.
+    """
+    at = (pdist(cells * bins_per_cell) + rounding_bins).astype(np.int64)
+    return np.bincount(np.minimum(at, bins - 1), minlength=bins)
 
 
 def histogram(cells: np.ndarray, config: SignatureConfig = CONFIG) -> np.ndarray:

@@ -74,11 +74,6 @@ def definition(type_name: str) -> str:
     return typestore().generate_msgdef(type_name, ros_version=2)[0]
 
 
-def type_hash(type_name: str) -> str:
-    """The RIHS01 hash of a type (REP-2016)."""
-    return typestore().hash_rihs01(type_name)
-
-
 def serialized(message: Any) -> bytes:
     """A message in CDR, little endian."""
     return bytes(typestore().serialize_cdr(message, message.__msgtype__, little_endian=True))

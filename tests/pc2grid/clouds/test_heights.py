@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, U8
+from pc2grid.arrays import F32, F64, U8
 from pc2grid.clouds._kernels import heights_seen as compiled
 from pc2grid.clouds.ground import Ground
-from pc2grid.clouds.heights import heights_seen, heights_seen_plain
+from pc2grid.clouds.heights import heights_seen
 from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
 from pc2grid.config import ProjectionConfig
-from pc2grid.model import SLICE_BORDERS_M
+from pc2grid.model import SLICE_BORDERS_M, SLICES
 
 SENSOR_M = np.array([0.0, 0.0, 0.9])
 FLOOR = np.array([0.0, 0.0, 1.0, 0.0])
@@ -53,6 +55,37 @@ def test_rays_to_the_floor_and_to_the_ceiling_pass_too() -> None:
     # Through 2 m: to the floor at 4 m at 0.45 m, to a ceiling of 2.5 m at 4 m at 1.7 m.
     rays = np.array([(4.0, 0.0, 0.0), (4.0, 0.0, 2.5)], np.float32)
     assert seen([(2.0, 0.0)], np.concatenate((table(2.0), rays))) == [TOP_ONLY]
+
+
+def heights_seen_plain(
+    at_m: F32,
+    points_m: F32,
+    sensor_m: F64,
+    plane: F64,
+    band_m: tuple[float, float],
+    depths: tuple[float, float],
+    borders_m: F64,
+) -> U8:
+    """The definition of the compiled form, in plain numpy."""
+    away_m = points_m[:, :2].astype(np.float64) - sensor_m[:2]
+    ranges_m = np.hypot(away_m[:, 0], away_m[:, 1])
+    height_m = points_m.astype(np.float64) @ plane[:3] + plane[3]
+    sensor_height_m = float(sensor_m @ plane[:3] + plane[3])
+    heights = np.zeros(len(at_m), np.uint8)
+    for k, (x, y) in enumerate(at_m.astype(np.float64) - sensor_m[:2]):
+        r = math.hypot(x, y)
+        aside_m = np.abs(away_m @ (-y, x)) / np.maximum(ranges_m, 1e-9)
+        ahead, deep_m = away_m @ (x, y) > 0.0, depths[0] + depths[1] * r * r
+        returned = ahead & (aside_m <= 0.5 * depths[0]) & (np.abs(ranges_m - r) <= deep_m)
+        passed = ahead & (aside_m <= 0.25 * depths[0]) & (ranges_m > r + deep_m)
+        passing_m = sensor_height_m + (height_m - sensor_height_m) * r / np.maximum(ranges_m, 1e-9)
+        filled, empty = (
+            np.bitwise_or.reduce(1 << np.searchsorted(borders_m, inside, side="right"))
+            for some in (height_m[returned], passing_m[passed])
+            for inside in [some[(some >= band_m[0]) & (some <= band_m[1])]]
+        )
+        heights[k] = filled | (empty & ~filled) << SLICES
+    return heights
 
 
 def test_the_compiled_form_is_the_plain_one() -> None:

@@ -14,9 +14,20 @@ from pc2grid.arrays import F64
 from pc2grid.estimation import _kernels
 from pc2grid.estimation.belief import PLANAR, SPATIAL, Belief
 from pc2grid.estimation.graph import Factors, normal_equations, without
-from pc2grid.estimation.manifold import Steps, _rotation_vectors, _skew, moved, steps
+from pc2grid.estimation.manifold import Steps, _skew, moved, steps
 from pc2grid.estimation.smoother import IN_THE_HAND, Evidence, Smoother
 from pc2grid.geometry import SE2, invert_pose, motion_size, pose_from_rotation_vector
+
+
+def rotation_vectors(rotations: F64) -> F64:
+    """Rotation vectors (N, 3) of rotation matrices (N, 3, 3)."""
+    R = rotations
+    twice = np.stack((R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]), axis=1)
+    twice_sine = np.linalg.norm(twice, axis=1)
+    angle = np.arctan2(twice_sine, np.einsum("naa->n", R) - 1.0)
+    small = twice_sine < 1e-9
+    result: F64 = twice * np.where(small, 0.5, angle / np.where(small, 1.0, twice_sine))[:, None]
+    return result
 
 
 def add_factors_plain(
@@ -39,7 +50,7 @@ def steps_plain(first: F64, second: F64) -> Steps:
     turn = R @ second[:, :3, :3]
     step = np.empty((len(first), 6))
     step[:, :3] = np.einsum("nab,nb->na", R, second[:, :3, 3] - first[:, :3, 3])
-    step[:, 3:] = _rotation_vectors(turn)
+    step[:, 3:] = rotation_vectors(turn)
     # Of the rotation vector only the first term of the series is needed: steps are small, or count little.
     right = np.eye(3) + 0.5 * _skew(step[:, 3:])
     by_first, by_second = np.zeros((len(first), 6, 6)), np.zeros((len(first), 6, 6))

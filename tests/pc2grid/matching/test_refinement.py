@@ -7,13 +7,14 @@ import math
 import numpy as np
 import pytest
 
+from pc2grid.arrays import F64, U8
 from pc2grid.geometry import SE2
 from pc2grid.matching._kernels import normal_equations
 from pc2grid.matching.refinement import (
+    LEAST_LIKELIHOOD,
     REFINEMENT,
     RefinementParameters,
     gauss_newton,
-    plain_normal_equations,
     refine,
 )
 from pc2grid.matching.walls import Walls
@@ -24,6 +25,32 @@ from tests.helpers.simulated_drives import office, office_part, plan
 MAP = SearchMap.of(office())
 FIELD = MAP.field
 ONE_STEP = RefinementParameters(steps=1)
+
+
+def plain_normal_equations(
+    values: U8, x: F64, y: F64, tx: float, ty: float, yaw: float
+) -> tuple[F64, F64, float, float]:
+    """Hessian (3, 3), gradient (3,), sum of squared misfits and number of the points that count.
+
+    A point counts if the interpolation has its four cells within the field and gives at least
+    `LEAST_LIKELIHOOD`.
+    """
+    height, width = values.shape
+    c, s = math.cos(yaw), math.sin(yaw)
+    rx, ry = c * x - s * y, s * x + c * y
+    u, v = rx + tx - 0.5, ry + ty - 0.5  # the value of a cell is that of its centre
+    inside = (u >= 0) & (v >= 0) & (u < width - 1) & (v < height - 1)
+    rx, ry, u, v = (along[inside] for along in (rx, ry, u, v))
+    j, i = u.astype(np.int64), v.astype(np.int64)
+    a, b = u - j, v - i
+    f00, f01 = values[i, j] / 255.0, values[i, j + 1] / 255.0
+    f10, f11 = values[i + 1, j] / 255.0, values[i + 1, j + 1] / 255.0
+    f = (1 - b) * ((1 - a) * f00 + a * f01) + b * ((1 - a) * f10 + a * f11)
+    du = (1 - b) * (f01 - f00) + b * (f11 - f10)
+    dv = (1 - a) * (f10 - f00) + a * (f11 - f01)
+    jacobian = np.column_stack((du, dv, dv * rx - du * ry))[f >= LEAST_LIKELIHOOD]
+    residual = 1.0 - f[f >= LEAST_LIKELIHOOD]
+    return jacobian.T @ jacobian, jacobian.T @ residual, float(residual @ residual), float(len(residual))
 
 
 @pytest.mark.parametrize("near", [(220.0, 160.0), (65.0, 65.0)])  # the other: walls hang over the map's edge

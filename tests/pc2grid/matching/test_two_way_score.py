@@ -7,10 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.matching.likelihood_field import LIKELIHOOD
+from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
 from pc2grid.matching.refinement import refine
-from pc2grid.matching.two_way_score import Fit, _sums, plain_known_sums, score_fit
+from pc2grid.matching.two_way_score import Fit, _sums, score_fit
 from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap, search_windows
 from pc2grid.model import THING, UNKNOWN, OccupancyGrid
@@ -39,6 +40,15 @@ def test_unknown_ground_is_neutral() -> None:
     fit = score_fit(walls, Walls.of(office_part((10.0, 7.0))), SE2(10.0, 7.0, 0.0), np.eye(3))
     assert 0.3 < fit.overlap < 0.7
     assert fit.forward == pytest.approx(fit.overlap + LIKELIHOOD.neutral * (1 - fit.overlap), abs=0.03)
+
+
+def plain_known_sums(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> F64:
+    """(3,) of the wall points on known ground: their weight, the weighted sum of their likelihoods, 0..1, and
+    the weight of those that were seen from unknown ground."""
+    likelihood, known = field.at(T_field_walls.apply(walls.points_m), above=walls.only_explain)
+    _, before = field.at(T_field_walls.apply(walls.before_m))
+    weights = walls.weights[known].astype("f8")
+    return np.array([weights.sum(), weights @ likelihood[known], weights[~before[known]].sum()])
 
 
 @pytest.mark.parametrize("pose", [SE2(), SE2(9.3, 6.1, 0.7), SE2(1.0, 13.0, -2.0), SE2(60.0, 0.0, 0.1)])
