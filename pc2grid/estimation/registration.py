@@ -22,6 +22,9 @@ from pc2grid.model import Scan
 _EXACT = 1e-12
 """A rotation matrix times its transpose differs from 1 by less; products of a few of them do, too."""
 
+_FEW = 50
+"""A scan with no more points is not thinned a second time: too little of it would be left."""
+
 
 class KissRegistration:
     """KISS-ICP with a given initial guess, in one thread and hence repeatable.
@@ -52,8 +55,9 @@ class KissRegistration:
         if self._map is None or not len(points_m) or self._config.icp == "none":
             return guess
         sigma = self._threshold.get_threshold()
+        frame = self._frame(points_m)
         pose: F64 = self._registration.align_points_to_map(
-            points=self._downsample(self._frame(points_m), 1.5),
+            points=frame if len(frame) <= _FEW else self._downsample(frame, 1.5),
             voxel_map=self._map,
             initial_guess=guess,
             max_correspondance_distance=3.0 * sigma,
