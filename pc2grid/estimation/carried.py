@@ -100,9 +100,9 @@ class CarriedSensor:
             self._map = SpaceMap(scan, points_m, self._registration, self._projection)
         self._thinned = self._map.thin(scan, points_m)
 
-    def match(self, belief: Belief, *, registered: bool) -> Fit:
+    def match(self, belief: Belief, *, again: bool) -> list[Fit]:
         """See `PlacingSensor`."""
-        return self._matched(belief.pose, belief, registered=registered)
+        return [self._matched(belief.pose, belief, registered=not again)]
 
     def search(self, belief: Belief) -> Iterator[Fit]:
         """Match in all headings around the last pose, with its height and tilt.

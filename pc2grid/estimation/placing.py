@@ -66,10 +66,11 @@ class PlacingSensor(Protocol):
     def __bool__(self) -> bool:
         """Whether there is a local map."""
 
-    def match(self, belief: Belief, *, registered: bool) -> Fit:
-        """Match the scan taken last with the local map; the match is held to a belief.
+    def match(self, belief: Belief, *, again: bool) -> list[Fit]:
+        """Match the scan taken last with the local map; the matches are held to a belief.
 
-        registered : it begins where KISS-ICP puts the scan from there, else at the belief.
+        The first begins where KISS-ICP puts the scan from there. again : what is left to try if that did not
+        settle it.
         """
 
     def search(self, belief: Belief) -> Iterator[Fit]:
@@ -160,9 +161,9 @@ class Placer:
         found: list[_Hypothesis] = []
         first = expected[0]
         for belief in expected:
-            for registered in (True, False):
-                fit = self._sensor.match(belief, registered=registered)
-                found.append(self._hypothesis(fit, expected))
+            for again in (False, True):
+                fits = self._sensor.match(belief, again=again)
+                found += [self._hypothesis(fit, expected) for fit in fits]
                 if max(found).sure and max(found).near and not self._is_vague(belief):
                     return found
         if not max(found).sure and (self._is_vague(first) or not max(found).near):

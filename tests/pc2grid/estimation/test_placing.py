@@ -51,8 +51,8 @@ class Sensor:
 
     def take(self, *of_scan: object) -> None: ...
 
-    def match(self, belief: Belief, *, registered: bool) -> Fit:
-        return self.near
+    def match(self, belief: Belief, *, again: bool) -> list[Fit]:
+        return [self.near]
 
     def search(self, belief: Belief) -> Iterator[Fit]:
         self.searched += 1

@@ -241,14 +241,6 @@ _E1R = Recording(
     truth="lidar/e1r_office_a.tum",
     poses="lidar/e1r_office_a.tum",
 )
-_CSAIL = _laser(
-    "csail without odometry",
-    "csail",
-    file="laser/csail.mcap",
-    options=("--odometry", "none"),
-    truth="laser/csail.relations",
-    poses="laser/csail_corrected.tum",
-)
 
 RECORDINGS: tuple[Recording, ...] = (
     _hall(1, "hall", quick=True),
@@ -267,8 +259,14 @@ RECORDINGS: tuple[Recording, ...] = (
     _corrected("intel", "intel"),
     _corrected("csail", "csail", quick=True),
     _corrected("killian", "killian", relations=False),
-    _CSAIL,
-    *_with_control(replace(_CSAIL, name="csail without odometry, every 4th scan", every=4)),
+    _laser(
+        "csail without odometry",
+        "csail",
+        file="laser/csail.mcap",
+        options=("--odometry", "none"),
+        truth="laser/csail.relations",
+        poses="laser/csail_corrected.tum",
+    ),
     _laser("aces", "aces", file="laser/aces_ros1.bag"),
     _sparse("acapulco"),
     _sparse("belgioioso"),
