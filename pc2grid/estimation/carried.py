@@ -100,9 +100,9 @@ class CarriedSensor:
             self._map = SpaceMap(scan, points_m, self._registration, self._projection)
         self._thinned = self._map.thin(scan, points_m)
 
-    def match(self, belief: Belief, *, again: bool) -> list[Fit]:
+    def match(self, belief: Belief) -> list[Fit]:
         """See `PlacingSensor`."""
-        return [self._matched(belief.pose, belief, registered=not again)]
+        return [self._matched(belief.pose, belief)]
 
     def search(self, belief: Belief) -> Iterator[Fit]:
         """Match in all headings around the last pose, with its height and tilt.
@@ -116,10 +116,10 @@ class CarriedSensor:
         for guess in self._space.search(self._thinned, self._last, window_m, p.starts):
             yield self._matched(guess, Belief(guess, covariance, belief.free))
 
-    def _matched(self, guess: F64, held: Belief, *, registered: bool = True) -> Fit:
+    def _matched(self, guess: F64, held: Belief) -> Fit:
         """The scan taken last matched with the map from a guess (4, 4), held to a belief."""
         space = self._space
-        found = space.match(self._thinned, guess, held, registered=registered)
+        found = space.match(self._thinned, guess, held)
         of_known, of_all = space.agreement(self._thinned, found.pose)
         quality = of_all - self._parameters.residual_weight_per_m * found.residual_m
         return Fit(

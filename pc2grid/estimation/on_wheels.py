@@ -84,11 +84,9 @@ class SensorOnWheels:
         self._points_m = self._floor.remove(points_m)
         self._planar_scan, self._unaided = self._project(scan, points_m), scan.T_odom_base is None
 
-    def match(self, belief: Belief, *, again: bool) -> list[Fit]:
+    def match(self, belief: Belief) -> list[Fit]:
         """See `PlacingSensor`. Along a corridor KISS-ICP tends to stand still, scan after scan, so what was
         expected is always beside it."""
-        if again:
-            return []
         expected = self.levelled(belief.pose)
         starts = self._kiss.register(self._points_m, expected), expected
         return [self._matched(self._maps, SE2.from_matrix(start), belief) for start in starts]

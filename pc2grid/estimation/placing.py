@@ -66,12 +66,9 @@ class PlacingSensor(Protocol):
     def __bool__(self) -> bool:
         """Whether there is a local map."""
 
-    def match(self, belief: Belief, *, again: bool) -> list[Fit]:
-        """Match the scan taken last with the local map; the matches are held to a belief.
-
-        The first begins where KISS-ICP puts the scan from there. again : what is left to try if that did not
-        settle it.
-        """
+    def match(self, belief: Belief) -> list[Fit]:
+        """Match the scan taken last with the local map, first of all from where KISS-ICP puts it that begins
+        at a belief; the matches are held to that belief."""
 
     def search(self, belief: Belief) -> Iterator[Fit]:
         """Match the scan taken last wherever a belief holds it possible."""
@@ -155,17 +152,14 @@ class Placer:
     def _hypotheses(self, expected: Sequence[Belief]) -> list[_Hypothesis]:
         """Where the scan taken last may lie.
 
-        Where KISS-ICP does not settle it, the scan is also matched from where it is expected. Where it fits
-        nowhere there, it is searched for.
+        Where it fits nowhere that it is expected, it is searched for.
         """
         found: list[_Hypothesis] = []
         first = expected[0]
         for belief in expected:
-            for again in (False, True):
-                fits = self._sensor.match(belief, again=again)
-                found += [self._hypothesis(fit, expected) for fit in fits]
-                if max(found).sure and max(found).near and not self._is_vague(belief):
-                    return found
+            found += [self._hypothesis(fit, expected) for fit in self._sensor.match(belief)]
+            if max(found).sure and max(found).near and not self._is_vague(belief):
+                return found
         if not max(found).sure and (self._is_vague(first) or not max(found).near):
             found += [
                 replace(self._hypothesis(fit, expected), near=False) for fit in self._sensor.search(first)

@@ -104,11 +104,10 @@ class SpaceMap:
         sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
         return ThinnedScan(thinned, 1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2))
 
-    def match(self, thinned: ThinnedScan, guess: F64, prior: Belief, *, registered: bool) -> Placement:
-        """Register a scan from a guess (4, 4); it is held to a prior. registered : by KISS-ICP first."""
-        surfaces = self._surfaces
-        near = surfaces.near(thinned.points_m, thinned.weights, guess, prior) if registered else guess
-        return surfaces.match(thinned.points_m, thinned.weights, near, prior)
+    def match(self, thinned: ThinnedScan, guess: F64, prior: Belief) -> Placement:
+        """Register a scan from a guess (4, 4), by KISS-ICP and then exactly; it is held to a prior."""
+        near = self._surfaces.near(thinned.points_m, thinned.weights, guess, prior)
+        return self._surfaces.match(thinned.points_m, thinned.weights, near, prior)
 
     def held(self, thinned: ThinnedScan, placement: Placement) -> Placement:
         """A placement of a scan with the information that surfaces give; see `SurfaceMap.held`."""

@@ -64,7 +64,7 @@ class SurfaceParameters:
     most: float = 200.0
     noise_m: float = 0.02
     point_sigma_m: float = 0.1
-    near_sigma_m: float = 0.4
+    near_sigma_m: float = 1.0
     near_scale: float = 3.0
     rounds: tuple[float, ...] = (0.3, 0.3, 0.3, 0.1, 0.1, 0.1, *(0.05,) * 8)
     converged: float = 2e-4

@@ -51,7 +51,7 @@ class Sensor:
 
     def take(self, *of_scan: object) -> None: ...
 
-    def match(self, belief: Belief, *, again: bool) -> list[Fit]:
+    def match(self, belief: Belief) -> list[Fit]:
         return [self.near]
 
     def search(self, belief: Belief) -> Iterator[Fit]:
