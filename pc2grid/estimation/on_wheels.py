@@ -49,7 +49,7 @@ class SensorOnWheels:
         self._matching = MATCHING_PARAMETERS
         self._maps = MatchingMaps(projection.max_range_m, parameters)
         self._kiss = KissRegistration(registration)
-        # Of the scan taken last: reduced to the plane, its points without the floor, whether it has odometry.
+        # Of the scan taken last: in the plane, its points without the floor, whether it has no odometry.
         self._planar_scan: PlanarScan
         self._points_m, self._unaided = np.empty((0, 3), np.float32), True
         self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)

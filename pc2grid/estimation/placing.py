@@ -67,8 +67,8 @@ class PlacingSensor(Protocol):
         """Whether there is a local map."""
 
     def match(self, belief: Belief) -> list[Fit]:
-        """Match the scan taken last with the local map, first of all from where KISS-ICP puts it that begins
-        at a belief; the matches are held to that belief."""
+        """Match the scan taken last with the local map. KISS-ICP begins at the belief, and the first match
+        begins where KISS-ICP ends. All matches are held to the belief."""
 
     def search(self, belief: Belief) -> Iterator[Fit]:
         """Match the scan taken last wherever a belief holds it possible."""
@@ -150,10 +150,7 @@ class Placer:
         return Placed(fit.pose, (alone, 0.5 * (believed + believed.T)), measured=fit.measured)
 
     def _hypotheses(self, expected: Sequence[Belief]) -> list[_Hypothesis]:
-        """Where the scan taken last may lie.
-
-        Where it fits nowhere that it is expected, it is searched for.
-        """
+        """Where the scan taken last may lie. If it fits nowhere that it is expected, it is searched for."""
         found: list[_Hypothesis] = []
         first = expected[0]
         for belief in expected:

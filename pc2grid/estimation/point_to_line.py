@@ -134,24 +134,22 @@ class PointGrid:
         """
         p = self._parameters
         pose = np.array([registered.x, registered.y, registered.yaw])
-        H, _, _ = self._equations(points_m, normal_rad, pose, p.radii_cells[0])
+        points, normals = np.asarray(points_m, np.float64), np.asarray(normal_rad, np.float64)
+        H, _, _ = self._equations(points, normals, pose, p.radii_cells[0])
         away = pose - (prior.x, prior.y, prior.yaw)
         away[2] = wrap_angle(float(away[2]))
         information = H / p.near_sigma_m**2 + prior_information + 1e-6 * np.eye(3)
         x, y, yaw = (pose - np.linalg.solve(information, prior_information @ away)).tolist()
         return SE2(x, y, wrap_angle(yaw))
 
-    def _equations(
-        self, points_m: NDArray[np.floating], normal_rad: NDArray[np.floating], pose: F64, radius: int
-    ) -> tuple[F64, F64, int]:
+    def _equations(self, points_m: F64, normal_rad: F64, pose: F64, radius: int) -> tuple[F64, F64, int]:
         """The normal equations of points (N, 2) at a pose (3,), see `_kernels.normal_equations`."""
         from pc2grid.estimation._kernels import normal_equations
 
-        points, normals = np.asarray(points_m, np.float64), np.asarray(normal_rad, np.float64)
         corner = np.array([*self.low_m, 0.0])
         scale_m = self._parameters.residual_scale_m * radius
         return normal_equations(
-            self._index, self._moments, points, normals, pose - corner, self.cell_m, radius, scale_m
+            self._index, self._moments, points_m, normal_rad, pose - corner, self.cell_m, radius, scale_m
         )
 
     def match(
@@ -170,12 +168,13 @@ class PointGrid:
         radii : half widths of the neighbourhood, as `MatchingParameters.radii_cells`, its default.
         """
         p, steps = self._parameters, radii or self._parameters.radii_cells
+        points, normals = np.asarray(points_m, np.float64), np.asarray(normal_rad, np.float64)
         unit, damping = p.cell_m**-2, 1e-6 * np.eye(3)
         pose = np.array([guess.x, guess.y, guess.yaw])
         held = np.array([prior.x, prior.y, prior.yaw])
         information, found = np.zeros((3, 3)), 0
         for radius in steps:
-            H, g, found = self._equations(points_m, normal_rad, pose, radius)
+            H, g, found = self._equations(points, normals, pose, radius)
             information = unit * H
             away = pose - held
             away[2] = wrap_angle(float(away[2]))
@@ -186,14 +185,14 @@ class PointGrid:
             pose = pose + step
             if radius == steps[-1] and np.abs(step).sum() < p.converged:
                 break
-        overlap = found / max(len(points_m), 1)
+        overlap = found / max(len(points), 1)
         placed = SE2(float(pose[0]), float(pose[1]), wrap_angle(float(pose[2])))
         return Match(
             placed,
             SE2(float(alone[0]), float(alone[1]), wrap_angle(float(alone[2]))),
             information,
             overlap,
-            min(self.free(placed.apply(np.asarray(points_m, np.float64))), 1.0 - overlap),
+            min(self.free(placed.apply(points)), 1.0 - overlap),
             weakest(information, 2) > unit * p.least_points,
         )
 
