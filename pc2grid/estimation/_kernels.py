@@ -137,37 +137,6 @@ def placement_scores(
 
 
 @njit(cache=True)
-def add_factors(
-    rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
-) -> None:
-    """Add factors, see `graph.Factors`, to the normal equations H and g."""
-    dimension, unknowns = jacobian.shape[1], jacobian.shape[2]
-    Le, LJ = np.empty(dimension), np.empty((dimension, unknowns))
-    for f in range(rows.shape[0]):
-        chi2 = 0.0
-        for a in range(dimension):
-            Le[a] = 0.0
-            for b in range(dimension):
-                Le[a] += information[f, a, b] * error[f, b]
-            chi2 += error[f, a] * Le[a]
-        weight = 1.0 / (1.0 + chi2 / kernel[f] ** 2)
-        for a in range(dimension):
-            for k in range(unknowns):
-                LJ[a, k] = 0.0
-                for b in range(dimension):
-                    LJ[a, k] += information[f, a, b] * jacobian[f, b, k]
-        for j in range(unknowns):
-            row = rows[f, j]
-            for a in range(dimension):
-                left = weight * jacobian[f, a, j]
-                if left == 0.0:
-                    continue
-                g[row] += left * Le[a]
-                for k in range(unknowns):
-                    H[row, rows[f, k]] += left * LJ[a, k]
-
-
-@njit(cache=True)
 def steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
     """The steps between poses (N, 4, 4) and their Jacobians, see `manifold.Steps`."""
     count = first.shape[0]
@@ -185,9 +154,9 @@ def steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
         ratio = 0.5 if twice_sine < 1e-9 else angle / twice_sine
         rx, ry, rz = ratio * x, ratio * y, ratio * z
         step[n, 3], step[n, 4], step[n, 5] = rx, ry, rz
-        right[0] = 1.0, -0.5 * rz, 0.5 * ry
-        right[1] = 0.5 * rz, 1.0, -0.5 * rx
-        right[2] = -0.5 * ry, 0.5 * rx, 1.0
+        right[0, 0] = right[1, 1] = right[2, 2] = 1.0
+        right[1, 0], right[2, 0], right[2, 1] = 0.5 * rz, -0.5 * ry, 0.5 * rx
+        right[0, 1], right[0, 2], right[1, 2] = -0.5 * rz, 0.5 * ry, -0.5 * rx
         tx, ty, tz = step[n, 0], step[n, 1], step[n, 2]
         J = by_first[n]
         J[0, 0] = J[1, 1] = J[2, 2] = -1.0
@@ -201,3 +170,28 @@ def steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
                     right[i, 0] * turn[k, 0] + right[i, 1] * turn[k, 1] + right[i, 2] * turn[k, 2]
                 )
     return step, by_first, by_second
+
+
+@njit(cache=True)
+def moved(poses: F64, changes: F64) -> F64:
+    """Poses (N, 4, 4) after changes (N, 6) in their own axes, see `manifold.moved`."""
+    result, turn = poses.copy(), np.empty((3, 3))
+    for n in range(len(poses)):
+        x, y, z = changes[n, 3], changes[n, 4], changes[n, 5]
+        square = x * x + y * y + z * z
+        angle = math.sqrt(square)
+        # Rodrigues' formula, by its series near no turn.
+        s = math.sin(angle) / angle if angle > 1e-9 else 1.0
+        c = (1.0 - math.cos(angle)) / square if angle > 1e-4 else 0.5
+        turn[0, 0], turn[1, 1] = 1.0 - c * (y * y + z * z), 1.0 - c * (x * x + z * z)
+        turn[2, 2] = 1.0 - c * (x * x + y * y)
+        turn[0, 1], turn[1, 0] = c * x * y - s * z, c * x * y + s * z
+        turn[0, 2], turn[2, 0] = c * x * z + s * y, c * x * z - s * y
+        turn[1, 2], turn[2, 1] = c * y * z - s * x, c * y * z + s * x
+        for i in range(3):
+            for k in range(3):
+                result[n, i, 3] += poses[n, i, k] * changes[n, k]
+                result[n, i, k] = 0.0
+                for j in range(3):
+                    result[n, i, k] += poses[n, i, j] * turn[j, k]
+    return result

@@ -27,9 +27,7 @@ class Steps(NamedTuple):
 
 def moved(poses: F64, changes: F64) -> F64:
     """Poses (N, 4, 4) after changes (N, 6) in their own axes."""
-    result = poses.copy()
-    result[:, :3, 3] += np.einsum("nab,nb->na", poses[:, :3, :3], changes[:, :3])
-    result[:, :3, :3] = poses[:, :3, :3] @ _rotations(changes[:, 3:])
+    result: F64 = _kernels.moved(poses, changes)
     return result
 
 
@@ -63,11 +61,3 @@ def _skew(vectors: F64) -> F64:
     result = np.zeros((len(vectors), 3, 3))
     result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
     return result - result.transpose(0, 2, 1)
-
-
-def _rotations(vectors: F64) -> F64:
-    """Rotation matrices (N, 3, 3) of rotation vectors (N, 3), by Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=1)[:, None, None]
-    K = _skew(vectors)
-    result: F64 = np.eye(3) + np.sinc(angle / np.pi) * K + 0.5 * np.sinc(0.5 * angle / np.pi) ** 2 * (K @ K)
-    return result

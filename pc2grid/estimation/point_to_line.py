@@ -172,19 +172,19 @@ class PointGrid:
         unit, damping = p.cell_m**-2, 1e-6 * np.eye(3)
         pose = np.array([guess.x, guess.y, guess.yaw])
         held = np.array([prior.x, prior.y, prior.yaw])
-        information, found = np.zeros((3, 3)), 0
+        information, gradient, found, linearised = np.zeros((3, 3)), np.zeros(3), 0, pose
         for radius in steps:
             H, g, found = self._equations(points, normals, pose, radius)
-            information = unit * H
+            information, gradient, linearised = unit * H, unit * g, pose
             away = pose - held
             away[2] = wrap_angle(float(away[2]))
             # Cauchy weight: wheels slip, so a prior that disagrees with the points counts less.
             weight = prior_information / (1.0 + (away @ prior_information @ away) / p.prior_scale**2)
-            step = np.linalg.solve(information + weight + damping, -(unit * g + weight @ away))
-            alone = pose - np.linalg.solve(information + unit * damping, unit * g)
+            step = np.linalg.solve(information + weight + damping, -(gradient + weight @ away))
             pose = pose + step
             if radius == steps[-1] and np.abs(step).sum() < p.converged:
                 break
+        alone = linearised - np.linalg.solve(information + unit * damping, gradient)
         overlap = found / max(len(points), 1)
         placed = SE2(float(pose[0]), float(pose[1]), wrap_angle(float(pose[2])))
         return Match(

@@ -28,7 +28,8 @@ from pc2grid.estimation.on_wheels import SensorOnWheels
 from pc2grid.estimation.overruled import Disagreement
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placing import Placed, Placer, PlacingSensor
-from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, Evidence, Smoother
+from pc2grid.estimation.smoother import Evidence, Smoother
+from pc2grid.estimation.window import IN_THE_HAND, SMOOTHER
 from pc2grid.geometry import SE2, invert_pose
 from pc2grid.model import Health, RegisteredScan, Scan
 

@@ -7,7 +7,6 @@ with several; what remains, the factors, their derivatives, the marginalisation 
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 
 import numpy as np
@@ -15,13 +14,14 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.estimation.belief import PLANAR, Belief
-from pc2grid.estimation.smoother import SMOOTHER, Evidence, Smoother
+from pc2grid.estimation.smoother import Evidence, Smoother
+from pc2grid.estimation.window import SMOOTHER
 from pc2grid.geometry import SE2
 
 gtsam = pytest.importorskip("gtsam")
 
-GAUSSIAN = dataclasses.replace(
-    SMOOTHER, kernel=1e6, iterations=20, converged=1e-9,
+GAUSSIAN = SMOOTHER._replace(
+    kernel=1e6, iterations=20, converged=1e-9,
     scale=1e-9, direction_rad=1e-9, yaw_rad_per_m=1e-9, turn=1e-9,
 )  # fmt: skip
 MATCH = np.diag([0.05**-2, 0.02**-2, 0.01**-2])

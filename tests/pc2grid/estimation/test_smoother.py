@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
-from pc2grid.estimation import _kernels
+from pc2grid.estimation._smoother_kernels import normal_equations
 from pc2grid.estimation.belief import PLANAR, SPATIAL, Belief
-from pc2grid.estimation.graph import Factors, normal_equations, without
 from pc2grid.estimation.manifold import Steps, _skew, moved, steps
-from pc2grid.estimation.smoother import IN_THE_HAND, Evidence, Smoother
+from pc2grid.estimation.smoother import Evidence, Smoother, _without
+from pc2grid.estimation.window import IN_THE_HAND, SMOOTHER
 from pc2grid.geometry import SE2, invert_pose, motion_size, pose_from_rotation_vector
+from tests.helpers.plain_smoother import plain_equations
 
 
 def rotation_vectors(rotations: F64) -> F64:
@@ -28,20 +27,6 @@ def rotation_vectors(rotations: F64) -> F64:
     small = twice_sine < 1e-9
     result: F64 = twice * np.where(small, 0.5, angle / np.where(small, 1.0, twice_sine))[:, None]
     return result
-
-
-def add_factors_plain(
-    rows: NDArray[np.intp], error: F64, jacobian: F64, information: F64, kernel: F64, H: F64, g: F64
-) -> None:
-    """Add factors, see `Factors`, to the normal equations.
-
-    In numpy.
-    """
-    chi2 = np.einsum("fa,fab,fb->f", error, information, error)
-    weight = 1.0 / (1.0 + chi2 / kernel**2)
-    JtL = jacobian.transpose(0, 2, 1) @ (information * weight[:, None, None])
-    np.add.at(H, (rows[:, :, None], rows[:, None, :]), JtL @ jacobian)
-    np.add.at(g, rows, np.einsum("fka,fa->fk", JtL, error))
 
 
 def steps_plain(first: F64, second: F64) -> Steps:
@@ -233,33 +218,39 @@ def test_steps_and_their_derivatives() -> None:
         np.testing.assert_allclose(by_first[:, :, k], numeric, atol=1e-3)
 
 
-def some_factors(seed: int = 3) -> Factors:
-    rng = np.random.default_rng(seed)
-    root = rng.normal(size=(5, 2, 2))
-    return Factors(
-        rows=np.array([[0, 1, 2], [1, 2, 3], [0, 3, 4], [2, 3, 4], [0, 2, 4]]),
-        error=rng.normal(size=(5, 2)),
-        jacobian=rng.normal(size=(5, 2, 3)),
-        information=root @ root.transpose(0, 2, 1),
-        kernel=np.array([3.0, 1.0, np.inf, 2.0, 0.5]),
-    )
-
-
-def test_the_compiled_equations_are_the_plain_ones() -> None:
-    f = some_factors()
-    results = []
-    for add in (_kernels.add_factors, add_factors_plain):
-        H, g = np.zeros((5, 5)), np.zeros(5)
-        add(f.rows, f.error, f.jacobian, f.information, f.kernel, H, g)
-        results.append(np.concatenate((H.ravel(), g)))
-    np.testing.assert_allclose(*results, atol=1e-12)
+@pytest.mark.parametrize("free", [PLANAR, SPATIAL])
+@pytest.mark.parametrize("few", [1, 8])
+def test_the_compiled_equations_are_the_plain_ones(free: tuple[int, ...], few: int) -> None:
+    """Of a drive whose odometry jumps, and is missing; whose scans are lost, and follow only each other."""
+    rng, true, smoother = np.random.default_rng(5), drive(), Smoother(free, SMOOTHER._replace(lag=8))
+    odometry = wheels(true, 0.95, 1.1)
+    for k, pose in enumerate(true[10:34]):
+        noise = pose_from_rotation_vector(*rng.normal(scale=0.02, size=(2, 3)))
+        root, known = rng.normal(size=(2, len(free), len(free))), k % 4 != 1
+        placed = pose @ noise, 100.0 * root[0] @ root[0].T
+        motion = STEP.lift() @ noise, 10.0 * root[1] @ root[1].T
+        reading, match = odometry[10 + k] if k % 7 < 5 else None, placed if known else None
+        if k == 0:
+            smoother.start(pose, reading)
+            continue
+        between = motion if k % 5 == 2 else None
+        smoother.add(placed[0], Evidence(0.08 + 0.01 * (k % 3), reading, k % 6 != 3, match, between))
+    own = smoother._state, smoother._window, smoother._prior, smoother._free, smoother._parameters
+    H, g, scale = normal_equations(*own, smoother._drift_scale, few)
+    smoother._drift_scale = scale
+    plain_H, plain_g = plain_equations(smoother, few)
+    # Derivatives of a turn are those of its first order.
+    unit = np.sqrt(np.diag(plain_H) + 1e-9)
+    np.testing.assert_allclose(H / np.outer(unit, unit), plain_H / np.outer(unit, unit), atol=2e-3)
+    np.testing.assert_allclose(g / unit, plain_g / unit, atol=1e-3)
 
 
 def test_what_is_marginalised_leaves_the_same_solution() -> None:
-    f = replace(some_factors(), kernel=np.full(5, np.inf))
-    H, g = normal_equations([f], 5)
-    reduced, gradient = without(H, g, np.array([0, 1]))
-    np.testing.assert_allclose(-np.linalg.solve(H, g)[2:], -np.linalg.solve(reduced, gradient), rtol=1e-6)
+    root, g = np.random.default_rng(3).normal(size=(8, 8)), np.arange(8.0)
+    H = root @ root.T + np.eye(8)
+    reduced, gradient = _without(H, g, 2)
+    rest = [0, 1, 2, 3, 6, 7]
+    np.testing.assert_allclose(-np.linalg.solve(H, g)[rest], -np.linalg.solve(reduced, gradient), rtol=1e-6)
 
 
 def test_the_density_of_a_belief_falls_with_the_distance() -> None:
