@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -170,3 +171,12 @@ def test_the_matrix_of_sensors_shows_its_gaps() -> None:
     assert driven["driven lidar"] == ["-", "-", "1 of 2, 1 wrong (1 building)", "-"]
     assert driven["driven depth"] == ["-", "1 of 1, 0 wrong (1 building)", "-", "-"]
     assert driven["laser"] == ["-"] * 4  # what is not driven stands in the table above
+
+
+def test_wrong_answers_are_counted_by_confidence_and_by_drive() -> None:
+    sure = pair_row("right", "wrong", "wrong", query="d")
+    unsure = replace(query(1, "refused"), confidence=0.6)
+    text = page(table(sure, pair_row("right", query="e"), pair_row(queries=(unsure,))))
+    section = text.split("## By confidence")[1].split("##")[0]
+    assert "| 0.99 and above | 4 | 2 of 4 [0.07, 0.93] | 1 of 2 [0.01, 0.99] |" in section
+    assert "| 0.50 to 0.75 | 0 | 0 of 1 [0.00, 0.97] | 0 of 1 [0.00, 0.97] |" in section

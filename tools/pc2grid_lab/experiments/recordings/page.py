@@ -43,6 +43,10 @@ def page(table: Table, changed: Sequence[RowChange] = ()) -> str:
             "",
             *_by_building(table),
             "",
+            "## By confidence",
+            "",
+            *_by_confidence(table),
+            "",
             *_failures(table),
             *_changed(changed),
         ]
@@ -290,6 +294,28 @@ def _building_cells(name: str, inside: Sequence[PairRow], outside: Sequence[Pair
         _share(counts.covered_right, counts.covered),
         _share(counts.wrong, counts.right + counts.wrong),
         _share(other.wrong, other.queries),
+    ]
+
+
+_BANDS = (0.0, 0.5, 0.75, 0.9, 0.99)
+"""Confidences at which a band begins; the last one ends at 1."""
+
+
+def _by_confidence(table: Table) -> list[str]:
+    """A row a band of confidence: how many of the likeliest places are wrong, and on how many drives."""
+    judged = [(row.query, query) for row in table.pairs for query in row.queries if query.right is not None]
+    cells = []
+    for low, high in zip(_BANDS, (*_BANDS[1:], math.inf), strict=True):
+        of = [(drive, query) for drive, query in judged if low <= (query.confidence or 0.0) < high]
+        drives, wrong = {drive for drive, _ in of}, [drive for drive, query in of if not query.right]
+        band = f"{low:.2f} to {high:.2f}" if math.isfinite(high) else f"{low:.2f} and above"
+        located = sum(query.located for _, query in of)
+        cells.append([band, str(located), _share(len(wrong), len(of)), _share(len(set(wrong)), len(drives))])
+    heads = (("confidence",), ("located", "the likeliest place is wrong", "drives with a wrong one"), ())
+    return [
+        *_markdown(heads, cells),
+        "",
+        "All answers that can be judged, also those that do not say `located`, and those from elsewhere.",
     ]
 
 
