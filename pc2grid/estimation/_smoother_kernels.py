@@ -136,7 +136,7 @@ def normal_equations(
         _put(by_first[k], 1.0, free, 0, of_motion)
         _put(by_second[k], 1.0, free, 2 * d, of_motion)
         for a in range(d):
-            error[a] = _difference(step[k], window.motion[k + 1], free[a])
+            error[a] = _difference(step[k], 1.0, window.motion[k + 1], free[a])
         information = window.motion_information[k + 1]
         _add(ERRORS + 2 * d * k, error, of_motion, information, kernel, H, g, 3 * d)
     _add_steadiness(moves, window, free, parameters, few, H, g)
@@ -178,16 +178,17 @@ def _add_drifts(
     scale is returned."""
     (step, by_first, by_second), d, n = moves, len(free), len(state.poses)
     reports, read_first, read_second = steps(state.readings[:-1], state.readings[1:])
-    errors, variances, chi2 = np.empty((n - 1, d)), np.empty((n - 1, d)), np.zeros(n - 1)
+    errors, variances, chi2, all_chi2 = np.empty((n - 1, d)), np.empty((n - 1, d)), np.zeros(n - 1), 0.0
     for k in range(n - 1):
         expected, _, _ = corrected(reports[k], state.errors)
         variance = drift_variance(reports[k], p.drift, p.drift_turn_m)
         for a in range(d):
-            errors[k, a], variances[k, a] = _difference(step[k], expected, free[a]), variance[free[a]]
+            errors[k, a], variances[k, a] = _difference(step[k], 1.0, expected, free[a]), variance[free[a]]
             if not window.jumps[k + 1]:
                 chi2[k] += errors[k, a] ** 2 / variance[free[a]]
+        all_chi2 += chi2[k]
     if n > 3:  # not of the few that are marginalised
-        drift_scale = math.sqrt(max(chi2.sum() / ((n - 1) * d), 1.0))
+        drift_scale = math.sqrt(max(all_chi2 / ((n - 1) * d), 1.0))
     for k in range(min(few, n - 1)):
         if window.jumps[k + 1]:
             continue
@@ -221,9 +222,12 @@ def _add_steadiness(
     (step, by_first, by_second), d = moves, len(free)
     error, information = np.empty(d), np.zeros((d, d))
     for k in range(min(few, len(step) - 1)):
-        matched = np.any(window.match_information[k + 2] != 0.0)
-        read = np.isfinite(window.read_sigma[k + 2, 0]) and (matched or not window.jumps[k + 2])
-        if read or np.any(window.motion_information[k + 2] != 0.0):
+        matched, measured = 0.0, 0.0
+        for a in range(d):
+            matched += window.match_information[k + 2, a, a]
+            measured += window.motion_information[k + 2, a, a]
+        read = math.isfinite(window.read_sigma[k + 2, 0]) and (matched > 0.0 or not window.jumps[k + 2])
+        if read or measured > 0.0:
             continue
         before_s, seconds = max(window.seconds[k + 1], LEAST_S), max(window.seconds[k + 2], LEAST_S)
         ratio = min(seconds, max(before_s, p.steady_s)) / before_s
@@ -233,7 +237,7 @@ def _add_steadiness(
         _put(by_first[k + 1], 1.0, free, 2 * d, jacobian)
         _put(by_second[k + 1], 1.0, free, 4 * d, jacobian)
         for a in range(d):
-            error[a] = _difference(step[k + 1], ratio * step[k], free[a])
+            error[a] = _difference(step[k + 1], ratio, step[k], free[a])
             information[a, a] = (p.unsteady * seconds ** (1.0 + p.growth)) ** -2.0
         _add(ERRORS + 2 * d * k, error, jacobian, information, np.inf, H, g, 5 * d)
 
@@ -250,8 +254,8 @@ def _product(A: F64, B: F64) -> F64:
 
 
 @njit(cache=True)
-def _difference(step: F64, other: F64, direction: int) -> float:
-    """Of two steps (6,) in one direction, a turn about z within half a turn."""
-    difference: float = step[direction] - other[direction]
+def _difference(step: F64, factor: float, other: F64, direction: int) -> float:
+    """Of a step (6,) and a multiple of another in one direction, a turn about z within half a turn."""
+    difference: float = step[direction] - factor * other[direction]
     turns = math.floor(difference / (2.0 * math.pi) + 0.5) if direction == 5 else 0.0
     return difference - 2.0 * math.pi * turns

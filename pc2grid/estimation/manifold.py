@@ -6,6 +6,7 @@ added, the rotation multiplied (Sola et al., "A micro Lie theory for state estim
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -27,13 +28,13 @@ class Steps(NamedTuple):
 
 def moved(poses: F64, changes: F64) -> F64:
     """Poses (N, 4, 4) after changes (N, 6) in their own axes."""
-    result: F64 = _kernels.moved(poses, changes)
+    result: F64 = _kernels.moved(*_for_compiled(poses, changes))
     return result
 
 
 def steps(first: F64, second: F64) -> Steps:
     """The steps from poses (N, 4, 4) to others."""
-    return Steps(*_kernels.steps(first, second))
+    return Steps(*_kernels.steps(*_for_compiled(first, second)))
 
 
 def carried_on(motion: F64) -> F64:
@@ -54,6 +55,11 @@ def weakest(information: F64, position: int) -> float:
     turn = turn + 1e-9 * np.eye(len(turn))
     across = information[:position, :position] - mixed @ np.linalg.solve(turn, mixed.T)
     return float(np.linalg.eigvalsh(across)[0])
+
+
+def _for_compiled(*arrays: F64) -> Iterator[F64]:
+    """Arrays in one order of memory, writable: for any other, the same code would be compiled once more."""
+    return (np.require(array, requirements=("C", "W")) for array in arrays)
 
 
 def _skew(vectors: F64) -> F64:

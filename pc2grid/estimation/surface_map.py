@@ -176,7 +176,8 @@ class VoxelShapes:
         H, g, found, distance_m = kernels.normal_equations(
             self._slots, rows.codes, rows.shapes, points_m, weights, pose, self.edge_m, scale_m
         )
-        R = np.kron(np.eye(2), pose[:3, :3])
+        R = np.zeros((6, 6))
+        R[:3, :3] = R[3:, 3:] = pose[:3, :3]
         return R.T @ H @ R, R.T @ g, found, distance_m
 
 
