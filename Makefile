@@ -10,7 +10,7 @@ ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 BYTE_CODE = PYTHONDONTWRITEBYTECODE=
 PYTEST_ARGS ?=
 
-.PHONY: help demo test nightly check bench real fuzz picture docs clean
+.PHONY: help demo test nightly check real fuzz picture docs clean
 .DEFAULT_GOAL = help
 
 help:
@@ -18,7 +18,6 @@ help:
 	@echo 'make test    run the tests (PYTEST_ARGS="-k name" for some of them)'
 	@echo 'make nightly what `make test` leaves out: README pasted whole, the site, kill -9, recordings; 1,000 rounds of fuzz'
 	@echo 'make check   lint, format, types, import order'
-	@echo 'make bench   time and memory of describe, look up and convert'
 	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
 	@echo 'make picture list the modules by what they import, in CONTRIBUTING.md'
@@ -45,9 +44,6 @@ check: $(READY)
 	$(BIN)/ruff format --check .
 	MYPYPATH=tools $(BIN)/mypy -p pc2grid -p signature -p pc2grid_cli -p pc2grid_lab
 	$(BIN)/lint-imports
-
-bench: $(READY)
-	$(ONE_THREAD) $(BIN)/python -m pc2grid_lab.bench.run
 
 # Real recordings, where there are any. A whole run replaces the table that the next run is compared with.
 REAL_DATA = $(or $(PC2GRID_DATA),../shared/data)

@@ -17,7 +17,7 @@ import grimp
 import networkx as nx
 
 ABOUT = {
-    "pc2grid_lab": "the laboratory: experiments, peers, benchmarks",
+    "pc2grid_lab": "the laboratory: experiments, peers",
     "pc2grid_cli": "the program: one file for each command, and what they share",
     "signature": "submaps to signatures, database, localization",
     "pc2grid": "recordings to clouds, trajectories, maps, submaps",
