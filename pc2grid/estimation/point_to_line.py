@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pc2grid.arrays import F32, F64, SUBPIXEL_BITS, BoolGrid, polygon_corners
+from pc2grid.estimation._kernels import normal_equations, placement_scores
 from pc2grid.estimation.manifold import weakest
 from pc2grid.estimation.parameters import MATCHING_PARAMETERS, MatchingParameters
 from pc2grid.geometry import SE2, wrap_angle
@@ -144,8 +145,6 @@ class PointGrid:
 
     def _equations(self, points_m: F64, normal_rad: F64, pose: F64, radius: int) -> tuple[F64, F64, int]:
         """The normal equations of points (N, 2) at a pose (3,), see `_kernels.normal_equations`."""
-        from pc2grid.estimation._kernels import normal_equations
-
         corner = np.array([*self.low_m, 0.0])
         scale_m = self._parameters.residual_scale_m * radius
         return normal_equations(
@@ -222,8 +221,6 @@ def best_placements(
     Returns the best `count` placements no two of which are neighbours, best first, each with the mean
     likelihood of the points.
     """
-    from pc2grid.estimation._kernels import placement_scores
-
     steps = math.ceil(window_m / step_m)
     across = step_m * np.arange(-steps, steps + 1, dtype=np.float64)
     turn_steps = math.ceil(window_rad / step_rad)
