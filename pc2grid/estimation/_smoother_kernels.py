@@ -1,4 +1,5 @@
-"""The normal equations of the smoother, compiled. The tests compare them with a plain form in numpy.
+"""The normal equations of the smoother, compiled. The tests compare them with plain residuals, which they
+differentiate by small steps.
 
 Each factor says how far the states are from what one piece of evidence says, with its derivatives and its
 information. Unknowns are, in this order, the systematic errors of odometry, and for each scan the changes of
@@ -52,6 +53,13 @@ def drift_variance(reported: F64, drift: float, drift_turn_m: float) -> F64:
         of_turn = drift_turn_m**2 * turn_rad if a < 3 else drift**2 * turn_rad
         variance[a] = drift**2 * distance_m + of_turn + _LEAST_DRIFT**2
     return variance
+
+
+@njit(cache=True)
+def unsteadiness(seconds: float, unsteady: float, growth: float) -> float:
+    """Standard deviation, m and rad, of the change of the motion from one scan to the next."""
+    sigma: float = unsteady * seconds ** (1.0 + growth)
+    return sigma
 
 
 @njit(cache=True)
@@ -218,7 +226,8 @@ def _add_steadiness(
     H: F64,
     g: F64,
 ) -> None:
-    """Where nothing else measures it, the motion goes on as it was."""
+    """The motion goes on as it was, where nothing else measures it: neither registration, nor odometry that
+    goes on, nor odometry that jumps together with a match."""
     (step, by_first, by_second), d = moves, len(free)
     error, information = np.empty(d), np.zeros((d, d))
     for k in range(min(few, len(step) - 1)):
@@ -238,7 +247,7 @@ def _add_steadiness(
         _put(by_second[k + 1], 1.0, free, 4 * d, jacobian)
         for a in range(d):
             error[a] = _difference(step[k + 1], ratio, step[k], free[a])
-            information[a, a] = (p.unsteady * seconds ** (1.0 + p.growth)) ** -2.0
+            information[a, a] = unsteadiness(seconds, p.unsteady, p.growth) ** -2.0
         _add(ERRORS + 2 * d * k, error, jacobian, information, np.inf, H, g, 5 * d)
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from pc2grid.arrays import F64
-from pc2grid.estimation._smoother_kernels import corrected, drift_variance, normal_equations
+from pc2grid.estimation._smoother_kernels import corrected, drift_variance, normal_equations, unsteadiness
 from pc2grid.estimation.belief import PLANAR, Belief
 from pc2grid.estimation.manifold import carried_on, moved, steps
 from pc2grid.estimation.window import ERRORS, LEAST_S, SMOOTHER, Prior, SmootherParameters, State, Window
@@ -219,7 +219,7 @@ class Smoother:
     def _unsteadiness(self, seconds: float) -> F64:
         """Standard deviations (D,) of the change of the motion from one scan to the next."""
         p = self._parameters
-        return np.full(len(self._free), p.unsteady * seconds ** (1.0 + p.growth))
+        return np.full(len(self._free), unsteadiness(seconds, p.unsteady, p.growth))
 
 
 def _without(H: F64, g: F64, first: int) -> tuple[F64, F64]:
