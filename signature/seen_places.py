@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, U8, BoolGrid, freeze
@@ -94,8 +95,6 @@ def viewpoints_of(grid: OccupancyGrid, centers_m: F64) -> tuple[F32, I64]:
 
 def _roomy(grid: OccupancyGrid) -> BoolGrid:
     """Cells (H, W) with free cells around them."""
-    import cv2
-
     n = round(CLEARANCE_M / grid.resolution_m)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * n + 1, 2 * n + 1))
     return np.asarray(cv2.erode(grid.ground.astype(np.uint8), kernel), bool)

@@ -84,16 +84,6 @@ class LikelihoodField:
         values[~known] = np.maximum(values[~known], parameters.neutral_value)
         return LikelihoodField(values=values, known=known, resolution_m=resolution_m, origin_m=origin_m)
 
-    def mirrored(self) -> LikelihoodField:
-        """With x turned into -x."""
-        right_m = self.origin_m[0] + self.values.shape[1] * self.resolution_m
-        return replace(
-            self,
-            values=np.ascontiguousarray(self.values[:, ::-1]),
-            known=np.ascontiguousarray(self.known[:, ::-1]),
-            origin_m=(-right_m, self.origin_m[1]),
-        )
-
     def at(self, points_m: NDArray[np.floating], *, above: bool = False) -> tuple[F32, NDArray[np.bool_]]:
         """Likelihood (N,) 0..1 in the cells of points (N, 2), and whether these cells are known (N,).
 

@@ -133,17 +133,6 @@ class Walls:
         part = self.at_all_heights and self.at_all_heights.seen_from(free)
         return replace(self, before_m=(self.points_m + away_m).astype(np.float32), at_all_heights=part)
 
-    def mirrored(self) -> Walls:
-        """With x turned into -x."""
-        flip = np.array((-1.0, 1.0), np.float32)
-        return replace(
-            self,
-            field=self.field.mirrored(),
-            points_m=self.points_m * flip,
-            before_m=self.before_m * flip,
-            at_all_heights=self.at_all_heights and self.at_all_heights.mirrored(),
-        )
-
     @property
     def weight(self) -> float:
         """The number of wall points, by weight."""

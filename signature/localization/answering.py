@@ -11,17 +11,15 @@ import time
 from dataclasses import replace
 from typing import Literal
 
-import numpy as np
-
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from signature.localization.answer import Answer, Moment, Verdict
 from signature.localization.belief import Masses
 from signature.localization.decision import PriorOf, decide, judge, with_slip
-from signature.localization.hypotheses import Hypothesis
+from signature.localization.hypotheses import Hypothesis, moved_to_origin
 from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
-from signature.localization.query import Query, QueryMap, query_of
+from signature.localization.query import Query, QueryMap, map_as_query
 
 
 class Clock:
@@ -124,12 +122,7 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     ('located', 4.0, 3.0)
     """
     clock = Clock()
-    query = query_of(grid, np.empty((0, 2)), index.made_with, index.config)
-    # The origin of a map may lie anywhere, even far outside its walls. Poses turn about the best observed
-    # point instead: it is free, and the walls around it are known.
-    if query.views:
-        center = query.views[0].center_m
-        query = replace(query, T_odom_base=SE2(*center), center_m=center)
+    query = map_as_query(grid, index.made_with, index.config)
     clock.lap("describe")
     found = index.look_up(query)
     clock.lap("look_up")
@@ -142,13 +135,10 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
 
 
 def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
-    """The hypothesis with its covariance, known for the point `at` of the query, moved to the query's
-    origin."""
+    """The hypothesis with its covariance, known for the point `at` of the query, at the query's origin."""
     fit = hypothesis.fit
-    there = fit.T_map_query @ at
-    J = np.eye(3)
-    J[:2, 2] = there.y - fit.T_map_query.y, fit.T_map_query.x - there.x
-    return replace(hypothesis, fit=replace(fit, covariance=J @ fit.covariance @ J.T))
+    covariance = moved_to_origin(fit.covariance, fit.T_map_query, at)
+    return replace(hypothesis, fit=replace(fit, covariance=covariance))
 
 
 def moment_of(index: MapIndex, query: QueryMap, verdict: Verdict) -> Moment:

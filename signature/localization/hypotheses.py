@@ -171,6 +171,14 @@ def _nearer(a: SE2, b: SE2, apart_m: float, apart_rad: float) -> bool:
     return math.hypot(a.x - b.x, a.y - b.y) < apart_m and abs(wrap_angle(a.yaw - b.yaw)) < apart_rad
 
 
+def moved_to_origin(covariance: F64, T_map_query: SE2, at: SE2) -> F64:
+    """The covariance (3, 3) of a pose in the map at the query's origin; it is known for its point `at`."""
+    there = T_map_query @ at
+    J = np.eye(3)
+    J[:2, 2] = there.y - T_map_query.y, T_map_query.x - there.x
+    return np.asarray(J @ covariance @ J.T)
+
+
 def coarse_points(points_m: F32, center_m: tuple[float, float]) -> F32:
     """(M, 2) float32: a few of the wall points (N, 2), near and far, spread evenly around `center_m` and
     relative to it."""

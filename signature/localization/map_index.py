@@ -6,7 +6,10 @@ import contextlib
 import copy
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
+
+import numpy as np
 
 from pc2grid.errors import DatabaseCorrupt
 from pc2grid.matching.icp_in_space import MapSurface
@@ -135,6 +138,13 @@ class MapIndex:
                 f" {len(infos)} sessions, so it was computed now; `pc2grid db copy --recover` makes it whole"
             )
         return index
+
+    @staticmethod
+    def of_session(database: SubmapDatabase, session: str) -> MapIndex:
+        """One session of a database by itself, without points."""
+        table, config = database.signatures(session), database.config()
+        table = replace(table, session_index=np.zeros(len(table), np.int32))
+        return MapIndex({session: database.grid(session)}, table, config, config, stored=database.seen_places)
 
     def surface(self, session_index: int) -> MapSurface | None:
         """The points of a session in space; None if it has none."""

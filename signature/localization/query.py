@@ -314,6 +314,19 @@ def query_of(
     )
 
 
+def map_as_query(grid: OccupancyGrid, made_with: Config, config: RelocalizeConfig) -> QueryMap:
+    """Describe a map, or a part of one, of which it is not known from where it was seen.
+
+    The origin of a map may lie anywhere, even far outside its walls. Poses turn about the best observed point
+    instead: it is free, and the walls around it are known.
+    """
+    query = query_of(grid, np.empty((0, 2)), made_with, config)
+    if not query.views:
+        return query
+    center = query.views[0].center_m
+    return replace(query, T_odom_base=SE2(*center), center_m=center)
+
+
 def _signature_at(grid: OccupancyGrid, center_m: tuple[float, float], made_with: Config) -> Signature:
     return describe(view_at(grid, center_m, made_with.partition), made_with.signature)
 

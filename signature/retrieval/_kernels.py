@@ -1,4 +1,4 @@
-"""Likeness of isovists, and the headings of poses, compiled. The tests compare both with plain forms."""
+"""The headings of poses, compiled. The tests compare them with a plain form."""
 
 from __future__ import annotations
 
@@ -7,55 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64
-
-_BLOCK = 64
-"""Viewpoints at a time, so that the sums of a block stay small."""
-
-
-@numba.njit(cache=True, nogil=True)
-def compare_rotated(
-    rays: I64,
-    own: NDArray[np.uint16],
-    others: NDArray[np.uint16],
-    known: NDArray[np.bool_],
-    width: int,
-    doubt: float,
-    out: F32,
-) -> None:
-    """Likeness of one isovist with others for each rotation by 2 pi s / B, into `out` (B, N).
-
-    The mean over the rays that both sides know of a triangular kernel of the difference of their ranges, with
-    `doubt` added to the number of rays.
-
-    own : ranges of some `rays` of the view. others (N, B) : ranges of the viewpoints, `known` or not. Ranges
-    that differ by `width` or more are not alike. Sums are exact in 16 bits.
-    """
-    n, bearings = others.shape
-    full, scale, more = np.uint16(width), np.float32(1.0 / width), np.float32(doubt)
-    most = bearings * min(n, _BLOCK)
-    # Transposed, and the circle twice over, so that the partners of a ray at all rotations lie side by side.
-    there, there_known = np.empty(2 * most, np.uint16), np.empty(2 * most, np.uint16)
-    total, count = np.empty(most, np.uint16), np.empty(most, np.uint16)
-    for first in range(0, n, _BLOCK):
-        size = min(_BLOCK, n - first)
-        around = bearings * size
-        for i in range(size):
-            for k in range(bearings):
-                at = k * size + i
-                there[at] = there[at + around] = others[first + i, k]
-                there_known[at] = there_known[at + around] = known[first + i, k]
-        total[:], count[:] = 0, 0
-        for ray in range(len(rays)):
-            here, at = own[ray], rays[ray] * size
-            run, run_known = there[at : at + around], there_known[at : at + around]
-            for j in range(around):
-                apart = np.uint16(max(here, run[j]) - min(here, run[j]))
-                total[j] += np.uint16(full - min(apart, full))
-                count[j] += run_known[j]
-        for shift in range(bearings):
-            for i in range(size):
-                j = shift * size + i
-                out[shift, first + i] = np.float32(total[j]) * scale / (np.float32(count[j]) + more)
 
 
 @numba.njit(cache=True, nogil=True)

@@ -7,9 +7,8 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid
-from pc2grid.submaps.junction_graph import junction_graph
 from signature.localization.joining.join import JoinableMap
-from tests.helpers.simulated_drives import RESOLUTION_M, office
+from tests.helpers.simulated_drives import RESOLUTION_M, building, office
 
 WEST, EAST = (0.0, 0.0, 13.0, 14.0), (6.0, 0.0, 20.0, 14.0)
 """Two parts of the office (left, bottom, right, top; metres) that share its middle: a strip of 7 x 14 m."""
@@ -46,4 +45,4 @@ def in_frame(grid: OccupancyGrid, T_grid_frame: SE2) -> OccupancyGrid:
 
 
 def joinable(grid: OccupancyGrid) -> JoinableMap:
-    return JoinableMap(grid=grid, graph=junction_graph(grid), sight_m=5.0)
+    return JoinableMap(building({"": grid}))

@@ -36,8 +36,7 @@ class ComparedSessions(TypedDict):
     """Two sessions that were compared. status: joined, ambiguous, or different: nothing says that they show
     one building. accepted: the join counts; other pairs and labels do not contradict it. T_target_source:
     null if the status is `different`; covariance: (3, 3) of its x, y, yaw. probability: that it is right.
-    agreement: of the walls where both know the ground, 0..1. common_m2: free ground that both know. nodes: of
-    the junction graphs, that agree on it."""
+    agreement: of the walls where both know the ground, 0..1. common_m2: free ground that both know."""
 
     target: str
     source: str
@@ -48,7 +47,6 @@ class ComparedSessions(TypedDict):
     probability: float
     agreement: float
     common_m2: float
-    nodes: int
 
 
 class DbJoin(OfDatabase):
@@ -194,5 +192,4 @@ def _compared(pair: SessionPair) -> ComparedSessions:
         "probability": join.probability,
         "agreement": join.agreement,
         "common_m2": join.common_m2,
-        "nodes": join.nodes,
     }

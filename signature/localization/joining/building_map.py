@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -98,8 +99,6 @@ def _as_drawn(
     A bend changes little from cell to cell: it is inverted for the middles of large squares, and in between
     it is interpolated.
     """
-    import cv2
-
     at = np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1)
     T_session_building = frame.T_building_session.inverse()
     straight_m = T_session_building.apply(whole.to_point(at.reshape(-1, 2))).reshape(at.shape)

@@ -1,11 +1,11 @@
 """Do two sessions show one building, and how does one lie to the other?
 
-The junction graphs propose transforms (`graph_matching`); each is searched around, refined and scored by the
-walls of both. What is judged is the part of the source that lies on known ground of the target: it is a query
-that the target is asked for, and the posterior of every other answer decides (`posterior`). The other
-transforms are its rivals, with the same part. So are decoys: the source is also matched in its mirror image,
-which lies nowhere for certain. What that scores is what wrong transforms of these two maps score, and where a
-building is symmetric, or another one has its plan turned over, it scores as much as any.
+The pieces of the source propose transforms (`proposals`); each is refined and scored by the walls of both.
+What is judged is the part of the source that lies on known ground of the target: it is a query that the
+target is asked for, and the posterior of every other answer decides (`posterior`). The other transforms are
+its rivals, with the same part. So are decoys: the source is also matched in its mirror image, which lies
+nowhere for certain. What that scores is what wrong transforms of these two maps score, and where a building
+is symmetric, or another one has its plan turned over, it scores as much as any.
 """
 
 from __future__ import annotations
@@ -14,8 +14,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F32, F64, BoolGrid, freeze
@@ -25,11 +26,9 @@ from pc2grid.matching.refinement import refine
 from pc2grid.matching.self_likeness import self_likeness
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.matching.walls import Walls
-from pc2grid.matching.window_search import SearchMap, SearchParameters, search_windows
+from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import UNKNOWN, OccupancyGrid
-from signature.localization.hypotheses import HYPOTHESES, coarse_points, same_pose
-from signature.localization.joining.graph_matching import Alignment, align_graphs
-from signature.localization.joining.landmarks import Landmarks
+from signature.localization.hypotheses import HYPOTHESES, moved_to_origin, same_pose
 from signature.localization.joining.pieces import (
     PIECES,
     Link,
@@ -37,14 +36,14 @@ from signature.localization.joining.pieces import (
     PieceFits,
     align_pieces,
     links_of,
+    mirrored,
     pieces_of,
     rigid,
 )
+from signature.localization.joining.proposals import Proposal, proposals
+from signature.localization.map_index import MapIndex
 from signature.localization.posterior import NO_EVIDENCE, POSTERIOR, Evidence, evidence_of, masses
 from signature.localization.query import QueryMap
-
-if TYPE_CHECKING:
-    import networkx as nx
 
 JoinStatus = Literal["joined", "ambiguous", "different"]
 """different: nothing says that the two show one building."""
@@ -54,7 +53,6 @@ JoinStatus = Literal["joined", "ambiguous", "different"]
 class JoinParameters:
     """How a transform is verified and judged. By hand.
 
-    around_m, around_rad : a transform of the graphs is searched so far around: two nodes of a way.
     least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
     accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
     labelled : prior odds that two sessions show one floor if their labels say so, relative to those of other
@@ -62,8 +60,6 @@ class JoinParameters:
     wall_m : the ground that a session knows is widened by this, so that the walls at its edge count.
     """
 
-    around_m: float = 1.0
-    around_rad: float = math.radians(10.0)
     least_m2: float = 20.0
     accept: float = 0.99
     labelled: float = 10.0
@@ -75,21 +71,19 @@ _MIRROR = np.array((-1.0, 1.0), np.float32)
 """Turns x into -x."""
 
 
-@dataclass(frozen=True, kw_only=True)  # no slots, for what is computed once
+@dataclass(frozen=True)  # no slots, for what is computed once
 class JoinableMap:
     """The map of a session, prepared to be joined when it first matters.
 
-    graph : its junction graph. sight_m : what is visible is described up to this distance.
+    index : of this session alone.
     """
 
-    grid: OccupancyGrid
-    graph: nx.Graph
-    sight_m: float
+    index: MapIndex
 
-    @cached_property
-    def landmarks(self) -> Landmarks:
-        """The nodes of the graph, described."""
-        return Landmarks.of(self.grid, self.graph, self.sight_m)
+    @property
+    def grid(self) -> OccupancyGrid:
+        """The map."""
+        return self.index.grids[0]
 
     @cached_property
     def walls(self) -> Walls:
@@ -112,12 +106,17 @@ class JoinableMap:
     @cached_property
     def pieces(self) -> tuple[Piece, ...]:
         """The map cut in pieces."""
-        return pieces_of(self.grid)
+        return pieces_of(self.index)
 
     @cached_property
+    def mirrored_pieces(self) -> tuple[Piece, ...]:
+        """The same pieces of the mirror image, with x turned into -x."""
+        return tuple(mirrored(piece, self.index) for piece in self.pieces)
+
+    @property
     def search(self) -> SearchMap:
         """The map, prepared to be searched."""
-        return SearchMap.of(self.grid)
+        return self.index.maps[0]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,7 +126,7 @@ class Join:
     status : whether they are joined. T_target_source : the best transform; of no meaning if "different".
     covariance : (3, 3) of its x, y, yaw. probability : 0..1, of the transform being right.
     agreement : 0..1, of the walls where both know the ground, the lower one of both directions.
-    common_m2 : free ground that both know. nodes : of the two graphs, that agree on the transform.
+    common_m2 : free ground that both know.
     rivals : other transforms that were compared, with decoys. evidence : what the probability rests on.
     links : where the pieces of the source lie that agree with the target.
     """
@@ -138,7 +137,6 @@ class Join:
     probability: float
     agreement: float
     common_m2: float
-    nodes: int
     rivals: int
     evidence: Evidence
     links: tuple[Link, ...] = ()
@@ -154,7 +152,6 @@ UNJOINED = Join(
     probability=0.0,
     agreement=0.0,
     common_m2=0.0,
-    nodes=0,
     rivals=0,
     evidence=NO_EVIDENCE,
 )
@@ -163,12 +160,11 @@ UNJOINED = Join(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Candidate:
-    """A transform that was made exact by walls. at : middle of its nodes in the source. fits : of each piece
-    of the source. links : of those that agree. covariance : (3, 3) of the transform at `at`."""
+    """A transform that was made exact by walls. at : the piece of the source that proposed it. fits : of each
+    piece of the source. links : of those that agree. covariance : (3, 3) of the transform at `at`."""
 
     T_target_source: SE2
     at: SE2
-    nodes: int
     fits: tuple[Fit, ...]
     links: tuple[Link, ...]
     covariance: F64
@@ -183,12 +179,11 @@ def join_maps(
     """
     points_m = source.walls.facing(target.walls).points_m
     prior = parameters.labelled if labelled else 1.0
-    candidates = _candidates(target, source.landmarks, points_m, source.pieces, parameters)
+    candidates = _candidates(target, points_m, source.pieces)
     join = _best(target, source, candidates, (), prior, parameters)
     if join.status == "different":
         return join  # decoys are further rivals, which tell against it at most
-    mirrored = tuple(piece.mirrored() for piece in source.pieces)
-    decoys = _candidates(target, source.landmarks.mirrored(), points_m * _MIRROR, mirrored, parameters)
+    decoys = _candidates(target, points_m * _MIRROR, source.mirrored_pieces)
     return _best(target, source, candidates, decoys, prior, parameters)
 
 
@@ -220,53 +215,30 @@ def _same(a: _Candidate, b: _Candidate) -> bool:
     return same_pose(a.T_target_source @ a.at, b.T_target_source @ a.at)
 
 
-def _candidates(
-    target: JoinableMap, source: Landmarks, points_m: F32, pieces: Sequence[Piece], parameters: JoinParameters
-) -> list[_Candidate]:
-    """The transforms of a source that the graphs propose, no two alike."""
+def _candidates(target: JoinableMap, points_m: F32, pieces: Sequence[Piece]) -> list[_Candidate]:
+    """The transforms of a source that its pieces propose, no two alike."""
     found: list[_Candidate] = []
-    for alignment in align_graphs(target.landmarks, source) if pieces else ():
-        refined = _refined(target, points_m, pieces, alignment, parameters)
-        if refined is not None and not any(_same(refined, other) for other in found):
+    for proposal in proposals(target.index, pieces):
+        refined = _refined(target, points_m, pieces, proposal)
+        if not any(_same(refined, other) for other in found):
             found.append(refined)
     return found
 
 
-def _refined(
-    target: JoinableMap,
-    points_m: F32,
-    pieces: Sequence[Piece],
-    alignment: Alignment,
-    parameters: JoinParameters,
-) -> _Candidate | None:
-    """The transform of the graphs made exact by walls: around the matched nodes, then piece by piece."""
-    at = SE2(*alignment.at_m)
-    there = alignment.T_target_source @ at
-    found = search_windows(
-        target.search,
-        coarse_points(points_m, alignment.at_m),
-        np.array([[there.x, there.y, there.yaw]]),
-        half_t_m=parameters.around_m,
-        half_a_rad=parameters.around_rad,
-        parameters=SearchParameters(floor=0.0, most=1),
-    )
-    if not len(found):
-        return None
-    around = points_m[np.hypot(*(points_m - np.asarray(alignment.at_m, np.float32)).T) < PIECES.side_m]
-    start = SE2(*found[0, :3].tolist()) @ SE2(-at.x, -at.y, 0.0)
-    pose, _ = refine(target.search.field, around, start, alignment.at_m)
-    fits = align_pieces(target.search, pieces, pose, alignment.at_m)
+def _refined(target: JoinableMap, points_m: F32, pieces: Sequence[Piece], proposal: Proposal) -> _Candidate:
+    """The transform of one piece made exact by the walls of all."""
+    pose = proposal.T_target_source
+    fits = align_pieces(target.search, pieces, pose, proposal.at_m)
     links = links_of(pieces, fits)
     T_target_source, bend_m = rigid(links)
-    whole, covariance = refine(target.search.field, points_m, T_target_source, alignment.at_m)
+    whole, covariance = refine(target.search.field, points_m, T_target_source, proposal.at_m)
     if bend_m < LIKELIHOOD.sigma_m:  # all walls are within reach of theirs at once, which is more exact
         T_target_source = whole
     deviations = (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)
     covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
     return _Candidate(
         T_target_source=T_target_source,
-        at=at,
-        nodes=alignment.nodes,
+        at=SE2(*proposal.at_m),
         fits=fits,
         links=links,
         covariance=covariance,
@@ -327,7 +299,8 @@ def _judged(
     # Transforms that fit equally well share the mass.
     equal = int(np.count_nonzero(np.abs(scores - scores[number]) <= POSTERIOR.alike))
     probability = float(masses([evidence] * equal, odds)[0])
-    enough = common_m2 >= parameters.least_m2
+    # Of thousands of wall points a small lead is much, even where walls fit as wrong places do.
+    enough = common_m2 >= parameters.least_m2 and min(forward, backward) >= PIECES.follows
     return Join(
         status=_status(evidence, odds, probability, enough, parameters),
         T_target_source=candidate.T_target_source,
@@ -335,7 +308,6 @@ def _judged(
         probability=probability,
         agreement=min(forward, backward),
         common_m2=common_m2,
-        nodes=candidate.nodes,
         rivals=len(scores) - 1,
         evidence=evidence,
         links=candidate.links,
@@ -345,7 +317,7 @@ def _judged(
 def _status(
     evidence: Evidence, odds: float, probability: float, enough: bool, parameters: JoinParameters
 ) -> JoinStatus:
-    """What is said of a transform. enough : whether so much is in common that it may be joined."""
+    """What is said of a transform. enough : whether enough is in common, and alike, to be joined."""
     if enough and probability >= parameters.accept:
         return "joined"
     # That the source lies here, or at a place that fits equally well, is more probable than not.
@@ -354,8 +326,6 @@ def _status(
 
 def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> OccupancyGrid:
     """The source without what the target does not know, widened by `JoinParameters.wall_m`."""
-    import cv2
-
     n = math.ceil(JOIN.wall_m / target.resolution_m)
     known = cv2.dilate((target.cells != UNKNOWN).astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8))
     cells = np.argwhere(source.cells != UNKNOWN)
@@ -377,11 +347,3 @@ def _looked_up(mask: BoolGrid, grid: OccupancyGrid, points_m: F64) -> BoolGrid:
     inside: BoolGrid = np.asarray(((at >= 0) & (at < mask.shape)).all(axis=1))
     inside[inside] = mask[tuple(at[inside].T)]
     return inside
-
-
-def moved_to_origin(covariance: F64, T_target_source: SE2, at: SE2) -> F64:
-    """The covariance (3, 3) of a transform at a point of the source, at its origin."""
-    there = T_target_source @ at
-    J = np.eye(3)
-    J[:2, 2] = there.y - T_target_source.y, T_target_source.x - there.x
-    return np.asarray(J @ covariance @ J.T)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from pc2grid.observer import Observer
 from signature.database.protocol import BuildingFrame, SessionInfo
 from signature.localization.joining.join import Join, JoinableMap, join_maps
+from signature.localization.map_index import MapIndex
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
@@ -53,11 +54,10 @@ def compare_pairs(
     pairs = [
         (a, b) for a, b in combinations(infos, 2) if {a, b} & {*only} and not told_apart(infos[a], infos[b])
     ]
-    sight_m = database.config().partition.radius_m
 
     @functools.lru_cache(_KEPT)
     def prepared(name: str) -> JoinableMap:
-        return JoinableMap(grid=database.grid(name), graph=database.graph(name), sight_m=sight_m)
+        return JoinableMap(MapIndex.of_session(database, name))
 
     with observer.step(f"compare {len(pairs)} pairs of sessions"):
         for done, (a, b) in enumerate(pairs, start=1):

@@ -1,6 +1,6 @@
 """A map in pieces, each aligned by itself: a bent map fits another one in pieces, and nowhere as a whole.
 
-The pieces are aligned one after the other, from the middle of what the graphs matched outwards. Each begins
+The pieces are aligned one after the other, from the one that proposed a transform outwards. Each begins
 where its nearest neighbour came to lie, so the alignment follows the bend.
 """
 
@@ -21,6 +21,8 @@ from pc2grid.matching.walls import Walls
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from signature.localization.hypotheses import HYPOTHESES
+from signature.localization.map_index import MapIndex
+from signature.localization.query import QueryMap, map_as_query
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,34 +46,54 @@ _STEPS = 4
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A square of a map. center_m : (x, y) the middle of its walls."""
+    """A square of a map, described as a query. center_m : (x, y) the middle of its walls."""
 
-    walls: Walls
+    query: QueryMap
     center_m: tuple[float, float]
 
-    def mirrored(self) -> Piece:
-        """With x turned into -x."""
-        return Piece(self.walls.mirrored(), (-self.center_m[0], self.center_m[1]))
+    @staticmethod
+    def of(grid: OccupancyGrid, target: MapIndex) -> Piece:
+        """A square that is described as the places of `target` are."""
+        query = map_as_query(grid, target.made_with, target.config)
+        x, y = query.walls.points_m.mean(axis=0).tolist() if len(query.walls.points_m) else (0.0, 0.0)
+        return Piece(query, (x, y))
+
+    @property
+    def walls(self) -> Walls:
+        """Its walls."""
+        return self.query.walls
 
 
-def pieces_of(grid: OccupancyGrid) -> tuple[Piece, ...]:
-    """The squares of a map that hold enough walls."""
+def pieces_of(index: MapIndex) -> tuple[Piece, ...]:
+    """The squares of the map of one session that hold enough walls."""
+    grid = index.grids[0]
     side = round(PIECES.side_m / grid.resolution_m)
     height, width = grid.cells.shape
-    found = []
-    for row in range(0, height, side):
-        for column in range(0, width, side):
-            here = np.s_[row : row + side, column : column + side]
-            cells, heights = grid.cells[here], None if grid.heights is None else grid.heights[here]
-            if not (cells > UNKNOWN).any():
-                continue
-            x, y = grid.origin_m
-            origin_m = (x + column * grid.resolution_m, y + row * grid.resolution_m)
-            walls = Walls.of(replace(grid, cells=cells, heights=heights, origin_m=origin_m))
-            if walls.weight >= PIECES.least_walls:
-                at_x, at_y = walls.points_m.mean(axis=0).tolist()
-                found.append(Piece(walls, (at_x, at_y)))
-    return tuple(found)
+    squares = (
+        _square(grid, row, column, side) for row in range(0, height, side) for column in range(0, width, side)
+    )
+    pieces = (Piece.of(square, index) for square in squares if (square.cells > UNKNOWN).any())
+    return tuple(piece for piece in pieces if piece.walls.weight >= PIECES.least_walls)
+
+
+def mirrored(piece: Piece, index: MapIndex) -> Piece:
+    """A piece with x turned into -x."""
+    grid = piece.query.grid
+    right_m = grid.origin_m[0] + grid.cells.shape[1] * grid.resolution_m
+    heights = None if grid.heights is None else grid.heights[:, ::-1]
+    turned = replace(grid, cells=grid.cells[:, ::-1], heights=heights, origin_m=(-right_m, grid.origin_m[1]))
+    return Piece.of(turned, index)
+
+
+def _square(grid: OccupancyGrid, row: int, column: int, side: int) -> OccupancyGrid:
+    here = np.s_[row : row + side, column : column + side]
+    x, y = grid.origin_m
+    return replace(
+        grid,
+        cells=grid.cells[here],
+        heights=None if grid.heights is None else grid.heights[here],
+        origin_m=(x + column * grid.resolution_m, y + row * grid.resolution_m),
+    )
 
 
 def align_pieces(

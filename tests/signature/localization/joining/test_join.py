@@ -10,8 +10,8 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
-from signature.localization.joining.graph_matching import Alignment, align_graphs
 from signature.localization.joining.join import JOIN, Join, join_maps
+from signature.localization.joining.proposals import Proposal, proposals
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, joinable, part
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import office, plan, with_tables
@@ -58,16 +58,15 @@ def test_tables_of_a_lidar_do_not_part_it_from_a_laser(lidar_asked: bool) -> Non
     assert told.status == "joined" and told.agreement > 0.95 > 0.6 > untold.agreement
 
 
-def test_the_graphs_propose_where_the_other_map_lies() -> None:
-    """Among the three sets with most evidence: rooms along a corridor look alike, and walls decide."""
+def test_pieces_propose_where_the_other_map_lies() -> None:
+    """Among the likeliest: rooms along a corridor look alike, and the walls of all pieces decide."""
 
-    def near(alignment: Alignment) -> bool:
-        at = SE2(*alignment.at_m)
-        apart = (T_OFFICE_EAST @ at).inverse() @ alignment.T_target_source @ at
-        # Nodes are up to a metre apart, and many of them are averaged.
-        return math.hypot(apart.x, apart.y) < 0.5 and abs(apart.yaw) < math.radians(5.0)
+    def near(proposal: Proposal) -> bool:
+        at = SE2(*proposal.at_m)
+        apart = (T_OFFICE_EAST @ at).inverse() @ proposal.T_target_source @ at
+        return math.hypot(apart.x, apart.y) < 0.1 and abs(apart.yaw) < math.radians(2.0)
 
-    assert sum(map(near, align_graphs(west.landmarks, east.landmarks)[:3])) == 1
+    assert any(map(near, proposals(west.index, east.pieces)[:5]))
 
 
 MIRRORED = OccupancyGrid(cells=office().cells[:, ::-1].copy(), resolution_m=RESOLUTION_M, origin_m=(0.0, 0.0))
