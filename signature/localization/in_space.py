@@ -85,6 +85,21 @@ def settle_in_space(
     """
     if not query.views or query.T_odom_base is None:
         return verdict, None
+    fits, masses, best = _compared(verdict, query, surface_of, accept)
+    if not fits:
+        return verdict, None
+    poses = {place: _pose(fit, query.T_odom_base) for place, fit in fits.items()}
+    settled = _settled(verdict, best, masses, poses.get(best), query.T_odom_base, accept)
+    if settled.status == "located":
+        return settled, poses.get(best)
+    return settled, poses.get(0) if verdict.status == "located" else None
+
+
+def _compared(
+    verdict: Verdict, query: QueryInSpace, surface_of: Callable[[int], MapSurface | None], accept: float
+) -> tuple[dict[int, SpatialFit], F64, int]:
+    """The fits of places by number, the masses with them, and the likeliest place: those with the most mass
+    are compared, until no other one can change what is certain."""
     fits: dict[int, SpatialFit] = {}
     best, masses = 0, np.array(verdict.masses)
     for place in range(min(len(masses), SPACE.places)):
@@ -98,13 +113,7 @@ def settle_in_space(
         left = sum(verdict.masses[place + 1 :]) / max(verdict.masses[best], np.finfo(float).tiny)
         if best in fits and masses[best] >= accept * (1.0 + masses[best] * left):
             break
-    if not fits:
-        return verdict, None
-    poses = {place: _pose(fit, query.T_odom_base) for place, fit in fits.items()}
-    settled = _settled(verdict, best, masses, poses.get(best), query.T_odom_base, accept)
-    if settled.status == "located":
-        return settled, poses.get(best)
-    return settled, poses.get(0) if verdict.status == "located" else None
+    return fits, masses, best
 
 
 def masses_in_space(masses: Sequence[float], fits: Mapping[int, SpatialFit]) -> tuple[F64, int]:

@@ -7,7 +7,7 @@ sessions lie (`placing`). One pose graph over all that they have measured says h
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -19,6 +19,8 @@ from signature.localization.joining.placing import anchor_of, buildings_of, plac
 from signature.localization.joining.straightening import bodies_of, straighten
 
 if TYPE_CHECKING:
+    import networkx as nx
+
     from signature.database import SubmapDatabase
 
 
@@ -62,13 +64,25 @@ def join_sessions(
     frames = dict(stay)
     accepted: set[Names] = set()
     for tree in buildings_of(infos, joined, stay):
-        within = [pair for pair in joined if pair.target in tree and pair.source in tree]
         anchor = anchor_of([name for name in infos if name in tree], frame, known, stay)
-        placed, counted = place(tree, anchor, within, stay)
-        links = {pair.names: pair.join.links for pair in within if pair.names in counted}
-        frames |= straighten(bodies_of(database, placed, stay), placed, links, placed.keys() & stay)
+        placed, counted = _lying(database, tree, anchor, joined, stay)
+        frames |= placed
         accepted |= counted
     return Joined(
         pairs=tuple(replace(pair, accepted=pair.names in accepted) for pair in pairs),
         frames={name: frames[name] for name in infos if name in frames},
     )
+
+
+def _lying(
+    database: SubmapDatabase,
+    tree: nx.Graph,
+    anchor: tuple[str, BuildingFrame],
+    joined: Sequence[SessionPair],
+    stay: Mapping[str, BuildingFrame],
+) -> tuple[dict[str, BuildingFrame], set[Names]]:
+    """How the sessions of one building lie and are bent, and the names of the pairs that count."""
+    within = [pair for pair in joined if pair.target in tree and pair.source in tree]
+    placed, counted = place(tree, anchor, within, stay)
+    links = {pair.names: pair.join.links for pair in within if pair.names in counted}
+    return straighten(bodies_of(database, placed, stay), placed, links, placed.keys() & stay), counted

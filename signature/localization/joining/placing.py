@@ -77,15 +77,8 @@ def place(
     stay: Mapping[str, BuildingFrame],
 ) -> tuple[dict[str, BuildingFrame], set[Names]]:
     """Where the sessions of a building lie, by all its joined pairs, and the names of those that count."""
-    import networkx as nx
-
     first, at = anchor
-    poses = {first: at.T_building_session} | {n: stay[n].T_building_session for n in tree if n in stay}
-    for a, b in nx.bfs_edges(tree, first):
-        if b not in poses:
-            pair = tree.edges[a, b]["pair"]
-            T_target_source = pair.join.T_target_source
-            poses[b] = poses[a] @ (T_target_source if pair.target == a else T_target_source.inverse())
+    poses = _along_tree(tree, anchor, stay)
     number = {name: k for k, name in enumerate(poses)}
     edges = [
         Edge(
@@ -115,6 +108,22 @@ def place(
     }
     found |= {name: stay[name] for name in tree if name in stay}
     return found, {pair.names for pair in compress(joined, counts)}
+
+
+def _along_tree(
+    tree: nx.Graph, anchor: tuple[str, BuildingFrame], stay: Mapping[str, BuildingFrame]
+) -> dict[str, SE2]:
+    """Where the sessions of a building lie by its surest pairs alone, the anchor first."""
+    import networkx as nx
+
+    first, at = anchor
+    poses = {first: at.T_building_session} | {n: stay[n].T_building_session for n in tree if n in stay}
+    for a, b in nx.bfs_edges(tree, first):
+        if b not in poses:
+            pair = tree.edges[a, b]["pair"]
+            T_target_source = pair.join.T_target_source
+            poses[b] = poses[a] @ (T_target_source if pair.target == a else T_target_source.inverse())
+    return poses
 
 
 def _covariances(poses: F64, edges: Sequence[Edge]) -> F64:
