@@ -29,7 +29,7 @@ REMOVED = {
         ("pc2grid compare log", "pc2grid compare maps"),
         "`pc2grid compare recordings FOLDER`, with true poses in NAME.tum beside NAME.mcap",
     ),
-    "pc2grid compare signatures": "`python -m pc2grid_lab.fit.retrieval --help`: the same on real logs",
+    "pc2grid compare signatures": "`pc2grid compare recordings DATA --shortlist shuffled`: without them",
     "pc2grid compare real": "its rows are those of `pc2grid compare recordings DATA --only 'other sensor'`",
     "pc2grid watch --last": "a finished recording is followed whole, and ws://ROBOT:8765 while it runs",
     "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",

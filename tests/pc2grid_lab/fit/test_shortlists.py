@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any, cast
-
 from pc2grid.simulate import office_floorplan
 from pc2grid_lab.fit.shortlists import asked, together
 from signature.localization.query import Query
@@ -20,9 +17,8 @@ def test_a_window_is_asked_once_by_each_shortlist() -> None:
     for registered, planar_scan, end in drive(office(), [(1.5, 7.0), (9.5, 7.0), (9.5, 4.0)]):
         query.add(registered, planar_scan)
         truth = end
-    window = cast(Any, SimpleNamespace(whole=query.map()))
-    rows = list(asked("all maps", every, window, {"office": truth}))
+    rows = list(asked("all maps", every, query.map(), {"office": truth}))
     assert [row.by for row in rows] == ["signatures", "shuffled", "random"]
     assert rows[0].located and rows[0].right
-    (elsewhere, *_) = asked("all maps", every, window, {"floor": truth})
+    (elsewhere, *_) = asked("all maps", every, query.map(), {"floor": truth})
     assert elsewhere.located and not elsewhere.right

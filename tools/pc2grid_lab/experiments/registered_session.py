@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import pickle
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -69,14 +69,15 @@ class RegisteredSession:
         pairs = [(_pose(self.T_odom_base[k]), _pose(self.T_world_base[k])) for k in known]
         return fit_frame(pairs, _FITTED_M)
 
-    def true_pose(self, scan: int) -> SE2 | None:
-        """T_world_base of a scan: the truth of the nearest scan that has one, carried on by registration."""
-        known = np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))
-        if not len(known):
-            return None
-        nearest = known[np.argmin(np.abs(known - scan))]
-        T_nearest_scan = _pose(self.T_odom_base[nearest]).inverse() @ _pose(self.T_odom_base[scan])
-        return _pose(self.T_world_base[nearest]) @ T_nearest_scan
+    def first(self, count: int) -> RegisteredSession:
+        """The session until so many scans were taken."""
+        return replace(
+            self,
+            planar_scans=self.planar_scans[:count],
+            T_odom_base=self.T_odom_base[:count],
+            lost=self.lost[:count],
+            T_world_base=self.T_world_base[:count],
+        )
 
     def scans(self) -> Iterator[tuple[RegisteredScan, PlanarScan, SE2]]:
         """Each scan (without its points), its planar scan and its true pose, in order of time."""

@@ -13,19 +13,19 @@ probability holds for queries half of which lie in the map.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import typer
 from numpy.typing import NDArray
 from scipy.optimize import minimize
-from scipy.stats import mannwhitneyu
+from sklearn.metrics import roc_auc_score
 
 from pc2grid.arrays import F64
 from pc2grid_lab.experiments.recordings.chance import clopper_pearson
@@ -37,8 +37,12 @@ RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
 that count as true are good to some centimetres."""
 NEAR_M = 1.0
 """Answers so near to the place of a query that is not in the map are left out: neither right nor wrong."""
-PARTS_OF = {"fr079_floor": "fr079"}
-"""Physical building of what the data call otherwise: the 3D scan is one floor of fr079."""
+KINDS = {
+    "in the map": "in its own building",
+    "elsewhere": "in another building",
+    "blanked": "place blanked",
+}
+"""What is printed of the places of `recorded_queries`."""
 _LAPSE = 0.1
 """Share of the truths that are taken to be none: a query whose map is wrong, or whose place no equation would
 find, does not decide the fit."""
@@ -72,25 +76,20 @@ class Known:
         return float(masses(self.places, p=p)[0]) if self.places else 0.0
 
 
-def known_of(rows: Sequence[dict[str, Any]]) -> Iterator[Known]:
+def known_of(rows: Iterable[dict[str, Any]]) -> Iterator[Known]:
     """Answers to real logs, without those to queries whose true pose is not known."""
     for row in rows:
-        own, blanked = row["log"] == row["map"], row["place"] == "blanked"
-        if not row["errors"] or (own and not math.isfinite(row["errors"][0][0])):
+        errors, own, blanked = row["errors"], row["log"] == row["map"], row["place"] == "blanked"
+        beside = blanked and any(error_m < NEAR_M for error_m, _ in errors)
+        if not errors or beside or (own and not math.isfinite(errors[0][0])):
             continue
-        if blanked and min(error_m for error_m, _ in row["errors"]) < NEAR_M:
-            continue
-        right = [
-            k
-            for k, (error_m, error_rad) in enumerate(row["errors"])
-            if own and not blanked and error_m <= RIGHT_M and error_rad <= RIGHT_RAD
-        ]
+        right = (error_m <= RIGHT_M and error_rad <= RIGHT_RAD for error_m, error_rad in errors)
         yield Known(
-            kind="place blanked" if blanked else "in its own building" if own else "in another building",
-            buildings=frozenset(PARTS_OF.get(row[name], row[name]) for name in ("log", "map")),
+            kind=KINDS[row["place"]],
+            buildings=frozenset((row["log"], row["map"])),
             session=f"{row['log']} {row['start']}",
             places=tuple(Evidence(**evidence) for evidence in row["evidence"]),
-            first=right[0] if right else None,
+            first=next((k for k, is_right in enumerate(right) if is_right), None) if own else None,
         )
 
 
@@ -174,19 +173,9 @@ def log_loss(answers: Sequence[Known], probabilities: F64) -> float:
     return float(-np.log(np.clip(np.where(right, probabilities, 1.0 - probabilities), 1e-4, 1.0)).mean())
 
 
-def roc_area(answers: Sequence[Known], probabilities: F64) -> float:
-    """Area under the ROC curve: how often a right answer is surer than a wrong one; 0.5 is chance."""
-    right = np.array([answer.right for answer in answers])
-    statistic = mannwhitneyu(probabilities[right], probabilities[~right], method="asymptotic").statistic
-    return float(statistic / (right.sum() * (~right).sum()))
-
-
-def main() -> None:
-    """Fit, judge and print."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("files", type=Path, nargs="+")
-    known = [k for file in parser.parse_args().files for k in known_of(json.loads(file.read_text()))]
+def main(files: list[Path]) -> None:
+    """Fit, judge and print. FILES: what `recorded_queries` has written."""
+    known = [k for file in files for k in known_of(json.loads(file.read_text()))]
     for buildings in {k.buildings for k in known}:
         if len({k.first is None for k in known if not k.buildings & buildings}) < 2:
             raise SystemExit(
@@ -201,23 +190,22 @@ def main() -> None:
 
 def print_judged(known: Sequence[Known], name: str, probabilities: F64) -> None:
     """Print how good the probabilities (N,) are, and what is located by them, by kind of query."""
-    accept = Config().relocalize.accept
-    counts = Counter((k.kind, k.right, bool(p >= accept)) for k, p in zip(known, probabilities, strict=True))
+    located = [k for k, p in zip(known, probabilities, strict=True) if p >= Config().relocalize.accept]
+    asked, found = (Counter((k.kind, k.right) for k in some) for some in (known, located))
     for kind in sorted({k.kind for k in known}):
-        right, wrong = (counts[kind, is_right, True] for is_right in (True, False))
-        all_right = right + counts[kind, True, False]
-        answers = all_right + wrong + counts[kind, False, False]
-        print(f"{name}, {kind}: of {answers} located {right} of {all_right} right ones, {wrong} wrong ones")
+        print(
+            f"{name}, {kind}: of {asked[kind, True] + asked[kind, False]} located {found[kind, True]} of"
+            f" {asked[kind, True]} right ones, {found[kind, False]} wrong ones"
+        )
     # Windows of one drive depend on each other: a drive with a wrong answer counts once.
-    located = {k.session for k, p in zip(known, probabilities, strict=True) if p >= accept}
-    wrong_in = {k.session for k, p in zip(known, probabilities, strict=True) if p >= accept and not k.right}
-    least, most = clopper_pearson(len(wrong_in), len(located), 0.1) if located else (0.0, 1.0)
+    drives, wrong_in = {k.session for k in located}, {k.session for k in located if not k.right}
+    least, most = clopper_pearson(len(wrong_in), len(drives), 0.1) if drives else (0.0, 1.0)
     print(
         f"{name}: log loss {log_loss(known, probabilities):.4f}, area under the ROC curve"
-        f" {roc_area(known, probabilities):.4f}, wrong in {len(wrong_in)} of {len(located)} drives"
-        f" (90 %: {least:.2%} to {most:.2%})"
+        f" {roc_auc_score([k.right for k in known], probabilities):.4f}, wrong in {len(wrong_in)} of"
+        f" {len(drives)} drives (90 %: {least:.2%} to {most:.2%})"
     )
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

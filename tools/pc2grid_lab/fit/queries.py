@@ -7,7 +7,7 @@ queries are its later parts, registered as a user's would be. DATA holds `laser/
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,31 +37,20 @@ def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
     return replace(plan, cells=cells)
 
 
-def queries_of(
-    session: RegisteredSession, config: Config, travels_m: Sequence[float] = TRAVELS_M
-) -> Iterator[tuple[float, QueryMap, SE2]]:
-    """The query after each of `travels_m`: metres, what has been seen, and its true frame in the plan.
+def queries_of(session: RegisteredSession, config: Config) -> Iterator[tuple[QueryMap, SE2]]:
+    """The query after each of `TRAVELS_M`: what has been seen, and its true frame in the plan.
 
     Without those whose true pose is not known.
     """
-    query = Query(config, config.relocalize)
-    path_m = session.path_m()
-    due = sorted(d for d in travels_m if len(path_m) and d <= path_m[-1])
+    query, path_m = Query(config, config.relocalize), session.path_m()
+    asked_after = np.array([np.argmax(path_m >= d) for d in TRAVELS_M if d <= path_m.max(initial=0.0)])
     for number, (registered, planar_scan, _) in enumerate(session.scans()):
         if not session.lost[number]:
             query.add(registered, planar_scan)
-        while due and path_m[number] >= due[0]:
-            truth = session.T_world_base[: number + 1]
-            if not np.all(session.lost[: number + 1]) and not np.isnan(truth).all():
-                so_far = replace(
-                    session,
-                    planar_scans=session.planar_scans[: number + 1],
-                    T_odom_base=session.T_odom_base[: number + 1],
-                    lost=session.lost[: number + 1],
-                    T_world_base=truth,
-                )
-                yield due[0], query.map(), so_far.T_world_odom()
-            del due[0]
+        so_far = session.first(number + 1)
+        for _ in np.flatnonzero(asked_after == number):
+            if not so_far.lost.all() and not np.isnan(so_far.T_world_base).all():
+                yield query.map(), so_far.T_world_odom()
 
 
 MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}

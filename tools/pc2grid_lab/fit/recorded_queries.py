@@ -1,6 +1,6 @@
 """The windows of `pc2grid compare recordings`, asked once more: what tells for each place that is found.
 
-    python -m pc2grid_lab.fit.recorded_queries DATA WORK OUT.json [--everywhere]
+    python -m pc2grid_lab.fit.recorded_queries DATA WORK OUT.json [--only PATTERN] [--everywhere]
 
 DATA is the folder of recordings, WORK the one in which `compare recordings` has kept its maps and answers.
 Each window is asked in its map and in that of another building, with --everywhere in those of seven or eight;
@@ -10,18 +10,19 @@ last scan alone. `posterior` fits the posterior to them.
 
 from __future__ import annotations
 
-import argparse
+import functools
 import json
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+import typer
 
 from pc2grid.errors import Pc2GridError
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
-from pc2grid.model import OccupancyGrid
 from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.answers import unseen_by
@@ -31,7 +32,7 @@ from pc2grid_lab.experiments.recordings.drive import config_of
 from pc2grid_lab.experiments.recordings.judging import Judge
 from pc2grid_lab.experiments.recordings.run import Folder
 from signature.config import Config
-from signature.database import SubmapDatabase, open_database
+from signature.database import open_database
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import evidence_of, tail_of
@@ -93,73 +94,71 @@ def rows(
         yield row | {"place": "blanked"} | _asked(_blanked(index, window), window.whole, window.truth)
 
 
-def _asked(index: MapIndex, query: QueryMap, truth: dict[str, SE2]) -> dict[str, Any]:
+def _asked(index: MapIndex, query: QueryMap, truth: Mapping[str, SE2]) -> dict[str, Any]:
+    """What tells for each place that is found, for the best one with what its last scans tell, and how far it
+    is from the truth."""
     found = index.search_whole_maps(query, index.look_up(query))
-    errors = []
-    for h in found:
-        expected = truth.get(index.sessions[h.session_index])
-        at = h.fit.T_map_query @ query.T_odom_base
-        errors.append((math.inf, math.pi) if expected is None else apart(expected, at))
-    return {"evidence": evidence_list(index, query, found), "errors": errors}
-
-
-def evidence_list(index: MapIndex, query: QueryMap, found: tuple[Hypothesis, ...]) -> list[dict[str, Any]]:
-    """What tells for each hypothesis, and for the best one, what its last scans tell."""
     evidence = list(evidence_of([h.fit for h in found], query))
     if found:
         walls = index.maps[found[0].session_index].walls
         tail = tail_of(query, found[0].fit, walls, index.config.step_m)
         evidence[0] = replace(evidence[0], tail=tail)
-    return [asdict(one) for one in evidence]
+    errors = [error_of(index, query, h, truth) for h in found]
+    return {"evidence": list(map(asdict, evidence)), "errors": errors}
+
+
+def error_of(
+    index: MapIndex, query: QueryMap, place: Hypothesis, truth: Mapping[str, SE2]
+) -> tuple[float, float]:
+    """Metres and radians of a place from the truth, of which there is none in the sessions without a pose."""
+    expected = truth.get(index.sessions[place.session_index])
+    if expected is None:
+        return math.inf, math.pi
+    return apart(expected, place.fit.T_map_query @ query.T_odom_base)
 
 
 def _blanked(index: MapIndex, window: Window) -> MapIndex:
     """The index with all that the window sees made unknown."""
     query, grids = window.whole, dict(zip(index.sessions, index.grids, strict=True))
-    blank: dict[str, OccupancyGrid] = {
-        name: unseen_by(query, grid, window.truth[name] @ query.T_odom_base.inverse())
-        if name in window.truth
-        else grid
-        for name, grid in grids.items()
-    }
-    config = Config(relocalize=index.config)
-    return MapIndex(blank, index.places.table, index.made_with, config)
+    for name, T_map_base in window.truth.items():
+        grids[name] = unseen_by(query, grids[name], T_map_base @ query.T_odom_base.inverse())
+    return MapIndex(grids, index.places.table, index.made_with, Config(relocalize=index.config))
 
 
-def main() -> None:
-    """Collect the evidence."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("data", type=Path)
-    parser.add_argument("work", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--only", help="of these recordings, buildings or kinds of pairs only, a pattern")
-    parser.add_argument("--everywhere", action="store_true", help="ask in all other buildings, not in one")
-    options = parser.parse_args()
-    folder = Folder(options.data.resolve(), options.work.resolve())
-    catalogue = Catalogue.of(only=options.only)
-    opened: dict[str, tuple[SubmapDatabase, MapIndex]] = {}
+@functools.cache
+def index_of(database: Path) -> MapIndex:
+    """The maps of a database, which stays open: they are read when they are first used."""
+    opened = open_database(database)
+    return MapIndex.of(opened, opened.config())
 
-    def index_of(name: str) -> MapIndex:
-        if name not in opened:
-            database = open_database(folder.map(name))
-            opened[name] = database, MapIndex.of(database, database.config())
-        return opened[name][1]
 
+Only = Annotated[str | None, typer.Option(help="of recordings, buildings or kinds of pairs, such as 'wean*'")]
+
+
+def main(
+    data: Path,
+    work: Path,
+    out: Path,
+    only: Only = None,
+    everywhere: Annotated[
+        bool, typer.Option("--everywhere", help="in all other buildings, not in one")
+    ] = False,
+) -> None:
+    """Collect the evidence of the windows of `compare recordings`, whose DATA and WORK these are."""
+    folder, catalogue = Folder(data.resolve(), work.resolve()), Catalogue.of(only=only)
+    building = {name: r.building for name, r in catalogue.recordings.items()}
     collected: list[dict[str, Any]] = []
     for number, window in enumerate(windows(catalogue, folder)):
-        of = {catalogue.recordings[name].building for name in (window.pair.query, window.pair.map)}
-        others = [n for n in OTHERS if catalogue.recordings[n].building not in of and folder.map(n).exists()]
+        of = (building[window.pair.query], building[window.pair.map])
+        others = [name for name in OTHERS if building[name] not in of and folder.map(name).exists()]
         if not others:
             raise SystemExit(f"{folder.work}: holds no map of another building")
-        chosen = others if options.everywhere else [others[number % len(others)]]
-        indices = {name: index_of(name) for name in chosen}
-        collected.extend(rows(window, index_of(window.pair.map_name), indices, catalogue))
-        options.out.write_text(json.dumps(collected))
+        chosen = others if everywhere else [others[number % len(others)]]
+        elsewhere = {name: index_of(folder.map(name)) for name in chosen}
+        collected.extend(rows(window, index_of(folder.map(window.pair.map_name)), elsewhere, catalogue))
+        out.write_text(json.dumps(collected))
         print(window.pair.query, "in", window.pair.map_name, f"{window.span.start_s:.1f} s", flush=True)
-    for database, _ in opened.values():
-        database.close()
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

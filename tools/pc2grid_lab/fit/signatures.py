@@ -6,23 +6,22 @@ variation within one place is kept; the rest, the variation between places and t
 logs. Pairs are views of later parts of a log, and the same points of a map of its first part; other
 places are those of the other logs' maps, of drawn maps, and of office floors.
 
-    python -m pc2grid_lab.fit.signatures DATA SIMULATED.npz OUT.npz [--without csail] [--maps aces,...]
+    python -m pc2grid_lab.fit.signatures DATA SIMULATED.npz OUT.npz [--logs csail,...] [--maps aces,...]
 
 The weights of the signatures of places, by which the first look is taken, are learned from the same logs, and
 from the place of the map that is nearest to each view; they are written to OUT.places.npz.
 
-DATA is as of `queries`; with `maps/NAME.yaml`, maps of buildings without queries. The building that is
-to be judged is left out by --without; `retrieval` judges.
+DATA is as of `queries`; with `maps/NAME.yaml`, maps of buildings without queries.
 """
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import typer
 from scipy.spatial import cKDTree
 
 from pc2grid.geometry import SE2
@@ -54,7 +53,7 @@ def pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], confi
         for name, (grid, driven) in logs.items():
             own = SensorMap(name=name, sensor="laser", index=index_of(name, grid, config), T_plan_map=SE2())
             for session in driven:
-                for _, query, T_map_query in queries_of(session, config):
+                for query, T_map_query in queries_of(session, config):
                     yield query, T_map_query, [own]
 
     return pairs_of(asked(), [*floors, *(grid for grid, _ in logs.values())], config)
@@ -68,7 +67,7 @@ def place_pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid],
     for name, (_, driven) in logs.items():
         tree, rows = cKDTree(maps[name].center_m), table_rows(maps[name])
         for session in driven:
-            for _, query, T_map_query in queries_of(session, config):
+            for query, T_map_query in queries_of(session, config):
                 if query.views:
                     views_m = T_map_query.apply(np.array([view.center_m for view in query.views]))
                     distance_m, nearest = tree.query(views_m)
@@ -95,35 +94,26 @@ def statistics_of(pairs: Pairs, simulated: SeenStatistics) -> SeenStatistics:
     return replace(mixed, spreads=fitted_spreads(mixed, pairs))
 
 
-def main() -> None:
-    """Learn and store the statistics."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("data", type=Path)
-    parser.add_argument("simulated", type=Path)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("--without", default="")
-    parser.add_argument("--logs", default=",".join(MAPPED_S))
-    parser.add_argument("--maps", default="aces,workshop_1")
-    parser.add_argument("--queries", type=int, default=24)
-    options = parser.parse_args()
-    config, kept = Config(), options.out.parent / "drives"
+def main(
+    data: Path,
+    simulated: Path,
+    out: Path,
+    logs: str = ",".join(MAPPED_S),
+    maps: str = "aces,workshop_1",
+    queries: int = 24,
+) -> None:
+    """Learn and store the statistics: of viewpoints in OUT.npz, of places in OUT.places.npz."""
+    config, kept = Config(), out.parent / "drives"
     kept.mkdir(parents=True, exist_ok=True)
-    names = [name for name in options.logs.split(",") if name != options.without]
-    logs = {name: read(options.data, name, options.queries, kept, config) for name in names}
-    floors = [
-        load_map(options.data / "maps" / f"{name}.yaml")
-        for name in options.maps.split(",")
-        if name and name != options.without
-    ]
+    drawn = {name: read(data, name, queries, kept, config) for name in logs.split(",")}
+    floors = [load_map(data / "maps" / f"{name}.yaml") for name in maps.split(",")]
     floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
-    pairs = pairs_of_logs(logs, floors, config)
-    statistics_of(pairs, SeenStatistics.load(options.simulated)).save(options.out)
-    of_places = place_statistics_of(place_pairs_of_logs(logs, floors, config), config)
-    of_places.save(options.out.with_suffix(".places.npz"))
-    print(f"{options.out}: learned from {len(pairs.queries):,} pairs and {len(pairs.other):,} other places")
+    pairs = pairs_of_logs(drawn, floors, config)
+    statistics_of(pairs, SeenStatistics.load(simulated)).save(out)
+    of_places = place_statistics_of(place_pairs_of_logs(drawn, floors, config), config)
+    of_places.save(out.with_suffix(".places.npz"))
+    print(f"{out}: learned from {len(pairs.queries):,} pairs and {len(pairs.other):,} other places")
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)

@@ -10,11 +10,13 @@ and intel; `signatures` takes a fifth of the variation within one place from the
 
 from __future__ import annotations
 
-import argparse
 import itertools
 from collections.abc import Iterator, Mapping
 from functools import partial
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
@@ -51,34 +53,32 @@ def asked(
         maps = [drives.read_map(name, sensor) for sensor in SENSORS]
         for sensor, seed in itertools.product(SENSORS, range(1, queries + 1)):
             session = drives.drive(name, partial(plans.__getitem__, name), sensor, seed)
-            for _, query, T_plan_query in queries_of(session, config):
+            for query, T_plan_query in queries_of(session, config):
                 yield query, T_plan_query, maps
             print(f"{name}, {sensor}, {seed}", flush=True)
 
 
-def main() -> None:
-    """Learn and store the statistics."""
-    raw = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=raw)
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("plans", nargs="+")
-    parser.add_argument("--queries", type=int, default=6)
-    options = parser.parse_args()
+def main(
+    folder: Path,
+    plan: Annotated[list[str], typer.Argument(help="MAP.yaml or office:SEED")],
+    queries: int = 6,
+) -> None:
+    """Learn and store the statistics, in FOLDER/simulated.npz."""
     for kind in ("maps", "drives"):
-        (options.folder / kind).mkdir(parents=True, exist_ok=True)
+        (folder / kind).mkdir(parents=True, exist_ok=True)
     drives = PlanDrives(
-        out=options.folder,
+        out=folder,
         setting=tuple(_SETTING.items()),
         until_m=TRAVELS_M[-1] + 0.5,
         length_m=TRAVELS_M[-1] + 3.0,
     )
-    plans = {Path(name.replace(":", "")).stem: plan_of(name) for name in options.plans}
+    plans = {Path(name.replace(":", "")).stem: plan_of(name) for name in plan}
     floors = [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
-    pairs = pairs_of(asked(plans, drives, options.queries, Config()), floors, Config())
-    out = options.folder / "simulated.npz"
+    pairs = pairs_of(asked(plans, drives, queries, Config()), floors, Config())
+    out = folder / "simulated.npz"
     SeenStatistics.of(pairs).save(out)
     print(f"{out}: learned from {len(pairs.queries):,} pairs")
 
 
 if __name__ == "__main__":
-    main()
+    typer.run(main)
