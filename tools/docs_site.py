@@ -153,38 +153,29 @@ def _shown(output: dict[str, Any]) -> str:
     return "```text\n" + "".join(data["text/plain"]).strip() + "\n```"
 
 
-_PARAMETER = re.compile(r"^((?:\w+(?: \([^)]*\))?)(?:, \w+(?: \([^)]*\))?)*) : (.*)$")
+_EXAMPLE = re.compile(r"^(>>> .*(?:\n.*\S.*)*)", re.MULTILINE)
+"""Up to the next empty line."""
+_NAMES = r"\w+(?: \([^)]*\))?(?:, \w+(?: \([^)]*\))?)*"
+_PARAMETER = re.compile(rf"^({_NAMES}) : (.*)$", re.MULTILINE)
 """A line such as `stamp_ns : when the scan was taken`."""
+_PARAMETERS = re.compile(rf"(?:^{_NAMES} : .*\n?(?:    .*\n?)*)+", re.MULTILINE)
+_TITLE = re.compile(r"^(.*\S.*)\n-{3,}$", re.MULTILINE)
+_BEFORE_INDENTED = re.compile(rf"^(?!{_NAMES} : )(\S.*)\n(?=    )", re.MULTILINE)
 
 
 def as_markdown(docstring: str) -> str:
     """A docstring of this project as Markdown: its examples as code, its parameters as a list."""
-    out: list[str] = []
-    state = "text"
-    for line in docstring.splitlines():
-        parameter = _PARAMETER.match(line)
-        if state == "example" and not line.strip():
-            out.append("```")
-            state = "text"
-        elif state != "example" and line.startswith(">>> "):
-            out += ["", "```pycon"]
-            state = "example"
-        elif state != "example" and parameter:
-            if state == "text":
-                out.append("")
-            out.append(f"- `{parameter[1]}`: {parameter[2]}")
-            state = "list"
-            continue
-        elif state == "list" and not line.startswith("    "):
-            out.append("")
-            state = "text"
-        elif re.fullmatch(r"-{3,}", line):  # under the title of a section
-            out[-1] = f"**{out[-1]}**"
-            continue
-        elif state == "text" and line.startswith("    ") and out and out[-1].strip() and out[-1][0] != " ":
-            out.append("")  # what is indented is set as it stands
-        out.append(line)
-    return "\n".join((*out, "```")) if state == "example" else "\n".join(out)
+    parts = _EXAMPLE.split(docstring)
+    parts[::2] = [_text_as_markdown(text) for text in parts[::2]]
+    parts[1::2] = [f"\n```pycon\n{example}\n```" for example in parts[1::2]]
+    return "".join(parts)
+
+
+def _text_as_markdown(text: str) -> str:
+    text = _TITLE.sub(r"**\1**", text)
+    text = _BEFORE_INDENTED.sub(r"\1\n\n", text)  # what is indented is set as it stands
+    text = _PARAMETERS.sub(lambda block: f"\n{block[0]}\n", text)
+    return _PARAMETER.sub(r"- `\1`: \2", text)
 
 
 class Docstrings(griffe.Extension):
