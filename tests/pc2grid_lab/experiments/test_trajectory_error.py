@@ -44,5 +44,4 @@ def test_lost_poses_are_not_judged_and_truth_is_interpolated_but_not_over_gaps()
     assert trajectory_error(truth, sparse).poses == 59  # not past the end
     gap = Trajectory(stamps_ns=truth.stamps_ns[::20], T_session_base=truth.T_session_base[::20])
     assert trajectory_error(truth, gap).poses == 3
-    with pytest.raises(ValueError, match="fewer than three"):
-        trajectory_error(trajectory(bend(2)), truth)
+    assert trajectory_error(trajectory(bend(2)), truth) is None

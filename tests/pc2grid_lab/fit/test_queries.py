@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pc2grid.geometry import SE2
-from pc2grid_lab.experiments.sensor_matrix import SensorMap
-from pc2grid_lab.fit.queries import office_floor
-from pc2grid_lab.fit.seen_pairs import pairs_of
+from pc2grid_lab.fit.queries import office_floor, pairs_of
 from signature.config import Config
 from signature.localization.query import Query
 from tests.helpers.simulated_drives import building, drive, office
@@ -22,8 +20,7 @@ def test_a_view_of_a_query_is_like_what_the_map_shows_there() -> None:
         first = first or truth
         window.add(registered, planar_scan)
     assert first is not None
-    own = SensorMap(name="office", sensor="laser", T_plan_map=SE2(), index=OFFICE)
-    pairs = pairs_of([(window.map(), first, [own])], [office_floor(1)], Config())
+    pairs = pairs_of([(window.map(), first, [(office(), SE2())])], [office_floor(1)], Config())
     assert pairs.queries.shape == pairs.same.shape and len(pairs.queries) >= 8
     one = np.linalg.norm(pairs.queries - pairs.same, axis=1)
     two = np.linalg.norm(pairs.queries[:, None] - pairs.other[None], axis=2)

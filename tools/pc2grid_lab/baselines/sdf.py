@@ -48,13 +48,12 @@ class DistanceFeatures:
 
     max_keypoints : the most curved ones are kept (200: paper IV-A).
     smooth_m : standard deviation of the Gaussian on D before it is differentiated, as creases have no
-        finite curvature.
-    apart_m : a keypoint is the most curved place within this distance.
+        finite curvature; and the step of the samples in a window.
+    apart_m : a keypoint is the most curved place within this distance. Matched keypoints this near to each
+        other after a motion agree with it.
     orient_m : radius in which the keypoint's own direction is found.
     window_m : half the width of the square that is described.
-    sample_m : step of the samples in it.
     distance_weight : of the mean distance in metres against the orientation part of length 1.
-    inlier_m : matched keypoints this near to each other after the motion agree with it.
     iterations : pairs of matches that RANSAC tries for each submap.
     """
 
@@ -63,9 +62,7 @@ class DistanceFeatures:
     apart_m: float = 0.25
     orient_m: float = 1.0
     window_m: float = 1.2
-    sample_m: float = 0.1
     distance_weight: float = 0.5
-    inlier_m: float = 0.25
     iterations: int = 400
 
     def fit(self, submaps: Sequence[Submap]) -> _FeatureTable:
@@ -87,7 +84,7 @@ class DistanceFeatures:
         keypoints = self._keypoints(distance, submap)
         gradient_y, gradient_x = (np.asarray(g, np.float32) for g in np.gradient(distance, resolution))
         directions = _directions(keypoints, gradient_x, gradient_y, self.orient_m / resolution)
-        window, step = self.window_m / resolution, self.sample_m / resolution
+        window, step = self.window_m / resolution, self.smooth_m / resolution
         shares = _orientation_shares(keypoints, directions, gradient_x, gradient_y, window, step)
         mean_m = _mean_distances(keypoints, directions, distance, window, step)
         descriptors = np.column_stack((shares, self.distance_weight * mean_m)).astype(np.float32)
@@ -138,7 +135,7 @@ class _FeatureTable:
     def _agreeing(self, wanted: Features, matches: I64, matched: BoolGrid) -> int:
         """How many of the matches of the wanted keypoints one rigid motion explains."""
         return _consensus(
-            wanted.places_m[matched], self.places_m[matches], self.method.inlier_m, self.method.iterations
+            wanted.places_m[matched], self.places_m[matches], self.method.apart_m, self.method.iterations
         )
 
 

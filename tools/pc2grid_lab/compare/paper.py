@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,15 +14,13 @@ from pc2grid_cli.console import json_text, of
 from pc2grid_cli.output_files import make_folder
 from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
 from pc2grid_lab.compare import options as options
-from pc2grid_lab.compare.paper_report import draw_figure, print_tables, published
+from pc2grid_lab.compare.paper_report import draw_figure, print_tables
 from pc2grid_lab.experiments.paper_task import (
     ABLATION,
     OPEN_CHOICES,
-    PaperCell,
+    cells_of,
     known_maps,
-    load_results,
     paper_tasks,
-    run_task,
 )
 from pc2grid_lab.experiments.program import BACK, FRONT, LABORATORY, digest_of_sources
 from pc2grid_lab.experiments.stored import in_processes, write_text
@@ -71,42 +70,33 @@ def compare_paper_command(
 
     Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
     """
-    chosen, offsets_m = _chosen(methods), _offsets(offset)
+    chosen, offsets_m = _chosen(methods), tuple(offset or (1.0, 0.5))
+    if min(offsets_m) <= 0:
+        raise ConfigError("--offset: expected a distance above 0 m")
     found = known_maps(maps)
     if not found:
         raise MapFileError(
             f"{maps}: no map is here", hint="a map.yaml, or a folder with intel.yaml, fr079.yaml, ..."
         )
-    images = [file for path in found for file in path.parent.glob(f"{path.stem}.*")]
-    cells = out / "cells" / digest_of_sources((FRONT, BACK, LABORATORY, *sorted(images)))
-    make_folder(out / "cells")
-    make_folder(cells)
+    make_folder(out)
     choices = (ABLATION if ablation else ()) + (OPEN_CHOICES if open_choices else ())
     setting: dict[str, Any] = {"queries": queries, "seed": seed, "speckle_sigma_m": speckles}
     tasks = list(paper_tasks(found, methods=chosen, offsets_m=offsets_m, choices=choices, **setting))
-    waiting = [(task, cells) for task in tasks if len(load_results(task, cells)) < len(task.methods)]
-    if waiting:
-        with of(context).progress(f"{len(waiting)} cells of the tables") as advance:
-            in_processes(run_task, waiting, jobs=jobs, advance=advance)
-    results = [cell for task in tasks for cell in load_results(task, cells)]
-    rows = [cell.summary() | {"published": _figures(cell)} for cell in results]
-    write_text(out / "results.json", json_text({**setting, "cells": rows}) + "\n")
+    with of(context).progress(f"{len(tasks)} cells of the tables") as advance:
+        kept = _kept_in(out, found)
+        cells = in_processes(cells_of, [(task, kept) for task in tasks], jobs=jobs, advance=advance)
+    results = list(itertools.chain.from_iterable(cells))
+    document = {**setting, "cells": [cell.summary() for cell in results]}
+    write_text(out / "results.json", json_text(document) + "\n")
     pictures = [draw_figure(results, offset_m, out) for offset_m in offsets_m]
     print_tables(results, chosen)
     print(f"written: {out / 'results.json'}, {', '.join(map(str, pictures))}")
 
 
-def _figures(cell: PaperCell) -> dict[str, float] | None:
-    """What the paper has published for a cell."""
-    paper = published(cell)
-    return None if paper is None else paper._asdict()
-
-
-def _offsets(offset: Sequence[float] | None) -> tuple[float, ...]:
-    offsets_m = tuple(offset or (1.0, 0.5))
-    if min(offsets_m) <= 0:
-        raise ConfigError("--offset: expected a distance above 0 m")
-    return offsets_m
+def _kept_in(out: Path, maps: Sequence[Path]) -> Path:
+    """The folder of the results of these sources and these maps."""
+    images = [file for path in maps for file in path.parent.glob(f"{path.stem}.*")]
+    return out / "cells" / digest_of_sources((FRONT, BACK, LABORATORY, *sorted(images)))
 
 
 def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:

@@ -7,25 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+from rich.table import Table
 
 from pc2grid.arrays import F64
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.experiments.paper_experiment import MatchMeasures
-from pc2grid_lab.experiments.paper_tables import MAPS, SUBMAPS, TABLE_3, TABLE_4, Measures
+from pc2grid_lab.experiments.paper_tables import SUBMAPS, Measures
 from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, RADII_M, PaperCell, SettingChoice
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
-
-
-def published(cell: PaperCell) -> Measures | None:
-    """The published number for a cell; None if there is none."""
-    task = cell.task
-    if task.overrides or task.map_name not in MAPS:
-        return None
-    if task.radius_m == 8.0:
-        return TABLE_3[task.level].get(cell.method, {}).get(task.map_name)
-    return TABLE_4[int(task.radius_m)].get(task.map_name)
 
 
 def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
@@ -45,36 +36,44 @@ def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
         plain = [r for r in of_offset if r.is_plain]
         where = f"queries within {offset_m:g} m of a submap centre"
         for measure in MatchMeasures._fields:
-            title = "R@1" if measure == "r_at_1" else measure.upper()
-            shown = table(f"Table III, {title}, {where}", ("noise", "method"), maps)
-            for level, method in itertools.product(range(len(_LEVELS)), methods):
-                row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == (method, level, 8.0)]
-                shown.add_row(str(level), method, *_cells(row, maps, measure))
-            show(shown)
-        shown = table(f"Table IV (proposed, noise level 1), {where}", ("radius", "measure"), maps)
-        for radius_m, measure in itertools.product(RADII_M, Measures._fields):
-            row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == ("proposed", 1, radius_m)]
-            shown.add_row(f"{radius_m:g} m", measure.upper(), *_cells(row, maps, measure))
-        show(shown)
+            show(_table_3(plain, maps, methods, measure, where))
+        show(_table_4(plain, maps, where))
         _print_choices(of_offset, maps, f"What each signature adds: {where}", ABLATION)
         _print_choices(of_offset, maps, f"What other choices move: {where}", OPEN_CHOICES)
 
 
+def _table_3(
+    plain: Sequence[PaperCell], maps: Sequence[str], methods: Sequence[str], measure: str, where: str
+) -> Table:
+    title = "R@1" if measure == "r_at_1" else measure.upper()
+    shown = table(f"Table III, {title}, {where}", ("noise", "method"), maps)
+    for level, method in itertools.product(range(len(_LEVELS)), methods):
+        row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == (method, level, 8.0)]
+        shown.add_row(str(level), method, *_cells(row, maps, measure))
+    return shown
+
+
+def _table_4(plain: Sequence[PaperCell], maps: Sequence[str], where: str) -> Table:
+    shown = table(f"Table IV (proposed, noise level 1), {where}", ("radius", "measure"), maps)
+    for radius_m, measure in itertools.product(RADII_M, Measures._fields):
+        row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == ("proposed", 1, radius_m)]
+        shown.add_row(f"{radius_m:g} m", measure.upper(), *_cells(row, maps, measure))
+    return shown
+
+
 def _cells(row: Sequence[PaperCell], maps: Sequence[str], measure: str) -> list[str]:
     """A text for each map."""
-    texts, by_map = [], {r.task.map_name: r for r in row}
-    for name in maps:
-        if name not in by_map:
-            texts.append("")
-            continue
-        cell = by_map[name]
-        ours, paper = round(1000 * getattr(cell.measures, measure)), published(cell)
-        spread = f" +-{round(1000 * getattr(cell.half_widths, measure)):<2d}"
-        there = None if paper is None or measure == "r_at_1" else round(1000 * getattr(paper, measure))
-        texts.append(
-            f"{ours}{spread}" if there is None else f"{there:3d} {ours:4d} {ours - there:+4d}{spread}"
-        )
-    return texts
+    by_map = {r.task.map_name: r for r in row}
+    return [_cell(by_map[name], measure) if name in by_map else "" for name in maps]
+
+
+def _cell(cell: PaperCell, measure: str) -> str:
+    ours = round(1000 * getattr(cell.measures, measure))
+    spread = f"+-{round(1000 * getattr(cell.half_widths, measure)):<2d}"
+    if cell.published is None or measure == "r_at_1":
+        return f"{ours} {spread}"
+    there = round(1000 * getattr(cell.published, measure))
+    return f"{there:3d} {ours:4d} {ours - there:+4d} {spread}"
 
 
 def _print_choices(

@@ -15,13 +15,13 @@ from pc2grid.errors import ConfigError
 from pc2grid_cli import console
 from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
+from pc2grid_lab.experiments.program import commit, digest_of_product
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.changes import changes
 from pc2grid_lab.experiments.recordings.judging import judged_table
-from pc2grid_lab.experiments.recordings.kidnaps import followed_in, task
+from pc2grid_lab.experiments.recordings.kidnaps import followed_in, tasks
 from pc2grid_lab.experiments.recordings.own import own_recordings, state_of
 from pc2grid_lab.experiments.recordings.page import change_lines, page
-from pc2grid_lab.experiments.recordings.program import commit, digest
 from pc2grid_lab.experiments.recordings.rows import Table
 from pc2grid_lab.experiments.recordings.run import Folder, run_all
 from pc2grid_lab.experiments.stored import write_text
@@ -75,7 +75,7 @@ def compare_recordings_command(
         raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
     own = own_recordings(data, without=out, of_base=of_base)
     catalogue = _catalogue(data, own, only, quick)
-    work = out / "work" / (digest() + state_of(data, own[0]))
+    work = out / "work" / (digest_of_product() + state_of(data, own[0]))
     make_folder(work)
     _remove_others(work)
     folder = Folder(data.absolute(), work.absolute(), shortlist)
@@ -85,20 +85,21 @@ def compare_recordings_command(
         raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
     terminal = console.of(context)
     with terminal.progress("recordings") as advance, _note_kept(terminal, out):
-        run_all(
-            catalogue,
-            folder,
-            mapped={name for one in followed for name in (one.before, one.map)},
-            further=[task(catalogue, folder, one) for one in followed],
-            jobs=jobs,
-            advance=advance,
-        )
+        mapped, further = tasks(catalogue, folder, followed)
+        run_all(catalogue, folder, mapped=mapped, further=further, jobs=jobs, advance=advance)
     with terminal.progress("judge") as advance:
-        found = judged_table(catalogue, folder, followed, program=digest(), commit=commit(), advance=advance)
-    kept = table or out / "real.json"
+        found = judged_table(
+            catalogue, folder, followed, program=digest_of_product(), commit=commit(), advance=advance
+        )
+    is_whole = only is None and not quick and not is_control
+    _tell(found, table or out / "real.json", replace=is_whole)
+
+
+def _tell(found: Table, kept: Path, *, replace: bool) -> None:
+    """Print a table and what changed since the one that is kept. replace : whether it is then kept itself."""
     before = _read(kept)
     changed = [] if before is None else changes(before, found)
-    if only is None and not quick and not is_control:
+    if replace:
         write_text(kept, found.to_text())
         write_text(kept.with_suffix(".md"), page(found, changed))
     print(page(found))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
-from functools import cache, partial
+from functools import cache
 from itertools import product
 from pathlib import Path
 from typing import Annotated
@@ -20,9 +19,11 @@ from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.picture import picture
-from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, query_trials
-from pc2grid_lab.experiments.stored import in_processes, write_text
+from pc2grid_lab.experiments.answers import index_of
+from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, SensorMap, query_trials
+from pc2grid_lab.experiments.stored import in_processes, once, write_text
 from pc2grid_lab.experiments.trial import MatrixCell, Trial, matrix, reliability
+from signature.config import Config
 from signature.localization.shown.picture import BLUE, ORANGE, VERMILLION
 
 
@@ -50,8 +51,7 @@ def compare_sensors_command(
     Example: pc2grid compare sensors maps/fr079.yaml maps/intel.yaml --queries 40 --out matrix
     """
     _refuse(plans)
-    for folder in ("", "maps", "drives", "trials"):
-        make_folder(out / folder)
+    make_folder(out)
     setting: dict[str, float] = {"map_length": map_length, "clutter": clutter, "rate": rate, "travel": travel}
     drives = PlanDrives(out=out, setting=tuple(setting.items()), until_m=travel, length_m=travel + 3.0)
     trials = _asked(drives, plans, range(seed, seed + queries), of(context), jobs)
@@ -76,15 +76,13 @@ def compare_sensors_command(
 def _asked(
     drives: PlanDrives, plans: Sequence[Path], seeds: Sequence[int], terminal: Console, jobs: int | None
 ) -> list[Trial]:
-    """The trials of all query sessions, after the maps are made and the sessions driven."""
-    sessions = [(drives, plan, sensor, seed) for seed in seeds for plan in plans for sensor in SENSORS]
-    for what, function, tasks in (
-        ("map", _map, [(drives, plan, sensor) for plan in plans for sensor in SENSORS]),
-        ("drive", _drive, sessions),
-        ("locate", _locate, [(*task, plans) for task in sessions]),
-    ):
-        with terminal.progress(what) as advance:
-            found = in_processes(function, tasks, jobs=jobs, advance=advance)
+    """The trials of all query sessions, after the maps are made."""
+    with terminal.progress("map") as advance:
+        mapped = [(drives, *one) for one in product(plans, SENSORS)]
+        in_processes(_map, mapped, jobs=jobs, advance=advance)
+    with terminal.progress("locate") as advance:
+        asked = [(drives, *one, plans) for one in product(seeds, plans, SENSORS)]
+        found = in_processes(_locate, asked, jobs=jobs, advance=advance)
     return [trial for trials in found for trial in trials]
 
 
@@ -99,28 +97,29 @@ def _refuse(plans: Sequence[Path]) -> None:
 
 
 def _map(drives: PlanDrives, plan: Path, sensor: SensorKind) -> None:
-    drives.make_map(plan.stem, partial(load_map, plan), sensor)
+    drives.map(plan.stem, load_map(plan), sensor)
 
 
-def _drive(drives: PlanDrives, plan: Path, sensor: SensorKind, seed: int) -> None:
-    drives.drive(plan.stem, partial(load_map, plan), sensor, seed)
-
-
-_mapped = cache(PlanDrives.read_map)
+@cache
+def _mapped(drives: PlanDrives, plan: Path, sensor: SensorKind) -> SensorMap:
+    grid, T_plan_map = drives.map(plan.stem, load_map(plan), sensor)
+    index = index_of(f"{plan.stem}-{sensor}", grid, Config())
+    return SensorMap(name=plan.stem, sensor=sensor, T_plan_map=T_plan_map, index=index)
 
 
 def _locate(
-    drives: PlanDrives, plan: Path, sensor: SensorKind, seed: int, plans: Sequence[Path]
+    drives: PlanDrives, seed: int, plan: Path, sensor: SensorKind, plans: Sequence[Path]
 ) -> list[Trial]:
     """One query session in the maps of its own plan and of one other."""
-    file = drives.file("trials", plan.stem, sensor, seed, suffix="json")
-    if not file.exists():
+
+    def located() -> list[Trial]:
         others = [p for p in plans if p != plan]
         searched = [plan, *others[seed % len(others) :][:1]] if others else [plan]
-        maps = [_mapped(drives, p.stem, s) for p in searched for s in SENSORS]
-        session = drives.drive(plan.stem, partial(load_map, plan), sensor, seed)
-        write_text(file, json.dumps([asdict(t) for t in query_trials(plan.stem, seed, session, maps)]))
-    return [Trial(**row) for row in json.loads(file.read_text())]
+        maps = [_mapped(drives, p, s) for p in searched for s in SENSORS]
+        session = drives.drive(plan.stem, load_map(plan), sensor, seed)
+        return query_trials(plan.stem, seed, session, maps)
+
+    return once(drives.file("trials", plan.stem, sensor, seed), located)
 
 
 def print_tables(cells: Sequence[MatrixCell]) -> None:

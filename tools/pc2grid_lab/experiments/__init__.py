@@ -2,5 +2,5 @@
 
 The paper's experiment: `paper_experiment`, with `noise`, `paper_tables`, `paper_task`. Real recordings:
 `recordings`, with `slam_relations`, `trajectory_error`. Relocalization across sensors: `sensor_matrix`, with
-`registered_session`, `sensor_map`, `judgement`, `trial`, `metrics`, `ablation`.
+`registered_session`, `answers`, `trial`.
 """

@@ -12,7 +12,6 @@ from typing import TypeVar
 import cv2
 import numpy as np
 
-from pc2grid.arrays import BoolGrid
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid, RegisteredScan
@@ -20,7 +19,7 @@ from pc2grid.submaps.partition import partition
 from signature.config import Config
 from signature.describe import describe
 from signature.localization.answer import Answer
-from signature.localization.localizer import Estimate, Localizer
+from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 from signature.similarity import SignatureTable
@@ -55,25 +54,24 @@ def localize(
     Raises NoScans if an answer is due and no scan could be used.
     """
     localizers = [Localizer(index) for index in indexes]
+    count, added_ms = 0, [0.0] * len(localizers)
 
-    def answers(count: int, added: Sequence[tuple[object, float]]) -> Answers:
+    def answers() -> Answers:
         found = [_timed(localizer.answer) for localizer in localizers]
         return Answers(
             scans=count,
             query=localizers[0].query.map(),
             answers=tuple(answer for answer, _ in found),
-            elapsed_ms=tuple(ms + add_ms for (_, ms), (_, add_ms) in zip(found, added, strict=True)),
+            elapsed_ms=tuple(ms + add_ms for (_, ms), add_ms in zip(found, added_ms, strict=True)),
         )
 
-    count = 0
-    added: list[tuple[Estimate | None, float]] = [(None, 0.0)] * len(localizers)
-    for count, (registered, planar_scan) in enumerate(scans, start=1):
+    for count, scan in enumerate(scans, start=1):
         # After every metre this is a search, which is then the answer.
-        added = [_timed(partial(localizer.add, registered, planar_scan)) for localizer in localizers]
+        added_ms = [_timed(partial(localizer.add, *scan))[1] for localizer in localizers]
         if after is not None and count in after:
-            yield answers(count, added)
+            yield answers()
     if after is None:
-        yield answers(count, added)
+        yield answers()
 
 
 def _timed(action: Callable[[], T]) -> tuple[T, float]:
@@ -92,13 +90,13 @@ def index_of(name: str, grid: OccupancyGrid, config: Config) -> MapIndex:
 
 def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:
     """A map in which all that a query has seen, placed at a pose, is made unknown."""
-    known = query.grid.cells != UNKNOWN
     n = math.ceil(_WALL_M / grid.resolution_m)
-    known = cv2.dilate(known.astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8)).astype(bool)
+    known = (query.grid.cells != UNKNOWN).astype(np.uint8)
+    known = cv2.dilate(known, np.ones((2 * n + 1, 2 * n + 1), np.uint8))
     cells = np.argwhere(grid.cells != UNKNOWN)
     at = query.grid.to_cell(T_map_query.inverse().apply(grid.to_point(cells)))
-    inside: BoolGrid = np.all((at >= 0) & (at < query.grid.cells.shape), axis=1)
-    inside[inside] = known[at[inside, 0], at[inside, 1]]
+    inside = np.all((at >= 0) & (at < known.shape), axis=1)
+    seen = cells[inside][known[tuple(at[inside].T)] > 0]
     left = grid.cells.copy()
-    left[cells[inside, 0], cells[inside, 1]] = UNKNOWN
+    left[tuple(seen.T)] = UNKNOWN
     return replace(grid, cells=left)

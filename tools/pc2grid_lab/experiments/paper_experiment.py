@@ -10,6 +10,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from sklearn.metrics import auc, precision_recall_curve
 
 from pc2grid.arrays import F64
 from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
@@ -99,9 +100,7 @@ class PrecisionRecall:
         """Area under the curve (AUPRC), trapezoids from (0, precision of the first point)."""
         if len(self.recall) == 0:
             return 0.0
-        recall = np.concatenate(([0.0], self.recall))
-        precision = np.concatenate((self.precision[:1], self.precision))
-        return float(np.sum(np.diff(recall) * (precision[1:] + precision[:-1]) / 2))
+        return float(auc([0.0, *self.recall], [self.precision[0], *self.precision]))
 
     @property
     def recall_at_90(self) -> float:
@@ -120,13 +119,9 @@ def precision_recall(similarity: F64, correct: NDArray[np.bool_]) -> PrecisionRe
     """The curve of best matches with similarity (Q,) and truth (Q,); empty if no match is true."""
     if not correct.any():
         return PrecisionRecall(recall=np.empty(0), precision=np.empty(0))
-    order = np.argsort(-similarity, kind="stable")
-    hits = np.cumsum(correct[order])
-    # Matches of equal similarity pass a threshold together.
-    last = np.append(np.diff(similarity[order]) != 0, True)
-    return PrecisionRecall(
-        recall=(hits / hits[-1])[last], precision=(hits / np.arange(1, len(hits) + 1))[last]
-    )
+    precision, recall, _ = precision_recall_curve(correct, similarity)
+    # scikit-learn begins at the lowest threshold, and ends with a point that no match has.
+    return PrecisionRecall(recall=recall[-2::-1], precision=precision[-2::-1])
 
 
 def draw_queries(

@@ -1,20 +1,17 @@
-"""The cells of the paper's tables as tasks: each runs independently and stores its results in files of its
-own.
-"""
+"""The cells of the paper's tables as tasks: each runs independently and keeps its results in a file."""
 
 from __future__ import annotations
 
 import itertools
-import pickle
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pc2grid.config import PartitionConfig
-from pc2grid.io.atomic import replace_file
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.submaps.partition import partition
@@ -22,7 +19,8 @@ from pc2grid_lab.baselines import METHOD_NAMES, make_methods
 from pc2grid_lab.baselines.proposed import Proposed
 from pc2grid_lab.experiments.noise import NOISE_LEVELS
 from pc2grid_lab.experiments.paper_experiment import BestMatches, Experiment, MatchMeasures, evaluate
-from pc2grid_lab.experiments.paper_tables import MAPS, SIZE_PX
+from pc2grid_lab.experiments.paper_tables import MAPS, SIZE_PX, TABLE_3, TABLE_4, Measures
+from pc2grid_lab.experiments.stored import once
 from signature.config import SignatureConfig
 
 RADII_M = (6.0, 8.0, 10.0)
@@ -156,7 +154,7 @@ OPEN_CHOICES = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperTask:
-    """Methods on one map at one noise level; one result file for each method.
+    """Methods on one map at one noise level.
 
     overrides : fields of SignatureConfig that differ from their defaults, for the proposed method.
     speckle_sigma_m : spread of the boundary noise, which the paper leaves open.
@@ -177,11 +175,11 @@ class PaperTask:
         """Name of the map, without suffix."""
         return self.map_path.stem
 
-    def result_path(self, folder: Path, method: str) -> Path:
-        """The file of one method's result."""
+    def file(self, folder: Path) -> Path:
+        """The file of the results."""
         changed = "".join(f".{key}={value}" for key, value in self.overrides)
         return folder / (
-            f"{self.map_name}.{method}.noise{self.level}.r{self.radius_m:g}.offset{self.offset_m:g}"
+            f"{self.map_name}.{'+'.join(self.methods)}.noise{self.level}.r{self.radius_m:g}.offset{self.offset_m:g}"
             f".q{self.queries}.seed{self.seed}.speckles{self.speckle_sigma_m:g}{changed}.pickle"
         )
 
@@ -230,7 +228,7 @@ def halved(grid: OccupancyGrid) -> OccupancyGrid:
     return OccupancyGrid(cells=cells, resolution_m=grid.resolution_m, origin_m=grid.origin_m)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class PaperCell:
     """One cell of a table: its task, the best match of every query, and the measures of these.
 
@@ -249,44 +247,44 @@ class PaperCell:
         """Whether the method has its own settings."""
         return not self.task.overrides
 
+    @property
+    def published(self) -> Measures | None:
+        """What the paper has printed for it; None if it has nothing."""
+        task = self.task
+        if task.overrides or task.map_name not in MAPS:
+            return None
+        if task.radius_m == 8.0:
+            return TABLE_3[task.level].get(self.method, {}).get(task.map_name)
+        return TABLE_4[int(task.radius_m)].get(task.map_name)
+
     def summary(self) -> dict[str, Any]:
         """Everything except the single queries, for JSON."""
         task = {**asdict(self.task), "map_path": self.task.map_name, "overrides": dict(self.task.overrides)}
         half = {f"{name}_half_width": value for name, value in self.half_widths._asdict().items()}
-        return {**task, "method": self.method, "submaps": self.submaps, **self.measures._asdict(), **half}
+        published = None if self.published is None else self.published._asdict()
+        measures = {**self.measures._asdict(), **half, "published": published}
+        return {**task, "method": self.method, "submaps": self.submaps, **measures}
 
 
-def load_results(task: PaperTask, folder: Path) -> list[PaperCell]:
-    """The results of a task that are in a folder."""
-    files = [task.result_path(folder, method) for method in task.methods]
-    return [pickle.loads(file.read_bytes()) for file in files if file.exists()]
+def cells_of(task: PaperTask, folder: Path) -> list[PaperCell]:
+    """The results of a task, which are kept in a folder. Raises MapFileError, OutputError."""
+    return once(task.file(folder), partial(_run, task))
 
 
-def run_task(task: PaperTask, folder: Path) -> None:
-    """Run the methods of a task that have no result yet. Each file is written completely or not at all.
-
-    Raises MapFileError, OutputError.
-    """
-    missing = [name for name in task.methods if not task.result_path(folder, name).exists()]
+def _run(task: PaperTask) -> list[PaperCell]:
     grid = read_map(task.map_path)
     submaps = partition(grid, PartitionConfig.paper(task.radius_m))
     experiment = Experiment(queries=task.queries, offset_m=task.offset_m, seed=task.seed)
     noise = replace(NOISE_LEVELS[task.level], speckle_sigma_m=task.speckle_sigma_m)
-    methods = make_methods(missing)
+    methods = make_methods(task.methods)
     if "proposed" in methods:
         methods["proposed"] = Proposed(SignatureConfig(**dict(task.overrides)))
+    cells = []
     for method, matches in evaluate(methods, grid, submaps, experiment, noise).items():
         low, high = matches.intervals()
-        cell = PaperCell(
-            task=task,
-            method=method,
-            submaps=len(submaps),
-            matches=matches,
-            measures=matches.measures(),
-            half_widths=MatchMeasures(*((b - a) / 2 for a, b in zip(low, high, strict=True))),
-        )
-        with replace_file(task.result_path(folder, method)) as draft:
-            draft.write_bytes(pickle.dumps(cell))
+        half = MatchMeasures(*((b - a) / 2 for a, b in zip(low, high, strict=True)))
+        cells.append(PaperCell(task, method, len(submaps), matches, matches.measures(), half))
+    return cells
 
 
 def known_maps(path: Path) -> list[Path]:

@@ -22,9 +22,7 @@ from pc2grid.geometry import SE2
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Health, RegisteredScan, Scan, SensorKind
 from pc2grid.pipeline import follow
-from pc2grid_lab.experiments.frames import fit_frame
-
-_FITTED_M = 3.0  # length of the path that the true frame is fitted over; chosen by hand
+from pc2grid_lab.experiments.frames import AHEAD_M, fit_frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +53,7 @@ class RegisteredSession:
     def T_world_odom(self) -> SE2:
         """The true pose of the session's frame, by the end of the session.
 
-        It is fitted over the scans of the last `_FITTED_M` whose true pose is known, because the heading of a
+        It is fitted over the scans of the last `AHEAD_M` whose true pose is known, because the heading of a
         single scan, taken while the robot turns, may be wrong by some degrees. Scans from before registration
         was lost are left out: the motion since is not known. (Unless no other pose is known.)
         """
@@ -65,9 +63,9 @@ class RegisteredSession:
         first = min(lost[-1] + 1, len(self) - 1) if len(lost) else 0  # a lost last scan is a query of its own
         if known[-1] >= first:
             known = known[known >= first]
-        known = known[path_m[known] >= path_m[known[-1]] - _FITTED_M]
+        known = known[path_m[known] >= path_m[known[-1]] - AHEAD_M]
         pairs = [(_pose(self.T_odom_base[k]), _pose(self.T_world_base[k])) for k in known]
-        return fit_frame(pairs, _FITTED_M)
+        return fit_frame(pairs, AHEAD_M)
 
     def first(self, count: int) -> RegisteredSession:
         """The session until so many scans were taken."""
@@ -79,21 +77,15 @@ class RegisteredSession:
             T_world_base=self.T_world_base[:count],
         )
 
-    def scans(self) -> Iterator[tuple[RegisteredScan, PlanarScan, SE2]]:
-        """Each scan (without its points), its planar scan and its true pose, in order of time."""
+    def scans(self) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
+        """Each scan (without its points) and its planar scan, in order of time."""
         no_points = np.empty((0, 3), np.float32)
-        for planar_scan, pose, lost, truth in zip(
-            self.planar_scans, self.T_odom_base, self.lost, self.T_world_base, strict=True
-        ):
+        for planar_scan, pose, lost in zip(self.planar_scans, self.T_odom_base, self.lost, strict=True):
             scan = Scan(
                 stamp_ns=planar_scan.stamp_ns, points_m=no_points, T_base_sensor=np.eye(4), sensor=self.sensor
             )
             health = Health.LOST if lost else Health.FINE
-            yield (
-                RegisteredScan(scan=scan, T_session_base=_pose(pose).lift(), health=health),
-                planar_scan,
-                _pose(truth),
-            )
+            yield RegisteredScan(scan=scan, T_session_base=_pose(pose).lift(), health=health), planar_scan
 
     def save(self, path: Path) -> None:
         """Write the session to a file, completely or not at all."""

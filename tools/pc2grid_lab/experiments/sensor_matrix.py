@@ -7,35 +7,38 @@ metres of travel. The sessions are registered as a user would do it; true poses 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.matching.two_way_score import score_fit
-from pc2grid.model import OccupancyGrid, Scan, SensorKind, SessionMap
+from pc2grid.model import OccupancyGrid, Scan, SensorKind
 from pc2grid.pipeline import map_scans
-from pc2grid.submaps.partition import partition
+from pc2grid.simulate.drive import Drive
 from pc2grid_lab.experiments.answers import Answers, localize
 from pc2grid_lab.experiments.frames import apart
 from pc2grid_lab.experiments.registered_session import RegisteredSession, register
-from pc2grid_lab.experiments.stored import write_text
+from pc2grid_lab.experiments.stored import once
 from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
 from pc2grid_lab.worlds import WorldConfig, prepare_session
 from signature.config import Config
-from signature.database import open_database
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
-from signature.sessions import add_session, provenance
 
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
 TRAVELS_M = (1.0, 3.0, 5.0, 8.0, 10.0, 15.0)
 """Metres of travel after which a query is answered."""
 MAP_SEED = 1000
 """Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
+
+
+PlanMap = tuple[OccupancyGrid, SE2]
+"""A map, and T_plan_map: its frame in the floor plan."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +53,7 @@ class SensorMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlanDrives:
-    """Maps and drives that are made unless they exist.
+    """Maps and drives in floor plans that are made unless they exist.
 
     setting : what their files are named after: map_length (metres driven to make a map), clutter, rate (scans
         a second), change (share of doors and furniture that differ, 0 if left out). until_m, length_m : a
@@ -62,10 +65,10 @@ class PlanDrives:
     until_m: float
     length_m: float
 
-    def file(self, kind: str, *names: object, suffix: str) -> Path:
+    def file(self, kind: str, *names: object) -> Path:
         """A file of the folder `kind`, named after its building, sensor and so on, and the setting."""
         tag = (f"{key}{value:g}" for key, value in sorted(self.setting))
-        return self.out / kind / ".".join([*map(str, names), *tag, suffix])
+        return self.out / kind / ".".join([*map(str, names), *tag, "pickle"])
 
     def simulation(
         self, length_m: float, seed: int, start_m: tuple[float, float] | None = None
@@ -88,46 +91,34 @@ class PlanDrives:
         """Of the drive that makes a map."""
         return self.simulation(dict(self.setting)["map_length"], MAP_SEED)
 
-    def make_map(self, name: str, plan: Callable[[], OccupancyGrid], sensor: SensorKind) -> None:
-        """Make the map of a plan by one sensor: a database, and beside it its frame in the plan."""
-        path, config = self.file("maps", name, sensor, suffix="submaps"), Config()
-        if not path.with_suffix(".json").exists():
-            session_map, T_plan_map = map_building(name, plan(), sensor, self.mapping, config)
-            path.unlink(missing_ok=True)
-            add_session(path, session_map, config, provenance(f"{name}.plan", "0" * 64, config))
-            write_text(path.with_suffix(".json"), json.dumps((T_plan_map.x, T_plan_map.y, T_plan_map.yaw)))
+    def map(self, name: str, plan: OccupancyGrid, sensor: SensorKind) -> PlanMap:
+        """The map of a plan by one sensor."""
+        return once(self.file("maps", name, sensor), partial(map_building, plan, sensor, self.mapping))
 
-    def read_map(self, name: str, sensor: SensorKind) -> SensorMap:
-        """What `make_map` has made."""
-        path = self.file("maps", name, sensor, suffix="submaps")
-        with open_database(path) as database:
-            index = MapIndex.of(database, Config())
-        T_plan_map = SE2(*json.loads(path.with_suffix(".json").read_text()))
-        return SensorMap(name=name, sensor=sensor, T_plan_map=T_plan_map, index=index)
-
-    def drive(
-        self, name: str, plan: Callable[[], OccupancyGrid], sensor: SensorKind, seed: int
-    ) -> RegisteredSession:
+    def drive(self, name: str, plan: OccupancyGrid, sensor: SensorKind, seed: int) -> RegisteredSession:
         """A registered query session, which starts somewhere on the path of the mapping one: a query from
         where the mapping robot has never been has no right answer."""
-        path = self.file("drives", name, sensor, seed, suffix="pickle")
-        if not path.exists():
-            grid = plan()
-            way = prepare_session(sensor="laser", grid=grid, config=self.mapping).drive
-            at_s = np.random.default_rng([seed, MAP_SEED]).uniform(0.0, way.duration_s)
-            x, y, _ = way.at(np.array([at_s]))[0].tolist()
-            config = self.simulation(self.length_m, seed, (x, y))
-            scans = prepare_session(sensor=sensor, grid=grid, config=config).scans()
-            register(scans, Config(), sensor=sensor, until_m=self.until_m).save(path)
-        return RegisteredSession.load(path)
+
+        def registered() -> RegisteredSession:
+            way = prepare_session(sensor="laser", grid=plan, config=self.mapping).drive
+            config = self.simulation(self.length_m, seed, start_on(way, seed))
+            scans = prepare_session(sensor=sensor, grid=plan, config=config).scans()
+            return register(scans, Config(), sensor=sensor, until_m=self.until_m)
+
+        return once(self.file("drives", name, sensor, seed), registered)
 
 
-def map_building(
-    name: str, plan: OccupancyGrid, sensor: SensorKind, simulation: WorldConfig, config: Config
-) -> tuple[SessionMap, SE2]:
-    """The map of a simulated session in a floor plan, and T_plan_map, the frame of the map in the plan.
+def start_on(way: Drive, seed: int) -> tuple[float, float]:
+    """A random place on a drive, x and y in metres."""
+    at_s = np.random.default_rng([seed, MAP_SEED]).uniform(0.0, way.duration_s)
+    x, y, _ = way.at(np.array([at_s]))[0].tolist()
+    return x, y
 
-    The frame is fitted over the whole trajectory, as for an absolute trajectory error: if it rested on the
+
+def map_building(plan: OccupancyGrid, sensor: SensorKind, simulation: WorldConfig) -> PlanMap:
+    """The map of a simulated session in a floor plan.
+
+    Its frame is fitted over the whole trajectory, as for an absolute trajectory error: if it rested on the
     heading of the first scan alone, an error of that heading would move distant places by much.
     """
     true_m: list[tuple[float, float]] = []
@@ -137,67 +128,47 @@ def map_building(
             true_m.append((truth.x, truth.y))
             yield scan
 
-    grid, trajectory, loops = map_scans(scans(), config)
-    session_map = SessionMap(
-        session=f"{name}-{sensor}",
-        sensor=sensor,
-        grid=grid,
-        submaps=partition(grid, config.partition),
-        trajectory=trajectory,
-        loops=loops,
-    )
-    return session_map, SE2.fit(trajectory.planar()[:, :2], np.array(true_m))
+    grid, trajectory, _ = map_scans(scans(), Config())
+    return grid, SE2.fit(trajectory.planar()[:, :2], np.array(true_m))
 
 
-def query_trials(
-    name: str,
-    seed: int,
-    session: RegisteredSession,
-    maps: Sequence[SensorMap],
-    travels_m: Sequence[float] = TRAVELS_M,
-) -> list[Trial]:
-    """One query session in each of `maps`, answered after each of `travels_m` that it has travelled.
+def query_trials(name: str, seed: int, session: RegisteredSession, maps: Sequence[SensorMap]) -> list[Trial]:
+    """One query session in each of `maps`, answered after each of `TRAVELS_M` that it has travelled.
 
     name : the building of the session. In maps of other buildings there is no right answer; they are located
     for the longest travel only.
     """
     path_m = session.path_m()
-    travels_m = sorted(d for d in travels_m if d <= path_m[-1])
+    travels_m = [d for d in TRAVELS_M if d <= path_m[-1]]
     # The number of scans after which each distance is reached, made distinct.
     after = np.searchsorted(path_m, travels_m) + 1 - np.arange(len(travels_m))
     after = np.maximum.accumulate(after) + np.arange(len(travels_m))
-    truths = [truth for _, _, truth in session.scans()]
     trials: list[Trial] = []
-    for searched, first in (
-        ([m for m in maps if m.name == name], 0),
-        ([m for m in maps if m.name != name], len(travels_m) - 1),
-    ):
+    for in_building, first in ((True, 0), (False, len(travels_m) - 1)):
+        searched = [m for m in maps if (m.name == name) is in_building]
         if not searched or not travels_m:
             continue
-        scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
-        answers = localize(scans, [m.index for m in searched], after=set(after[first:].tolist()))
+        answers = localize(session.scans(), [m.index for m in searched], after=set(after[first:].tolist()))
         for travel_m, found in zip(travels_m[first:], answers, strict=True):
-            about = (name, session.sensor, seed, travel_m)
+            about = {
+                "query_sensor": session.sensor,
+                "seed": seed,
+                "travel_m": travel_m,
+                "in_building": in_building,
+            }
+            T_plan_base = SE2(*session.T_world_base[found.scans - 1].tolist())
             trials += [
-                _judged(sensor_map, found, k, truths[found.scans - 1], *about)
+                Trial(**about, **_judged(sensor_map, found, k, T_plan_base, in_building))
                 for k, sensor_map in enumerate(searched)
             ]
     return trials
 
 
 def _judged(
-    sensor_map: SensorMap,
-    found: Answers,
-    k: int,
-    T_plan_base: SE2,
-    building: str,
-    query_sensor: SensorKind,
-    seed: int,
-    travel_m: float,
-) -> Trial:
+    sensor_map: SensorMap, found: Answers, k: int, T_plan_base: SE2, in_building: bool
+) -> dict[str, Any]:
     """The kth of the answers to a query, compared with the true pose of the base at its last scan."""
     query, answer = found.query, found.answers[k]
-    in_building = sensor_map.name == building
     T_map_base = sensor_map.T_plan_map.inverse() @ T_plan_base
     T_map_query = T_map_base @ answer.T_odom_base.inverse()
     mapped = score_fit(sensor_map.index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
@@ -205,21 +176,17 @@ def _judged(
     if answer.hypotheses:
         error_m, error_rad = apart(T_map_base, answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base)
         right = in_building and error_m <= JUDGEMENT.right_m and error_rad <= JUDGEMENT.right_rad
-    return Trial(
-        building=sensor_map.name,
-        map_sensor=sensor_map.sensor,
-        query_sensor=query_sensor,
-        seed=seed,
-        travel_m=travel_m,
-        in_building=in_building,
-        mapped=mapped if in_building else 0.0,
-        status=answer.status,
-        confidence=answer.confidence,
-        right=right,
-        error_m=error_m,
-        rank=_retrieved_rank(sensor_map.index, query, T_map_query) if in_building else -1,
-        look_up_ms=found.elapsed_ms[k],
-    )
+    return {
+        "building": sensor_map.name,
+        "map_sensor": sensor_map.sensor,
+        "mapped": mapped if in_building else 0.0,
+        "status": answer.status,
+        "confidence": answer.confidence,
+        "right": right,
+        "error_m": error_m,
+        "rank": _retrieved_rank(sensor_map.index, query, T_map_query) if in_building else -1,
+        "look_up_ms": found.elapsed_ms[k],
+    }
 
 
 def _retrieved_rank(index: MapIndex, query: QueryMap, T_map_query: SE2) -> int:

@@ -16,6 +16,7 @@ from pc2grid.arrays import F64, I64
 from pc2grid.errors import TrajectoryFileError
 from pc2grid.geometry import wrap_angle
 from pc2grid.model import Trajectory
+from pc2grid_lab.experiments.frames import nearest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,22 +74,23 @@ def relation_error(
     relations: Relations,
     *,
     base_to_reference_m: tuple[float, float] = (0.0, 0.0),
-    tolerance_s: float = 0.005,
 ) -> RelationError:
     """The errors of a trajectory with respect to the relations.
 
     base_to_reference_m : position on the base of the point that the relations describe (the benchmark's poses
-        are those of the laser, not of the base). tolerance_s : a relation is left out if no pose is this
-        close to one of its times, which may differ by a millisecond from the stamps.
+        are those of the laser, not of the base).
+
+    A relation is left out if there is no pose at one of its times.
     """
     poses = trajectory.planar()
     c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
     dx, dy = base_to_reference_m
     poses[:, 0] += c * dx - s * dy
     poses[:, 1] += s * dx + c * dy
-    i, near_i = _nearest(trajectory.stamps_ns, relations.first_ns, tolerance_s)
-    j, near_j = _nearest(trajectory.stamps_ns, relations.second_ns, tolerance_s)
-    used = near_i & near_j
+    i, j = (
+        nearest(trajectory.stamps_ns, wanted_ns) for wanted_ns in (relations.first_ns, relations.second_ns)
+    )
+    used = (i >= 0) & (j >= 0)
     error = _relative(relations.T_first_second[used], _relative(poses[i[used]], poses[j[used]]))
     off_m, off_deg = np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(wrap_angle(error[:, 2])))
     return RelationError(
@@ -97,16 +99,6 @@ def relation_error(
         used=len(error),
         total=len(used),
     )
-
-
-def _nearest(stamps_ns: I64, wanted_ns: I64, tolerance_s: float) -> tuple[I64, np.ndarray]:
-    if not len(stamps_ns):
-        return np.zeros(len(wanted_ns), np.int64), np.zeros(len(wanted_ns), np.bool_)
-    after = np.clip(np.searchsorted(stamps_ns, wanted_ns), 0, len(stamps_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    closer = np.abs(stamps_ns[before] - wanted_ns) < np.abs(stamps_ns[after] - wanted_ns)
-    index = np.where(closer, before, after)
-    return index, np.abs(stamps_ns[index] - wanted_ns) <= tolerance_s * 1e9
 
 
 def _relative(a: F64, b: F64) -> F64:

@@ -4,21 +4,35 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import pickle
 from collections.abc import Callable, Iterable
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Executor, ProcessPoolExecutor, as_completed
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 
 from pc2grid.io.atomic import replace_file
 
+T = TypeVar("T")
+Advance = Callable[[float], object]
+
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file."""
     with replace_file(path) as draft:
         draft.write_text(text, encoding="utf-8")
+
+
+def once(path: Path, make: Callable[[], T]) -> T:
+    """What `make` returns; it is kept in a file, and read if the file is there."""
+    if not path.exists():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with replace_file(path) as draft:
+            draft.write_bytes(pickle.dumps(make()))
+    found: T = pickle.loads(path.read_bytes())
+    return found
 
 
 def write_arrays(path: Path, **arrays: Any) -> None:
@@ -28,12 +42,8 @@ def write_arrays(path: Path, **arrays: Any) -> None:
 
 
 def in_processes(
-    function: Callable[..., Any],
-    tasks: Iterable[tuple[Any, ...]],
-    *,
-    jobs: int | None,
-    advance: Callable[[float], None],
-) -> list[Any]:
+    function: Callable[..., T], tasks: Iterable[tuple[Any, ...]], *, jobs: int | None, advance: Advance
+) -> list[T]:
     """What a function returns for the arguments of each task, in their order.
 
     jobs : processes, None: one a core; with one the tasks run in this process. advance : called with the
@@ -49,11 +59,17 @@ def in_processes(
     # One thread in each process, because the processes run in parallel; libraries read this when loaded.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
-    pool = ProcessPoolExecutor(
-        count, mp_context=multiprocessing.get_context("spawn"), initializer=cv2.setNumThreads, initargs=(1,)
-    )
+    spawn = multiprocessing.get_context("spawn")
+    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,))
+    return run_in(pool, function, given, advance)
+
+
+def run_in(
+    pool: Executor, function: Callable[..., T], tasks: Iterable[tuple[Any, ...]], advance: Advance
+) -> list[T]:
+    """The same in processes or threads that are given, which it ends."""
+    waiting = [pool.submit(function, *arguments) for arguments in tasks]
     try:
-        waiting = [pool.submit(function, *arguments) for arguments in given]
         for done, future in enumerate(as_completed(waiting), start=1):
             future.result()
             advance(done / len(waiting))

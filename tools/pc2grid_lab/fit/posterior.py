@@ -83,14 +83,19 @@ def known_of(rows: Iterable[dict[str, Any]]) -> Iterator[Known]:
         beside = blanked and any(error_m < NEAR_M for error_m, _ in errors)
         if not errors or beside or (own and not math.isfinite(errors[0][0])):
             continue
-        right = (error_m <= RIGHT_M and error_rad <= RIGHT_RAD for error_m, error_rad in errors)
         yield Known(
             kind=KINDS[row["place"]],
             buildings=frozenset((row["log"], row["map"])),
             session=f"{row['log']} {row['start']}",
             places=tuple(Evidence(**evidence) for evidence in row["evidence"]),
-            first=next((k for k, is_right in enumerate(right) if is_right), None) if own else None,
+            first=_first_right(errors) if own else None,
         )
+
+
+def _first_right(errors: Sequence[tuple[float, float]]) -> int | None:
+    """The number of the first place that is right, by metres and radians from the truth."""
+    right = (error_m <= RIGHT_M and error_rad <= RIGHT_RAD for error_m, error_rad in errors)
+    return next((k for k, is_right in enumerate(right) if is_right), None)
 
 
 def fit(answers: Sequence[Known]) -> PosteriorParameters:

@@ -16,7 +16,7 @@ DATA is as of `queries`; with `maps/NAME.yaml`, maps of buildings without querie
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -28,14 +28,11 @@ from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid
 from pc2grid_lab.experiments.answers import index_of
-from pc2grid_lab.experiments.sensor_matrix import SensorMap
 from pc2grid_lab.experiments.trial import JUDGEMENT
-from pc2grid_lab.fit.queries import MAPPED_S, Drawn, office_floor, queries_of, read
-from pc2grid_lab.fit.seen_pairs import pairs_of
+from pc2grid_lab.fit.queries import MAPPED_S, Drawn, office_floor, pairs_of, queries_of, read
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.freespace import freespace_bins
-from signature.localization.query import QueryMap
 from signature.retrieval.place_signatures import table_rows, view_rows
 from signature.seen_likelihood import Pairs, SeenStatistics, fitted_spreads
 
@@ -49,14 +46,13 @@ _FIRST_FLOOR, _FLOORS = 30_010, 10
 def pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], config: Config) -> Pairs:
     """Pairs of the logs; `floors` and the maps of the logs are the other places."""
 
-    def asked() -> Iterator[tuple[QueryMap, SE2, list[SensorMap]]]:
-        for name, (grid, driven) in logs.items():
-            own = SensorMap(name=name, sensor="laser", index=index_of(name, grid, config), T_plan_map=SE2())
-            for session in driven:
-                for query, T_map_query in queries_of(session, config):
-                    yield query, T_map_query, [own]
-
-    return pairs_of(asked(), [*floors, *(grid for grid, _ in logs.values())], config)
+    asked = (
+        (query, T_map_query, [(grid, SE2())])
+        for grid, driven in logs.values()
+        for session in driven
+        for query, T_map_query in queries_of(session, config)
+    )
+    return pairs_of(asked, [*floors, *(grid for grid, _ in logs.values())], config)
 
 
 def place_pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], config: Config) -> Pairs:

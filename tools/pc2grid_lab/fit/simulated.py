@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
-from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -22,9 +21,8 @@ from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import office_floorplan
-from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, SensorMap
-from pc2grid_lab.fit.queries import TRAVELS_M, office_floor, queries_of
-from pc2grid_lab.fit.seen_pairs import pairs_of
+from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, PlanMap
+from pc2grid_lab.fit.queries import TRAVELS_M, office_floor, pairs_of, queries_of
 from signature.config import Config
 from signature.localization.query import QueryMap
 from signature.seen_likelihood import SeenStatistics
@@ -45,14 +43,12 @@ def plan_of(name: str) -> OccupancyGrid:
 
 def asked(
     plans: Mapping[str, OccupancyGrid], drives: PlanDrives, queries: int, config: Config
-) -> Iterator[tuple[QueryMap, SE2, list[SensorMap]]]:
+) -> Iterator[tuple[QueryMap, SE2, list[PlanMap]]]:
     """Each query with its true frame in the plan, and the maps of that plan."""
-    for name in plans:
-        for sensor in SENSORS:
-            drives.make_map(name, partial(plans.__getitem__, name), sensor)
-        maps = [drives.read_map(name, sensor) for sensor in SENSORS]
+    for name, plan in plans.items():
+        maps = [drives.map(name, plan, sensor) for sensor in SENSORS]
         for sensor, seed in itertools.product(SENSORS, range(1, queries + 1)):
-            session = drives.drive(name, partial(plans.__getitem__, name), sensor, seed)
+            session = drives.drive(name, plan, sensor, seed)
             for query, T_plan_query in queries_of(session, config):
                 yield query, T_plan_query, maps
             print(f"{name}, {sensor}, {seed}", flush=True)
@@ -64,8 +60,6 @@ def main(
     queries: int = 6,
 ) -> None:
     """Learn and store the statistics, in FOLDER/simulated.npz."""
-    for kind in ("maps", "drives"):
-        (folder / kind).mkdir(parents=True, exist_ok=True)
     drives = PlanDrives(
         out=folder,
         setting=tuple(_SETTING.items()),

@@ -2,5 +2,5 @@
 
 `site` prepares a building: its map and the queries, in the form that each program takes. `programs` says
 which of the programs are installed, and asks them: `own`, `particle_filter`, and `cloud_matchers` with three
-of them. `outcome` judges and counts.
+of them, which `serving` lets answer alike. `outcome` judges and counts.
 """

@@ -21,12 +21,11 @@ Locate = Callable[[Cloud], Found]
 
 SUBMAP_M = 15.0
 """Travel that makes a submap of MapClosures; shorter ones describe too little."""
-DENSITY_M = 0.15
-"""Pixel of the density maps of MapClosures; its default is 0.5 m."""
 VOXEL_M = 0.3
-"""Of KISS-Matcher; 0.15 m takes three times as long and finds no more."""
-FPFH_VOXEL_M = 0.3
-"""Of Open3D's FPFH; with 0.2 m a query takes 18 s, most of it for the matches of features."""
+"""Of KISS-Matcher, where 0.15 m takes three times as long and finds no more, and of Open3D's FPFH, where with
+0.2 m a query takes 18 s, most of it for the matches of features."""
+DENSITY_M = 0.5 * VOXEL_M
+"""Pixel of the density maps of MapClosures; its default is 0.5 m."""
 
 
 def map_closures(path: Matrix, clouds: list[Cloud]) -> Locate:
@@ -81,14 +80,14 @@ def fpfh_ransac(_: Matrix, clouds: list[Cloud]) -> Locate:
     import open3d
 
     steps: Any = open3d.pipelines.registration
-    near_m = 1.5 * FPFH_VOXEL_M
+    near_m = 1.5 * VOXEL_M
 
     def described(points_m: Cloud) -> tuple[Any, Any]:
         cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points_m.astype(np.float64)))
-        cloud = cloud.voxel_down_sample(FPFH_VOXEL_M)
+        cloud = cloud.voxel_down_sample(VOXEL_M)
         search = open3d.geometry.KDTreeSearchParamHybrid
-        cloud.estimate_normals(search(radius=2.0 * FPFH_VOXEL_M, max_nn=30))
-        wide = search(radius=5.0 * FPFH_VOXEL_M, max_nn=100)
+        cloud.estimate_normals(search(radius=2.0 * VOXEL_M, max_nn=30))
+        wide = search(radius=5.0 * VOXEL_M, max_nn=100)
         return cloud, steps.compute_fpfh_feature(cloud, wide)
 
     building, features = described(np.concatenate(clouds))

@@ -125,9 +125,10 @@ def counted(trials: Sequence[PeerTrial]) -> list[PeerCell]:
 
 
 def _cell(trials: Sequence[PeerTrial], threshold: float) -> PeerCell:
+    answered = [trial for trial in trials if trial.answered(threshold)]
     of_place = Counter(trial.place for trial in trials)
-    wrong = Counter(t.place for t in trials if t.answered(threshold) and not t.right)
-    right = [t for t in trials if t.answered(threshold) and t.right and t.place == "covered"]
+    wrong = Counter(trial.place for trial in answered if not trial.right)
+    right = [trial for trial in answered if trial.right and trial.place == "covered"]
     covered = of_place["covered"]
     return PeerCell(
         peer=trials[0].peer,
@@ -142,10 +143,14 @@ def _cell(trials: Sequence[PeerTrial], threshold: float) -> PeerCell:
         elsewhere=of_place["elsewhere"],
         elsewhere_wrong=wrong["elsewhere"],
         median_error_m=_median([t.error_m for t in right if t.error_m is not None]),
-        cpu_s=_median([t.answer.cpu_s for t in trials if t.place != "elsewhere"]),
-        elsewhere_cpu_s=_median([t.answer.cpu_s for t in trials if t.place == "elsewhere"]),
+        cpu_s=_cpu_s(trials, elsewhere=False),
+        elsewhere_cpu_s=_cpu_s(trials, elsewhere=True),
         peak_mb=max(t.answer.peak_mb for t in trials),
     )
+
+
+def _cpu_s(trials: Sequence[PeerTrial], *, elsewhere: bool) -> float | None:
+    return _median([t.answer.cpu_s for t in trials if (t.place == "elsewhere") is elsewhere])
 
 
 def _median(values: Sequence[float]) -> float | None:

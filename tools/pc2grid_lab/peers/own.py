@@ -22,8 +22,7 @@ def locator(_: str, map_stem: str) -> Callable[[str], Found]:
 
     def locate(query: str) -> Found:
         session = RegisteredSession.load(Path(f"{query}.pickle"))
-        scans = ((registered, planar_scan) for registered, planar_scan, _ in session.scans())
-        (found,) = localize(scans, [index])
+        (found,) = localize(session.scans(), [index])
         (answer,) = found.answers
         return None if answer.T_map_base is None else (answer.T_map_base.lift(), answer.confidence)
 

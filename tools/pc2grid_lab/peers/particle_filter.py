@@ -8,13 +8,12 @@ answers differ a little from run to run.
 from __future__ import annotations
 
 import math
-import os
 import re
 import subprocess
 import tempfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
 from pc2grid_lab.experiments.frames import apart
 from pc2grid_lab.experiments.registered_session import RegisteredSession
+from pc2grid_lab.peers.serving import Found, serve
 
 PROGRAMS = ("pf-localization", "carmen2rawlog", "ros-map-yaml2mrpt")
 
@@ -32,20 +32,18 @@ PROGRAMS = ("pf-localization", "carmen2rawlog", "ros-map-yaml2mrpt")
 class ParticleFilterParameters:
     """Settings of `pf-localization`; others are those of its demonstration of global localization.
 
-    per_m2, least, most : particles at the start for each square metre of free floor. 27 on 376 m2 found
-        nothing, and 60,000 take 43 s a query.
+    per_m2, least : particles at the start for each square metre of free floor, and at least; twice as many at
+        most. 27 on 376 m2 found nothing, and 60,000 take 43 s a query.
     step_m, step_rad : a scan is used after this motion, as particle filters of robots do.
-    std_m, std_deg : least noise of the odometry between two such scans. The odometry is registered.
     max_range_m : beams that are as long came back from nothing.
+
+    The least noise of the odometry between two scans (`DummyOdometryParams` below) is that of registration.
     """
 
     per_m2: float = 80.0
     least: int = 30_000
-    most: int = 60_000
     step_m: float = 0.2
     step_rad: float = 0.2
-    std_m: float = 0.05
-    std_deg: float = 2.0
     max_range_m: float = 40.0
 
 
@@ -69,8 +67,8 @@ adaptiveSampleSize=1
 BETA=0.5
 sampleSize=1
 [DummyOdometryParams]
-minStdXY={std_m}
-minStdPHI={std_deg}
+minStdXY=0.05
+minStdPHI=2.0
 [LocalizationExperiment]
 use_3D_poses=false
 map_file={map_file}
@@ -106,60 +104,53 @@ LF_alternateAverageMethod=0
 """
 
 
-class ParticleFilter:
-    """The particle filter in one map. Score: minus the spread of the particles (see `locate`)."""
+def locator(_: str, map_stem: str) -> Callable[[str], Found]:
+    """The mean of the particles at the last scan, in one map.
 
-    def __init__(self, map_stem: Path) -> None:
-        grid = load_map(map_stem.with_suffix(".yaml"))
-        corner = np.array(grid.cells.shape[::-1]) * grid.resolution_m + grid.origin_m
-        self._bounds_m = (*grid.origin_m, float(corner[0]), float(corner[1]))
-        self._resolution_m = grid.resolution_m
-        p = PARTICLE_FILTER
-        free_m2 = float(np.count_nonzero(grid.free)) * grid.resolution_m**2
-        self._particles = round(min(max(p.per_m2 * free_m2, p.least), p.most))
-        self._folder = tempfile.TemporaryDirectory(prefix="particle-filter-")
-        self._map = Path(self._folder.name) / "map.gridmap.gz"
-        _run(["ros-map-yaml2mrpt", "-q", "-w", "-i", map_stem.with_suffix(".yaml"), "-d", self._folder.name])
+    The score is minus the root of the trace of their covariance, metres and radians: particles in several
+    places are far from each other. Raises Pc2GridError if one of the programs fails.
+    """
+    grid, p = load_map(Path(f"{map_stem}.yaml")), PARTICLE_FILTER
+    (x0, y0), (height, width) = grid.origin_m, grid.cells.shape
+    free_m2 = float(np.count_nonzero(grid.free)) * grid.resolution_m**2
+    folder = tempfile.TemporaryDirectory(prefix="particle-filter-")
+    setting = {
+        "particles": round(min(max(p.per_m2 * free_m2, p.least), 2 * p.least)),
+        "map_file": f"{folder.name}/map.gridmap.gz",
+        "rawlog": f"{folder.name}/query.rawlog",
+        "log": f"{folder.name}/log",
+        "x0": x0,
+        "x1": x0 + width * grid.resolution_m,
+        "y0": y0,
+        "y1": y0 + height * grid.resolution_m,
+        "resolution_m": grid.resolution_m,
+    }
+    _run("ros-map-yaml2mrpt", "-q", "-w", "-i", f"{map_stem}.yaml", "-d", folder.name)
 
-    def locate(self, query: Path) -> dict[str, Any]:
-        """The mean of the particles at the last scan, as the fields of `PeerAnswer`.
-
-        The score is minus the root of the trace of their covariance, metres and radians: particles in
-        several places are far from each other.
-
-        Raises Pc2GridError if one of the programs fails.
-        """
-        folder = Path(self._folder.name)
-        log, rawlog, config = folder / "query.log", folder / "query.rawlog", folder / "query.ini"
-        session = RegisteredSession.load(query.with_suffix(".pickle"))
-        with np.load(query.with_suffix(".ranges.npz")) as file:
+    def locate(query: str) -> Found:
+        log, config = Path(folder.name, "query.log"), Path(folder.name, "query.ini")
+        with np.load(f"{query}.ranges.npz") as file:
             ranges_m, fov_rad, T_base_middle = file["ranges_m"], float(file["fov_rad"]), file["T_base_middle"]
+        session = RegisteredSession.load(Path(f"{query}.pickle"))
         log.write_text(carmen_log(session, ranges_m, fov_rad, SE2.from_matrix(T_base_middle)))
-        _run(["carmen2rawlog", "-q", "-w", "-i", log, "-o", rawlog])
-        p, (x0, y0, x1, y1) = PARTICLE_FILTER, self._bounds_m
-        config.write_text(
-            _CONFIG.format(
-                particles=self._particles,
-                std_m=p.std_m,
-                std_deg=p.std_deg,
-                map_file=self._map,
-                rawlog=rawlog,
-                log=folder / "log",
-                x0=x0,
-                x1=x1,
-                y0=y0,
-                y1=y1,
-                resolution_m=self._resolution_m,
-                decimation=max(ranges_m.shape[1] // 36, 1),
-            )
-        )
-        output, cpu_s, peak_mb = _run(["pf-localization", config])
+        _run("carmen2rawlog", "-q", "-w", "-i", str(log), "-o", setting["rawlog"])
+        config.write_text(_CONFIG.format(**setting, decimation=max(ranges_m.shape[1] // 36, 1)))
+        output = _run("pf-localization", str(config))
         found = _ESTIMATE.findall(output)
         if not found:
-            raise Pc2GridError(f"pf-localization: no estimate for {query}", hint=output[-300:])
+            raise Pc2GridError(f"pf-localization: no estimate for {query}: {output[-300:]}")
         x, y, yaw_deg, spread = (float(value) for value in found[-1])
-        pose = (x, y, math.radians(yaw_deg))
-        return {"pose": pose, "score": -spread, "cpu_s": cpu_s, "peak_mb": peak_mb}
+        return SE2(x, y, math.radians(yaw_deg)).lift(), -spread
+
+    return locate
+
+
+def _run(*command: str) -> str:
+    """Run a program to its end: its output. Raises Pc2GridError if it fails."""
+    done = subprocess.run(command, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    if done.returncode:
+        raise Pc2GridError(f"{command[0]} ended with {done.returncode}: {done.stdout[-300:]}")
+    return done.stdout
 
 
 def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base_middle: SE2) -> str:
@@ -198,19 +189,5 @@ def _after_motion(T_odom_base: F64) -> list[int]:
     return kept
 
 
-def _run(command: list[str | Path]) -> tuple[str, float, float]:
-    """Run a program to its end: its output, processor seconds, and peak of memory in megabytes.
-
-    Raises Pc2GridError if it fails.
-    """
-    with tempfile.TemporaryFile("w+") as output:
-        process = subprocess.Popen(
-            [*map(str, command)], stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT
-        )
-        _, status, usage = os.wait4(process.pid, 0)
-        process.returncode = os.waitstatus_to_exitcode(status)
-        output.seek(0)
-        text = output.read()
-    if process.returncode:
-        raise Pc2GridError(f"{command[0]} ended with {process.returncode}", hint=text[-300:])
-    return text, usage.ru_utime + usage.ru_stime, usage.ru_maxrss / 1000.0
+if __name__ == "__main__":
+    serve(locator)

@@ -30,11 +30,11 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind
 from pc2grid.sensor_model import SENSOR_MODELS
-from pc2grid.simulate import Session, SimulationConfig, load_building, prepare_session
-from pc2grid.simulate.config import LidarConfig
-from pc2grid_lab.experiments.frames import apart, number_at
+from pc2grid.simulate import Session, load_building, prepare_session
+from pc2grid_lab.experiments.frames import apart, nearest
+from pc2grid_lab.experiments.recordings.driven import drive_config
 from pc2grid_lab.experiments.registered_session import register
-from pc2grid_lab.experiments.sensor_matrix import MAP_SEED
+from pc2grid_lab.experiments.sensor_matrix import MAP_SEED, start_on
 from pc2grid_lab.experiments.stored import write_arrays, write_text
 from pc2grid_lab.experiments.trial import JUDGEMENT
 from signature.config import Config
@@ -52,8 +52,7 @@ class SiteParameters:
     cloud_voxel_m : edge of the voxels that clouds are thinned to; each matcher thins further as it needs.
     near_m : a query is covered if the share `JudgementParameters.mapped` of its last planar scan lies so near
         to a wall of the map. Only covered queries have a right answer.
-    map_length_m, rate_hz, columns, clutter : of the lidar that is simulated in a 3D scan, as those of
-        `compare recordings`.
+    map_length_m : driven in a 3D scan for a map of it, as by `compare recordings`.
     """
 
     mapped: float = 0.55
@@ -66,9 +65,6 @@ class SiteParameters:
     cloud_voxel_m: float = 0.1
     near_m: float = 0.2
     map_length_m: float = 150.0
-    rate_hz: float = 5.0
-    columns: int = 720
-    clutter: int = 15
 
 
 SITE = SiteParameters()
@@ -96,6 +92,11 @@ class Site:
     folder: Path
 
     @property
+    def planar(self) -> bool:
+        """Whether its sensor is a 2D laser."""
+        return SENSOR_MODELS[self.sensor].planar
+
+    @property
     def map_stem(self) -> Path:
         """`map.yaml`, `map.png` and, of a lidar, `map.npz` without their suffixes."""
         return self.folder / "map"
@@ -119,9 +120,9 @@ def truth_file(log: Path) -> Path:
 
     Raises LogNotFound if there is neither.
     """
-    for name in (f"{log.stem}.tum", f"{log.stem}_corrected.tum"):
-        if (log.parent / name).is_file():
-            return log.parent / name
+    for file in (log.with_suffix(".tum"), log.with_name(f"{log.stem}_corrected.tum")):
+        if file.is_file():
+            return file
     raise LogNotFound(
         f"{log}: no true poses beside it", hint=f"put them into {log.stem}.tum, stamped as the scans"
     )
@@ -159,13 +160,13 @@ def recorded_site(
 
         def posed(start_s: float, duration_s: float) -> Iterator[PosedScan]:
             for scan in opened.scans(start_s, duration_s):
-                i = number_at(truth.stamps_ns, scan.stamp_ns)
-                T = None if i is None else truth.T_session_base[i]
+                (i,) = nearest(truth.stamps_ns, np.array([scan.stamp_ns]))
+                T = None if i < 0 else truth.T_session_base[i]
                 yield scan, T if T is None or of_base else T @ np.linalg.inv(scan.T_base_sensor)
 
         _save_map(site, posed(0.0, mapped_s), config)
         starts_s = np.linspace(mapped_s + SITE.gap * longest_s, end_s - longest_s, queries)
-        for number, start_s in enumerate(_distinct(opened, starts_s)):
+        for number, start_s in enumerate(_distinct(opened, starts_s.tolist())):
             _save_query(site, number, posed(start_s, longest_s), config, travel_m)
     return site
 
@@ -177,34 +178,25 @@ def simulated_site(
     building = load_building(building_file)
     site = Site(name=building_file.stem, sensor="lidar", folder=folder)
 
-    def drive(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> Session:
-        config = SimulationConfig(
-            length_m=length_m,
-            seed=seed,
-            clutter=SITE.clutter,
-            start_m=start_m,
-            lidar=LidarConfig(rate_hz=SITE.rate_hz, columns=SITE.columns),
-        )
-        return prepare_session(sensor="lidar", grid=building, config=config)
+    def driven(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> Session:
+        simulation = drive_config(length_m, seed, start_m)
+        return prepare_session(sensor="lidar", grid=building, config=simulation)
 
     def posed(session: Session) -> Iterator[PosedScan]:
         return ((scan, truth.lift()) for scan, truth in session.scans())
 
-    mapping = drive(SITE.map_length_m, MAP_SEED)
+    mapping = driven(SITE.map_length_m, MAP_SEED)
     _save_map(site, posed(mapping), config)
     for number in range(queries):
-        at_s = np.random.default_rng([number + 1, MAP_SEED]).uniform(0.0, mapping.drive.duration_s)
-        x, y, _ = mapping.drive.at(np.array([at_s]))[0].tolist()
-        _save_query(site, number, posed(drive(travel_m + 3.0, number + 1, (x, y))), config, travel_m)
+        start_m = start_on(mapping.drive, number + 1)
+        _save_query(site, number, posed(driven(travel_m + 3.0, number + 1, start_m)), config, travel_m)
     return site
 
 
-def _distinct(log: Log, starts_s: F64) -> list[float]:
-    """The starts, without those that begin with the same scan as the one before."""
-    first_ns = [next(iter(log.scans(float(start_s)))).stamp_ns for start_s in starts_s]
-    return [
-        float(starts_s[k]) for k in sorted({ns: k for k, ns in reversed(list(enumerate(first_ns)))}.values())
-    ]
+def _distinct(log: Log, starts_s: Iterable[float]) -> list[float]:
+    """The starts, without those that begin with the same scan as an earlier one."""
+    by_scan = {next(iter(log.scans(start_s))).stamp_ns: start_s for start_s in reversed([*starts_s])}
+    return sorted(by_scan.values())
 
 
 def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
@@ -216,82 +208,65 @@ def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
     for scan, T_world_base in _keyframes(site, scans):
         tracked = Tracker(config.registration, config.projection).start(scan)
         builder.add(tracked.planar_scan, SE2.from_matrix(T_world_base))
-        if not SENSOR_MODELS[site.sensor].planar:
-            path.append(T_world_base)
-            clouds.append(_thinned(transform_points(T_world_base, tracked.registered.scan.points_m)))
+        path.append(T_world_base)
+        clouds.append(_thinned(transform_points(T_world_base, tracked.registered.scan.points_m)))
+    grid = builder.grid()
     site.folder.mkdir(parents=True, exist_ok=True)
-    if clouds:
+    if not site.planar:
         write_arrays(
             site.map_stem.with_suffix(".npz"),
             T_map_base=np.array(path),
             points_m=np.concatenate(clouds),
             count=[len(c) for c in clouds],
         )
-    save_map(builder.grid(), site.map_stem, image_format="png")  # last: it says that the map is complete
+    save_map(grid, site.map_stem, image_format="png")  # last: it says that the map is complete
 
 
 def _keyframes(site: Site, scans: Iterable[PosedScan]) -> Iterator[tuple[Scan, F64]]:
     """The scans with a true pose between which the robot has moved or, with a laser, turned."""
-    planar = SENSOR_MODELS[site.sensor].planar
-    step_m, last = SITE.keyframe_m if planar else SITE.lidar_keyframe_m, None
+    step_m, last = SITE.keyframe_m if site.planar else SITE.lidar_keyframe_m, None
     for scan, T_world_base in scans:
         if T_world_base is None:
             continue
         pose = SE2.from_matrix(T_world_base)
         metres, radians = (math.inf, math.inf) if last is None else apart(last, pose)
-        if metres >= step_m or (planar and radians >= SITE.keyframe_rad):
+        if metres >= step_m or (site.planar and radians >= SITE.keyframe_rad):
             last = pose
             yield scan, T_world_base
 
 
-def _save_query(
-    site: Site,
-    number: int,
-    scans: Iterable[PosedScan],
-    config: Config,
-    travel_m: float,
-) -> None:
+def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Config, travel_m: float) -> None:
     """Register a query and keep what the peers need of it, unless it exists; without a true pose, nothing."""
     stem = site.stem(number)
     if stem.with_suffix(".json").exists():
         return
     stem.parent.mkdir(parents=True, exist_ok=True)
     seen: list[RegisteredScan] = []
-    planar = ((scan, None if T is None else SE2.from_matrix(T)) for scan, T in scans)
-    session = register(planar, config, sensor=site.sensor, until_m=travel_m, see=seen.append)
+    posed = ((scan, None if T is None else SE2.from_matrix(T)) for scan, T in scans)
+    session = register(posed, config, sensor=site.sensor, until_m=travel_m, see=seen.append)
     if np.isnan(session.T_world_base[:, 0]).all():
         return
     truth = session.T_world_odom() @ SE2(*session.T_odom_base[-1].tolist())
     session.save(stem.with_suffix(".pickle"))
-    if SENSOR_MODELS[site.sensor].planar:
+    if site.planar:
         save_beams(stem.with_suffix(".ranges.npz"), [registered.scan for registered in seen])
     else:
-        T_odom_query = seen[-1].T_session_base
-        cloud = [
-            transform_points(np.linalg.inv(T_odom_query) @ r.T_session_base, r.scan.points_m) for r in seen
-        ]
+        T_query_odom = np.linalg.inv(seen[-1].T_session_base)
+        cloud = [transform_points(T_query_odom @ r.T_session_base, r.scan.points_m) for r in seen]
         write_arrays(stem.with_suffix(".cloud.npz"), points_m=_thinned(np.concatenate(cloud)))
+    # What registration made of the scans before must not decide which queries count.
+    alone = Tracker(config.registration, config.projection).start(seen[-1].scan)
+    grid = load_map(site.map_stem.with_suffix(".yaml"))
     query = SiteQuery(
         pose=(truth.x, truth.y, truth.yaw),
-        covered=is_covered(
-            load_map(site.map_stem.with_suffix(".yaml")), hits_of(seen[-1].scan, config), truth
-        ),
+        covered=is_covered(grid, truth.apply(alone.planar_scan.hits_m)),
         travel_m=float(session.path_m()[-1]),
     )
     write_text(stem.with_suffix(".json"), json.dumps(asdict(query)))  # last: the query is complete
 
 
-def hits_of(scan: Scan, config: Config) -> F32:
-    """(M, 2) obstacles of a scan by itself, as if a query began with it.
-
-    What registration made of the scans before must not decide which queries count.
-    """
-    return Tracker(config.registration, config.projection).start(scan).planar_scan.hits_m
-
-
-def is_covered(grid: OccupancyGrid, planar_hits_m: F32, T_map_base: SE2) -> bool:
-    """Whether the map shows what the last scan of a query has seen (M, 2), by the true pose."""
-    hits_m = T_map_base.apply(planar_hits_m)
+def is_covered(grid: OccupancyGrid, hits_m: F64) -> bool:
+    """Whether a map shows the walls (M, 2), in its frame, that the last scan of a query has seen."""
     walls_m = grid.to_point(np.argwhere(grid.occupied))
     if not len(hits_m) or not len(walls_m):
         return False

@@ -43,7 +43,7 @@ def located(query: str, window: int, found: SE2 | None, *, status: str = "locate
         "query": {"path_m": 3.0, "stamp_ns": window},
         "hypotheses": [{"session": "map", "place": 0, "x": said.x, "y": said.y, "yaw": said.yaw}],
     }
-    done = Finished(code=0, cpu_s=1.0, wall_s=1.0, peak_mb=1.0, document=document)
+    done = Finished(code=0, cpu_s=1.0, document=document)
     where = None if found is None else (0, pose(window))
     return LocatedWindow(query, window, TimeSpan(float(window), 1.0), done, where, np.zeros((1, 2)))
 
@@ -59,9 +59,12 @@ class Known(Judge):
     def _problem(self, pair: Pair) -> str:
         return ""
 
-    def _grids_of(self, name: str) -> dict[str, OccupancyGrid]:
-        free = np.zeros((400, 400), np.int8)
-        return {"map": OccupancyGrid(cells=free, resolution_m=0.2, origin_m=(-40.0, -40.0))}
+
+@pytest.fixture(autouse=True)
+def all_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every map is of free ground all around."""
+    free = OccupancyGrid(cells=np.zeros((400, 400), np.int8), resolution_m=0.2, origin_m=(-40.0, -40.0))
+    monkeypatch.setattr(judging, "grids", lambda *_: {"map": free})
 
 
 def answers(*, a: tuple[SE2, ...], b: tuple[SE2, ...]) -> dict[Pair, list[LocatedWindow]]:

@@ -62,7 +62,8 @@ def main() -> None:
     ate_m = None
     if truth is not None:
         trajectory = Trajectory(stamps_ns=np.array(stamps, np.int64), T_session_base=np.array(poses))
-        ate_m = trajectory_error(trajectory, read_tum(Path(truth))).ate_m
+        error = trajectory_error(trajectory, read_tum(Path(truth)))
+        ate_m = None if error is None else error.ate_m
     print(json.dumps({"scans": len(stamps), "cpu_s": cpu_s, "ate_m": ate_m}))
 
 

@@ -10,15 +10,12 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any
 
-from mcap.reader import make_reader
-from mcap.records import Channel, Schema
-from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from pc2grid.geometry import SE2, pose_from_xyz_quat
-from pc2grid.io.atomic import replace_file
+from pc2grid_lab.experiments.recordings.mcap_copy import Stored, mcap_copy, stored_messages
 
 _CARRIED_NS = 1_000_000_000
 """Time without scans while the robot is carried; chosen by hand, short: a longer one is easier to notice."""
@@ -47,15 +44,6 @@ class Joined:
     shift_ns: int
 
 
-class _Raw(NamedTuple):
-    """A message as it is stored."""
-
-    schema: Schema
-    channel: Channel
-    log_time_ns: int
-    data: bytes
-
-
 def write_joined(before: Part, after: Part, target: Path) -> Joined:
     """Write the MCAP file `target`: the scans and odometry of `before`, then those of `after`.
 
@@ -65,22 +53,20 @@ def write_joined(before: Part, after: Part, target: Path) -> Joined:
     first, second = _messages(before), _messages(after)
     shift_ns = first[-1].log_time_ns + _CARRIED_NS - second[0].log_time_ns
     wheels = [_pose(m) for m in first if _is_odometry(m)]
-    with replace_file(target) as draft, draft.open("wb") as stream:
-        out = _Out(stream)
+    with mcap_copy(target) as copy:
         for message in (*_static(before, first[0].log_time_ns), *first):
-            out.add(message)
+            copy.add(message)
         T: SE2 | None = None
         for message in second:
             if _is_odometry(message) and T is None:
                 T = wheels[-1] @ _pose(message).inverse()
-            out.add(_moved(message, shift_ns, T))
-        out.finish()
+            copy.add(_moved(message, shift_ns, T))
     return Joined(second[0].log_time_ns + shift_ns, shift_ns)
 
 
-def _messages(part: Part) -> list[_Raw]:
+def _messages(part: Part) -> list[Stored]:
     """Scans and odometry of a part, from its first scan to its last one."""
-    found = [m for m in _read(part.path) if m.schema.name.endswith(("/LaserScan", "/Odometry"))]
+    found = [m for m in stored_messages(part.path) if m.schema.name.endswith(("/LaserScan", "/Odometry"))]
     scans_ns = [m.log_time_ns for m in found if not _is_odometry(m)]
     begin_ns = scans_ns[0] + round(part.begin_s * 1e9)
     end_ns = scans_ns[-1] if part.end_s is None else scans_ns[0] + round(part.end_s * 1e9)
@@ -88,20 +74,13 @@ def _messages(part: Part) -> list[_Raw]:
     return [m for m in found if wanted_ns[0] <= m.log_time_ns <= wanted_ns[-1]]
 
 
-def _static(part: Part, log_time_ns: int) -> Iterator[_Raw]:
-    for message in _read(part.path):
+def _static(part: Part, log_time_ns: int) -> Iterator[Stored]:
+    for message in stored_messages(part.path):
         if message.channel.topic == _STATIC:
             yield message._replace(log_time_ns=log_time_ns)
 
 
-def _read(path: Path) -> Iterator[_Raw]:
-    with path.open("rb") as stream:
-        for schema, channel, message in make_reader(stream).iter_messages():
-            assert schema is not None
-            yield _Raw(schema, channel, message.log_time, message.data)
-
-
-def _moved(message: _Raw, shift_ns: int, T: SE2 | None) -> _Raw:
+def _moved(message: Stored, shift_ns: int, T: SE2 | None) -> Stored:
     """A message at another time; an odometry at the pose that `T` moves it to."""
     content = _decoded(message)
     stamp = content.header.stamp
@@ -115,38 +94,15 @@ def _moved(message: _Raw, shift_ns: int, T: SE2 | None) -> _Raw:
     return message._replace(log_time_ns=message.log_time_ns + shift_ns, data=data)
 
 
-def _decoded(message: _Raw) -> Any:
+def _decoded(message: Stored) -> Any:
     return _TYPES.deserialize_cdr(message.data, message.schema.name)
 
 
-def _pose(odometry: _Raw) -> SE2:
+def _pose(odometry: Stored) -> SE2:
     pose = _decoded(odometry).pose.pose
     p, q = pose.position, pose.orientation
     return SE2.from_matrix(pose_from_xyz_quat((p.x, p.y, p.z), (q.x, q.y, q.z, q.w)))
 
 
-def _is_odometry(message: _Raw) -> bool:
+def _is_odometry(message: Stored) -> bool:
     return message.schema.name.endswith("/Odometry")
-
-
-class _Out:
-    """Writes messages to an MCAP, each topic as one channel."""
-
-    def __init__(self, stream: IO[bytes]) -> None:
-        self._writer = Writer(stream)
-        self._writer.start(profile="ros2")
-        self._channels: dict[str, int] = {}
-
-    def add(self, message: _Raw) -> None:
-        """Write a message."""
-        schema, topic = message.schema, message.channel.topic
-        if topic not in self._channels:
-            number = self._writer.register_schema(schema.name, schema.encoding, schema.data)
-            encoding = message.channel.message_encoding
-            self._channels[topic] = self._writer.register_channel(topic, encoding, number)
-        time_ns = message.log_time_ns
-        self._writer.add_message(self._channels[topic], time_ns, message.data, time_ns)
-
-    def finish(self) -> None:
-        """Write the end of the file."""
-        self._writer.finish()  # type: ignore[no-untyped-call]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import os
 import resource
 import subprocess
@@ -15,15 +16,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from pc2grid_lab.experiments.program import ROOT
 from pc2grid_lab.experiments.stored import write_text
 
-ROOT = Path(__file__).resolve().parents[4]
-"""The folder of the packages; `tools/` is below it."""
 _CLI = "from pc2grid_cli.main import main; main()"
 _ANSWERED = (0, 3, 4)
 """Exit codes of a command that did its work: done, with loss of data, without a confident answer."""
-
-
 _STOPPED = (130, 143)
 """Exit codes of a command that was interrupted or asked to end."""
 
@@ -32,16 +30,14 @@ _STOPPED = (130, 143)
 class Finished:
     """What became of one command.
 
-    code : its exit code, negative if a signal ended it. cpu_s, wall_s : processor time, user and system, of
-        all its processes, and elapsed time. peak_mb : its largest resident memory.
+    code : its exit code, negative if a signal ended it. cpu_s : processor time, user and system, of all its
+        processes.
     document : the JSON document on its standard output; None if there is none. error : the last line of its
         standard error, if it did not do its work.
     """
 
     code: int
     cpu_s: float
-    wall_s: float
-    peak_mb: float
     document: Any
     error: str = ""
 
@@ -66,7 +62,7 @@ def python_module(name: str, *arguments: str | Path, limit_s: float = 1800.0) ->
     return run((sys.executable, "-m", name, *map(str, arguments)), limit_s=limit_s)
 
 
-def run(command: Sequence[str], *, limit_s: float) -> Finished:
+def run(command: Sequence[str], *, limit_s: float = math.inf) -> Finished:
     """Run a command that prints a JSON document; its paths are absolute."""
     # Byte code is kept, as it is where pc2grid is installed, and one thread is used, so that the processor
     # time does not depend on the number of cores.
@@ -77,13 +73,12 @@ def run(command: Sequence[str], *, limit_s: float) -> Finished:
         "OPENBLAS_NUM_THREADS": "1",
     }
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
-        begin = time.monotonic()
         # `python -c` imports from the current folder first.
         child = subprocess.Popen(
             command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=out, stderr=err, env=environment
         )
         try:
-            used = _wait(child, begin + limit_s)
+            used = _wait(child, time.monotonic() + limit_s)
         except BaseException:
             child.kill()
             child.wait()
@@ -94,8 +89,6 @@ def run(command: Sequence[str], *, limit_s: float) -> Finished:
     finished = Finished(
         code=child.returncode,
         cpu_s=used.ru_utime + used.ru_stime,
-        wall_s=time.monotonic() - begin,
-        peak_mb=used.ru_maxrss / (1024 if sys.platform == "linux" else 1024**2),
         document=document,
     )
     return replace(finished, error=_error(finished.code, complaint)) if finished.failed else finished
@@ -134,8 +127,7 @@ def kept(file: Path) -> Finished | None:
     return Finished(**json.loads(file.read_text())) if file.exists() else None
 
 
-def keep(file: Path, finished: Finished) -> Finished:
+def keep(file: Path, finished: Finished) -> None:
     """Write a result to a file, completely or not at all."""
     file.parent.mkdir(parents=True, exist_ok=True)
     write_text(file, json.dumps(asdict(finished)))
-    return finished

@@ -20,6 +20,7 @@ from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.geometry import SE2, invert_pose, transform_points
 from pc2grid.io import Log
 from pc2grid.model import Trajectory
+from pc2grid.open3d_core import o3d
 from pc2grid.sensor_model import SENSOR_MODELS
 
 
@@ -32,7 +33,7 @@ class RegisteredCloudsParameters:
     step_m, step_rad, near_m : grid of the search, and how near to a surface a point counts. points : of the
         search. starts : that are refined.
     rounds_m : reach of ICP, one after the other.
-    same_m, same_rad : places nearer than this are one. rival : another place has less than this share of the
+    Places nearer than a step are one. rival : another place has less than this share of the
         points on surfaces of the best one.
     """
 
@@ -45,8 +46,6 @@ class RegisteredCloudsParameters:
     points: int = 250
     starts: int = 12
     rounds_m: tuple[float, ...] = (0.4, 0.2, 0.1)
-    same_m: float = 0.5
-    same_rad: float = math.radians(10.0)
     rival: float = 0.9
 
 
@@ -74,8 +73,6 @@ def registered_clouds(
     Neither cloud is preferred: each is registered to the other one, as one of the two ways may end beside the
     place, and a place counts by the points on surfaces of both (geometric mean).
     """
-    from pc2grid.open3d_core import o3d
-
     placed = [*_refined(source, target, p), *map(invert_pose, _refined(target, source, p))]
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
     found: list[tuple[float, SE2]] = []
@@ -92,8 +89,6 @@ def registered_clouds(
 
 def _refined(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F64]:
     """The poses (4, 4) at which a search ends, refined."""
-    from pc2grid.open3d_core import o3d
-
     steps = o3d.pipelines.registration
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
     clouds[1].estimate_normals()
@@ -142,4 +137,4 @@ def _lifted(pose: SE2, floors_m: list[float]) -> F64:
 
 def _same(a: SE2, b: SE2, p: RegisteredCloudsParameters) -> bool:
     between = a.inverse() @ b
-    return math.hypot(between.x, between.y) < p.same_m and abs(between.yaw) < p.same_rad
+    return math.hypot(between.x, between.y) < p.step_m and abs(between.yaw) < p.step_rad

@@ -4,34 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, interpolate_pose, invert_pose, leveling
+from pc2grid.geometry import SE2, invert_pose, leveling
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.pipeline import follow
 from pc2grid_cli.options import make_config
-from pc2grid_lab.experiments.frames import fit_frame
+from pc2grid_lab.experiments.frames import AHEAD_M, SAME_NS, fit_frame, nearest, pose_at
 from pc2grid_lab.experiments.recordings.catalogue import Recording
 from pc2grid_lab.experiments.recordings.run import Folder
 from signature.config import Config
 from signature.database import open_database
 
-_SAME_NS = 5_000_000
-"""Stamps that differ by no more than this are of one scan."""
 _GAP_NS = 200_000_000
 """True poses farther apart are not interpolated, as a robot turns between them."""
 _CARRIED_NS = 5_000_000_000
 """The own trajectory is laid on the true poses of so long before and after."""
-_AHEAD_M = 3.0
-"""The heading of a pose counts there as much as the position of a point so far ahead; as in
-`RegisteredSession.T_world_odom`."""
-
 _BEFORE_S = 2.0
 """A scan is looked for from so long before its stamp on."""
 _KNOWN_M = 0.2
@@ -64,44 +58,26 @@ class RecordedDrive:
     truth: Trajectory | None
     late_ns: int = 0
 
-    @staticmethod
-    def of(recording: Recording, folder: Folder) -> RecordedDrive:
-        """Of a recording whose whole map is in the folder."""
-        parts = tuple(sessions(folder, recording.name).values())
-        late_ns = round(recording.late_s * 1e9)
-        poses = folder.poses(recording)
-        if poses is None:
-            return RecordedDrive(parts, None, late_ns)
-        truth = read_tum(poses)
-        if not recording.of_base:
-            T_sensor_base = invert_pose(mount(folder, recording))
-            truth = replace(truth, T_session_base=truth.T_session_base @ T_sensor_base)
-        return RecordedDrive(parts, levelled(truth, parts, late_ns), late_ns)
-
     def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
         """The part and T_part_base of the scan with that stamp; None if no part has it."""
         for number, part in enumerate(self.parts):
-            k = _nearest(part.stamps_ns, stamp_ns)
-            if k is not None and abs(int(part.stamps_ns[k]) - stamp_ns) <= _SAME_NS:
+            (k,) = nearest(part.stamps_ns, np.array([stamp_ns]))
+            if k >= 0:
                 return number, SE2.from_matrix(part.T_session_base[k])
         return None
+
+    def where(self, stamp_ns: int) -> tuple[int, SE2] | None:
+        """The same; of a recording with true poses the part is -1, and the pose the true one."""
+        if self.truth is None:
+            return self.own_pose(stamp_ns)
+        true = self.true_pose(stamp_ns)
+        return None if true is None else (-1, true)
 
     def true_pose(self, stamp_ns: int) -> SE2 | None:
         """T_world_base by the true poses; where they are far apart, carried on by the own trajectory."""
         assert self.truth is not None
-        stamp_ns -= self.late_ns
-        stamps_ns = self.truth.stamps_ns
-        nearest = _nearest(stamps_ns, stamp_ns)
-        if nearest is not None and abs(int(stamps_ns[nearest]) - stamp_ns) <= _SAME_NS:
-            return SE2.from_matrix(self.truth.T_session_base[nearest])
-        after = int(np.searchsorted(stamps_ns, stamp_ns))
-        if 0 < after < len(stamps_ns):
-            before_ns, after_ns = int(stamps_ns[after - 1]), int(stamps_ns[after])
-            if after_ns - before_ns <= _GAP_NS:
-                part = (stamp_ns - before_ns) / (after_ns - before_ns)
-                before, behind = self.truth.T_session_base[after - 1 : after + 1]
-                return SE2.from_matrix(interpolate_pose(before, behind, part))
-        return self._carried(stamp_ns)
+        T = pose_at(self.truth, stamp_ns - self.late_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
+        return self._carried(stamp_ns - self.late_ns) if T is None else SE2.from_matrix(T)
 
     def _carried(self, stamp_ns: int) -> SE2 | None:
         """The own trajectory around a stamp, laid on the true poses there."""
@@ -118,7 +94,29 @@ class RecordedDrive:
         ]
         if not pairs:
             return None
-        return fit_frame(pairs, _AHEAD_M) @ own[1]
+        return fit_frame(pairs, AHEAD_M) @ own[1]
+
+
+@cache
+def drive_of(recording: Recording, folder: Folder) -> RecordedDrive:
+    """The drive of a recording whose whole map is in the folder."""
+    parts = tuple(sessions(folder, recording.name).values())
+    late_ns = round(recording.late_s * 1e9)
+    poses = folder.poses(recording)
+    if poses is None:
+        return RecordedDrive(parts, None, late_ns)
+    truth = read_tum(poses)
+    if not recording.of_base:
+        T_sensor_base = invert_pose(mount(folder, recording))
+        truth = replace(truth, T_session_base=truth.T_session_base @ T_sensor_base)
+    return RecordedDrive(parts, levelled(truth, parts, late_ns), late_ns)
+
+
+@cache
+def grids(folder: Folder, name: str) -> dict[str, OccupancyGrid]:
+    """The sessions of a map by name."""
+    with open_database(folder.map(name)) as database:
+        return {info.name: database.grid(info.name) for info in database.sessions()}
 
 
 def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -> Trajectory:
@@ -130,21 +128,13 @@ def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -
     up = np.zeros(3)
     for part in parts:
         at = np.searchsorted(part.stamps_ns, truth.stamps_ns + late_ns).clip(max=len(part) - 1)
-        same = np.abs(part.stamps_ns[at] - truth.stamps_ns - late_ns) <= _SAME_NS
+        same = np.abs(part.stamps_ns[at] - truth.stamps_ns - late_ns) <= SAME_NS
         # The third row of a rotation is the vertical of its frame, as the base sees it.
         vertical = part.T_session_base[at[same], 2, :3, None]
         up += (truth.T_session_base[same, :3, :3] @ vertical).sum(axis=(0, 2))
     if not up.any():
         return truth
     return replace(truth, T_session_base=leveling(up / np.linalg.norm(up)) @ truth.T_session_base)
-
-
-def _nearest(stamps_ns: NDArray[np.int64], stamp_ns: int) -> int | None:
-    if not len(stamps_ns):
-        return None
-    after = min(int(np.searchsorted(stamps_ns, stamp_ns)), len(stamps_ns) - 1)
-    before = max(after - 1, 0)
-    return before if stamp_ns - int(stamps_ns[before]) < int(stamps_ns[after]) - stamp_ns else after
 
 
 def config_of(recording: Recording) -> Config:

@@ -29,17 +29,23 @@ def write_drive(scan: Path, target: Path, drive: Drive) -> None:
     building = load_building(scan)
     if not isinstance(building, Building):
         raise MapFileError(f"{scan}: a plan, not a 3D scan", hint="a drive needs a cloud or a mesh")
-    config = SimulationConfig.model_validate(
+    config = drive_config(drive.length_m, drive.seed)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    simulate_session(target, sensor=drive.sensor, grid=building, config=config, overwrite=True)
+
+
+def drive_config(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> SimulationConfig:
+    """Of one drive."""
+    return SimulationConfig.model_validate(
         {
-            "length_m": drive.length_m,
-            "seed": drive.seed,
+            "length_m": length_m,
+            "seed": seed,
             "clutter": _CLUTTER,
+            "start_m": start_m,
             "lidar": {"rate_hz": _RATE_HZ, "columns": _COLUMNS},
             "depth": {"rate_hz": _RATE_HZ},
         }
     )
-    target.parent.mkdir(parents=True, exist_ok=True)
-    simulate_session(target, sensor=drive.sensor, grid=building, config=config, overwrite=True)
 
 
 @cache

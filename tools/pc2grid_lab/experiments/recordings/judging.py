@@ -17,13 +17,19 @@ from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_fra
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
 from pc2grid_lab.experiments.recordings.clouds import cloud_along, registered_clouds
-from pc2grid_lab.experiments.recordings.drive import RecordedDrive, config_of, hits_at, known_share, sessions
+from pc2grid_lab.experiments.recordings.drive import (
+    config_of,
+    drive_of,
+    grids,
+    hits_at,
+    known_share,
+    sessions,
+)
 from pc2grid_lab.experiments.recordings.kidnaps import Followed, FollowedJudge
 from pc2grid_lab.experiments.recordings.mapped import MISSING, map_row, said
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, PairRow, QueryRow, Table, Truth
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.trial import JUDGEMENT
-from signature.database import open_database
 
 _SESSION = "map"
 """The first session of a map, see `run`."""
@@ -36,11 +42,11 @@ _STEP_M = 0.3
 def judged_table(
     catalogue: Catalogue,
     folder: Folder,
-    followed: Sequence[Followed] = (),
+    followed: Sequence[Followed],
     *,
     program: str,
     commit: str,
-    advance: Callable[[float], None] = lambda share: None,
+    advance: Callable[[float], None],
 ) -> Table:
     """All rows of a run. advance : called with the share that is done."""
     judge, rows = Judge(catalogue, folder), []
@@ -92,8 +98,6 @@ class Judge:
 
     def __init__(self, catalogue: Catalogue, folder: Folder) -> None:
         self._catalogue, self._folder = catalogue, folder
-        self._drives: dict[str, RecordedDrive] = {}
-        self._grids: dict[str, dict[str, OccupancyGrid]] = {}
         self._windows: dict[Pair, list[LocatedWindow]] = {}
 
     def row(self, pair: Pair) -> PairRow:
@@ -122,12 +126,12 @@ class Judge:
             yield from ((one.span, {}, False) for one in self._located_windows(pair))
             return
         _, windows, frames = self._frames(pair, query, map_)
-        grids = self._grids_of(pair.map_name)
+        known = grids(self._folder, pair.map_name)
         for one in windows:
             expected = _expected(one, frames)
             if expected:
                 poses = {session: pose for session, (pose, _) in expected.items()}
-                yield one.span, poses, _covered(one, expected, grids)
+                yield one.span, poses, _covered(one, expected, known)
 
     def _judged(self, pair: Pair, query: Recording, map_: Recording, row: dict[str, Any]) -> PairRow:
         problem = self._problem(pair)
@@ -137,18 +141,16 @@ class Judge:
             queries = tuple(_elsewhere(one) for one in self._located_windows(pair))
             return PairRow(**row, truth="elsewhere", queries=queries)
         truth, windows, frames = self._frames(pair, query, map_)
-        grids = self._grids_of(pair.map_name)
+        known = grids(self._folder, pair.map_name)
         return PairRow(
             **row,
             truth=truth,
             agreeing=sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None,
-            queries=tuple(_judged(one, frames, grids) for one in windows),
+            queries=tuple(_judged(one, frames, known) for one in windows),
         )
 
     def _problem(self, pair: Pair) -> str:
-        recordings = [self._catalogue.recordings[name] for name in (pair.query, pair.map)]
-        gaps = [recording.file for recording in recordings if self._folder.missing(recording)]
-        if gaps:
+        if gaps := self._folder.gaps(self._catalogue, pair):
             return f"{gaps[0]}: {MISSING}"
         done = kept(self._folder.result(pair.map_name))
         if done is None:
@@ -164,20 +166,12 @@ class Judge:
         return self._windows[pair]
 
     def _one(self, pair: Pair, query: Recording, number: int, span: TimeSpan) -> LocatedWindow:
-        done = kept(self._folder.answer(pair, span))
-        if done is None or done.failed:
-            return LocatedWindow(pair.query, number, span, done)
-        stamp_ns = int(done.document["query"]["stamp_ns"])
-        if pair.kind == "elsewhere":
-            return LocatedWindow(pair.query, number, span, done)
-        drive = self._drive(query)
-        where: tuple[int, SE2] | None
-        if drive.truth is None:
-            where = drive.own_pose(stamp_ns)
-        else:
-            true = drive.true_pose(stamp_ns)
-            where = None if true is None else (-1, true)
-        return LocatedWindow(pair.query, number, span, done, where, hits_at(self._folder, query, stamp_ns))
+        one = LocatedWindow(pair.query, number, span, kept(self._folder.answer(pair, span)))
+        if one.answer is None or pair.kind == "elsewhere":
+            return one
+        stamp_ns = int(one.answer["query"]["stamp_ns"])
+        where = drive_of(query, self._folder).where(stamp_ns)
+        return replace(one, where=where, hits_m=hits_at(self._folder, query, stamp_ns))
 
     def _frames(
         self, pair: Pair, query: Recording, map_: Recording
@@ -187,15 +181,11 @@ class Judge:
         """
         windows = self._located_windows(pair)
         if query.poses is not None and query.poses == map_.poses:
-            return (
-                "poses",
-                windows,
-                {
-                    (-1, session): frame
-                    for session, trajectory in sessions(self._folder, pair.map_name).items()
-                    if (frame := self._true_frame(map_, trajectory)) is not None
-                },
-            )
+            placed = {
+                (-1, session): self._true_frame(map_, trajectory)
+                for session, trajectory in sessions(self._folder, pair.map_name).items()
+            }
+            return "poses", windows, {key: frame for key, frame in placed.items() if frame is not None}
         if pair.until_s is None and (by_clouds := self._by_clouds(query, map_)) is not None:
             own = [replace(one, where=self._own(query, one)) for one in windows]
             return "clouds", own, {(0, _SESSION): by_clouds}
@@ -227,14 +217,14 @@ class Judge:
         """Where the base is at the end of a window, by the trajectory that its cloud lies along."""
         if one.answer is None:
             return None
-        return self._drive(query).own_pose(int(one.answer["query"]["stamp_ns"]))
+        return drive_of(query, self._folder).own_pose(int(one.answer["query"]["stamp_ns"]))
 
     def _by_clouds(self, query: Recording, map_: Recording) -> Frame | None:
         """The frame of a recording in the map of another one, by the clouds of both; None if they have none,
         or do not tell."""
         if any(r.sensor not in ("lidar", "depth") for r in (query, map_)):
             return None
-        drives, clouds = [self._drive(recording).parts[0] for recording in (query, map_)], []
+        drives, clouds = [drive_of(one, self._folder).parts[0] for one in (query, map_)], []
         for recording, drive in zip((query, map_), drives, strict=True):
             with open_log(self._folder.source(recording), config_of(recording).read) as log:
                 clouds.append(cloud_along(log, drive))
@@ -276,26 +266,15 @@ class Judge:
             for one in self._located_windows(pair)
         ]
 
-    def _drive(self, recording: Recording) -> RecordedDrive:
-        if recording.name not in self._drives:
-            self._drives[recording.name] = RecordedDrive.of(recording, self._folder)
-        return self._drives[recording.name]
-
     def _true_frame(self, map_: Recording, trajectory: Trajectory) -> Frame | None:
         """The frame of a session of the map in the world, by its own scans, one on each `_STEP_M`."""
-        drive = self._drive(map_)
+        drive = drive_of(map_, self._folder)
         clues = [
             Clue(true, SE2.from_matrix(trajectory.T_session_base[k]))
             for k in _steps(trajectory)
             if (true := drive.true_pose(int(trajectory.stamps_ns[k]))) is not None
         ]
         return Frame(tuple(clues)) if len(clues) >= 2 else None
-
-    def _grids_of(self, name: str) -> dict[str, OccupancyGrid]:
-        if name not in self._grids:
-            with open_database(self._folder.map(name)) as database:
-                self._grids[name] = {info.name: database.grid(info.name) for info in database.sessions()}
-        return self._grids[name]
 
 
 def _steps(trajectory: Trajectory) -> list[int]:

@@ -21,12 +21,11 @@ from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_fra
 from pc2grid_lab.experiments.recordings.carried_away import Part, write_joined
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue
 from pc2grid_lab.experiments.recordings.children import Finished, kept, pc2grid
-from pc2grid_lab.experiments.recordings.drive import RecordedDrive, hits_at, known_share
+from pc2grid_lab.experiments.recordings.drive import RecordedDrive, drive_of, grids, hits_at, known_share
 from pc2grid_lab.experiments.recordings.mapped import MISSING
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, FollowedRow
 from pc2grid_lab.experiments.recordings.run import Folder, Task, plain
 from pc2grid_lab.experiments.trial import JUDGEMENT
-from signature.database import open_database
 
 KIND = "carried away"
 """How `--only` names these rows."""
@@ -108,7 +107,13 @@ def _names(catalogue: Catalogue, one: Followed) -> tuple[str, ...]:
     return KIND, one.before, one.map, catalogue.recordings[one.map].building
 
 
-def task(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
+def tasks(catalogue: Catalogue, folder: Folder, followed: Sequence[Followed]) -> tuple[set[str], list[Task]]:
+    """The recordings that have to be mapped for some rows, and a task a row."""
+    mapped = {name for one in followed for name in (one.before, one.map)}
+    return mapped, [_watched(catalogue, folder, one) for one in followed]
+
+
+def _watched(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
     """`watch` of a row, of its every scan."""
 
     def do() -> Finished:
@@ -146,7 +151,6 @@ class FollowedJudge:
 
     def __init__(self, catalogue: Catalogue, folder: Folder) -> None:
         self._catalogue, self._folder = catalogue, folder
-        self._drives: dict[str, RecordedDrive] = {}
         self._frames: dict[tuple[str, str], Frame | None] = {}
 
     def row(self, one: Followed) -> FollowedRow:
@@ -189,8 +193,7 @@ class FollowedJudge:
         if expected is None:
             return None
         hits_m = hits_at(self._folder, self._catalogue.recordings[name], stamp_ns)
-        with open_database(self._folder.map(map_)) as database:
-            grid = database.grid(_SESSION)
+        grid = grids(self._folder, map_)[_SESSION]
         return known_share(grid, expected[0].apply(hits_m)) >= JUDGEMENT.mapped
 
     def _is_right(self, name: str, map_: str, stamp_ns: int, T_map_base: SE2) -> bool | None:
@@ -224,9 +227,7 @@ class FollowedJudge:
         return self._frames[name, map_]
 
     def _drive(self, name: str) -> RecordedDrive:
-        if name not in self._drives:
-            self._drives[name] = RecordedDrive.of(self._catalogue.recordings[name], self._folder)
-        return self._drives[name]
+        return drive_of(self._catalogue.recordings[name], self._folder)
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,18 +267,23 @@ def _judged(row: FollowedRow, looks: Sequence[_Look]) -> FollowedRow:
     after = looks[len(before) :]
     knew = bool(before) and before[-1].state in ("located", "recovered", "doubtful")
     if knew:  # until it is noticed, the old place is told
-        after = after[next((k for k, look in enumerate(after) if look.state in NOTICED), len(after)) :]
+        noticed = (k for k, look in enumerate(after) if look.state in NOTICED)
+        after = after[next(noticed, len(after)) :]
     told = [look for look in (*before, *after) if look.tells]
+    rights = [look.right for look in told]
     row = replace(
         row,
         located=len(told),
-        judged=sum(look.right is not None for look in told),
-        wrong=sum(look.right is False for look in told),
+        judged=len(told) - rights.count(None),
+        wrong=rights.count(False),
         alarms=sum(look.alarm for look in before),
         knew=knew,
     )
-    if not knew or not after:
-        return row
-    again = next((look for look in after if look.tells and look.right is not False), None)
+    return _with_times(row, after) if knew and after else row
+
+
+def _with_times(row: FollowedRow, after: Sequence[_Look]) -> FollowedRow:
+    """The row with when the robot noticed that it had been carried away, and was located again."""
     row = replace(row, noticed_s=after[0].since_s, noticed_m=after[0].since_m)
+    again = next((look for look in after if look.tells and look.right is not False), None)
     return row if again is None else replace(row, again_s=again.since_s, again_m=again.since_m)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+import re
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +17,26 @@ from pc2grid.model import Trajectory
 from pc2grid_lab.experiments.recordings.catalogue import Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
 from pc2grid_lab.experiments.recordings.drive import config_of, mount, sessions
-from pc2grid_lab.experiments.recordings.rows import NOT_RUN, MapRow
+from pc2grid_lab.experiments.recordings.rows import NOT_RUN, MapRow, Verdict, Warned
 from pc2grid_lab.experiments.recordings.run import Folder
-from pc2grid_lab.experiments.recordings.warned import warned
 from pc2grid_lab.experiments.slam_relations import Relations, read_relations, relation_error
-from pc2grid_lab.experiments.trajectory_error import TrajectoryError, trajectory_error
+from pc2grid_lab.experiments.trajectory_error import trajectory_error
 
 MISSING = "not in the data folder"
+_ABOUT = {
+    "bent": r"contradicts itself",
+    "loose": r"^no loop ties",
+    "height": r"^the height changes by",
+    "parts": r"^the recording falls into \d+ parts",
+    "lost": r"^registration was lost",
+    "weak": r"did not fix the pose in every direction",
+    "no tf": r"^the log has no tf",
+    "gaps": r"gaps of more than",
+    "empty scans": r"hold no returns",
+}
+_SHAPE = ("bent", "loose")
+EXACT_M, WRONG_M = 0.1, 0.25
+"""A map with a smaller error is not bent, one with a larger is. Chosen by hand: what a doubled wall needs."""
 
 
 def map_row(recording: Recording, folder: Folder) -> MapRow:
@@ -114,15 +128,7 @@ def _relation_error(
 def _pose_error(parts: Sequence[Trajectory], truth: Path) -> dict[str, float]:
     """RMS distance from the true poses, each part aligned by itself."""
     true = read_tum(truth)
-
-    def errors() -> Iterator[TrajectoryError]:
-        for part in parts:
-            try:
-                yield trajectory_error(part, true)
-            except ValueError:  # fewer than three poses of this part have a true one
-                continue
-
-    found = list(errors())
+    found = [error for part in parts if (error := trajectory_error(part, true)) is not None]
     if not found:
         return {"compared": 0.0}
     poses = [error.poses for error in found]
@@ -130,3 +136,34 @@ def _pose_error(parts: Sequence[Trajectory], truth: Path) -> dict[str, float]:
         "error_m": float(np.sqrt(np.average([error.ate_m**2 for error in found], weights=poses))),
         "compared": sum(poses) / max(sum(len(part) for part in parts), 1),
     }
+
+
+def warned(texts: Iterable[str], *, error_m: float | None) -> tuple[Warned, ...]:
+    """The warnings of `convert`, each with what it is about and whether it is right, where that is known.
+
+    error_m : of the trajectory, None if it is not known.
+    """
+    return tuple(
+        Warned(about=about, verdict=_verdict(about, error_m), text=text)
+        for text in texts
+        for about in [_about(text)]
+    )
+
+
+def _about(text: str) -> str:
+    """What a warning is about; of one that is not known here, its first words."""
+    for about, pattern in _ABOUT.items():
+        if re.search(pattern, text):
+            return about
+    return " ".join(text.split()[:5])
+
+
+def _verdict(about: str, error_m: float | None) -> Verdict:
+    if about == "height":  # each of the recordings is of one floor
+        return "false"
+    if about in _SHAPE and error_m is not None:
+        if error_m < EXACT_M:
+            return "false"
+        if error_m > WRONG_M:
+            return "right"
+    return "unknown"

@@ -420,7 +420,7 @@ def change_lines(changed: Sequence[RowChange]) -> list[str]:
 
 
 def _total(rows: Iterable[PairRow]) -> Counts:
-    return sum((row.counts for row in rows), Counts())
+    return Counts.of([query for row in rows for query in row.queries])
 
 
 def _strong(count: int) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from statistics import median
@@ -89,19 +88,17 @@ class QueryRow:
 class Counts:
     """The queries of a row, or of several.
 
-    judged : those whose answer can be judged. right, wrong : of those, located and right, located and wrong.
-    refused : not located, of those that the map covers or whose place is not known. covered : judged, and in
-        the map; covered_right : of those, located and right.
+    right, wrong : located and right, located and wrong, of those whose answer can be judged. refused : not
+        located. covered : judged, and in the map; covered_right : of those, located and right.
     """
 
-    queries: int = 0
-    judged: int = 0
-    covered: int = 0
-    located: int = 0
-    right: int = 0
-    covered_right: int = 0
-    wrong: int = 0
-    failed: int = 0
+    queries: int
+    covered: int
+    located: int
+    right: int
+    covered_right: int
+    wrong: int
+    failed: int
 
     @staticmethod
     def of(queries: Sequence[QueryRow]) -> Counts:
@@ -109,7 +106,6 @@ class Counts:
         located = [q for q in queries if q.located]
         return Counts(
             queries=len(queries),
-            judged=sum(q.right is not None for q in queries),
             covered=sum(q.covered is True for q in queries),
             located=len(located),
             right=sum(q.right is True for q in located),
@@ -117,9 +113,6 @@ class Counts:
             wrong=sum(q.right is False for q in located),
             failed=sum(bool(q.problem) for q in queries),
         )
-
-    def __add__(self, other: Counts) -> Counts:
-        return Counts(**{name: value + getattr(other, name) for name, value in asdict(self).items()})
 
     @property
     def refused(self) -> int:
@@ -217,7 +210,10 @@ class Table:
 
     def to_json(self) -> dict[str, Any]:
         """In plain types; numbers are rounded to what the page could show."""
-        document: dict[str, Any] = _plain({"schema_version": 1, **asdict(self)})
+        text = json.dumps({"schema_version": 1, **asdict(self)})
+        document: dict[str, Any] = json.loads(
+            text, parse_float=lambda digits: round(float(digits), 4), parse_constant=lambda _: None
+        )
         return document
 
     def to_text(self) -> str:
@@ -235,13 +231,3 @@ class Table:
     def from_json(document: dict[str, Any]) -> Table:
         """What `to_json` made. Raises ValueError for any other document."""
         return TypeAdapter(Table).validate_python(document)
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {name: _plain(inner) for name, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(inner) for inner in value]
-    if isinstance(value, float):
-        return round(value, 4) if math.isfinite(value) else None
-    return value

@@ -6,8 +6,8 @@ already is not computed again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Collection, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,8 +17,8 @@ from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, keep, kept, pc2grid, python_module
 from pc2grid_lab.experiments.recordings.driven import digest_of_drive, write_drive
-from pc2grid_lab.experiments.recordings.thinned import write_thinned
-from pc2grid_lab.experiments.stored import in_processes
+from pc2grid_lab.experiments.recordings.mcap_copy import write_thinned
+from pc2grid_lab.experiments.stored import in_processes, run_in
 from signature.config import ShortlistBy
 
 _RESULTS = ("maps", "bare", "answers", "followed")
@@ -76,6 +76,10 @@ class Folder:
         """The result of bare KISS-ICP."""
         return self.work / "bare" / f"{plain(name)}.json"
 
+    def has_bare(self, recording: Recording) -> bool:
+        """Whether bare KISS-ICP is asked: it knows lidars, and real ones are there to be compared."""
+        return recording.sensor == "lidar" and recording.drive is None and not self.missing(recording)
+
     def answer(self, pair: Pair, window: TimeSpan) -> Path:
         """The result of `relocalize` for a window."""
         named = f"{plain(pair.query)}.in.{plain(pair.map_name)}"
@@ -85,6 +89,11 @@ class Folder:
     def missing(self, recording: Recording) -> bool:
         """Whether the data folder lacks the recording, so that it is a gap of the page."""
         return not (self.data / recording.file).exists()
+
+    def gaps(self, catalogue: Catalogue, pair: Pair) -> list[str]:
+        """The files of a pair that the data folder lacks."""
+        recordings = (catalogue.recordings[name] for name in (pair.query, pair.map))
+        return [recording.file for recording in recordings if self.missing(recording)]
 
     def cpu_s(self) -> float:
         """Processor time of all commands whose result is here."""
@@ -115,42 +124,37 @@ def run_all(
     catalogue: Catalogue,
     folder: Folder,
     *,
-    mapped: Collection[str] = (),
-    further: Sequence[Task] = (),
-    jobs: int = 2,
-    advance: Callable[[float], None] = lambda share: None,
+    mapped: Collection[str],
+    further: Sequence[Task],
+    jobs: int,
+    advance: Callable[[float], None],
 ) -> None:
     """Run every command whose result the folder does not hold.
 
     further : commands beside those of the catalogue, in the maps of the recordings `mapped`. advance : called
         with the share of the commands that is done.
     """
-    pairs = [p for p in catalogue.pairs if not _gap(catalogue, folder, p)]
+    pairs = [p for p in catalogue.pairs if not folder.gaps(catalogue, p)]
     maps = _maps(catalogue, folder, pairs)
     maps |= {name: (catalogue.recordings[name], None) for name in mapped}
-    read = {r.name: r for r, _ in maps.values()} | {p.query: catalogue.recordings[p.query] for p in pairs}
-    waiting = [(folder, r) for r in read.values() if not folder.source(r).exists()]
+    read = {recording.name: recording for recording, _ in maps.values()}
+    read |= {pair.query: catalogue.recordings[pair.query] for pair in pairs}
+    waiting = [(folder, one) for one in read.values() if not folder.source(one).exists()]
     in_processes(_make, waiting, jobs=jobs, advance=lambda share: None)
     tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
-    lidars = [
-        r for r in catalogue.mapped if r.sensor == "lidar" and r.drive is None and not folder.missing(r)
-    ]
-    tasks += [_bare(folder, recording) for recording in lidars]
-    windows = sum(pair.windows for pair in pairs) + len(further)
-    for done in _run(tasks, jobs):
-        advance(done / (len(tasks) + windows))
+    tasks += [_bare(folder, one) for one in catalogue.mapped if folder.has_bare(one)]
+    count = len(tasks) + sum(pair.windows for pair in pairs) + len(further)
+    _run(tasks, jobs, lambda done: advance(done / count))
     questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)]
-    for done in _run([*questions, *further], jobs):
-        advance((len(tasks) + done) / (len(tasks) + windows))
+    _run([*questions, *further], jobs, lambda done: advance((len(tasks) + done) / count))
 
 
 def _maps(
     catalogue: Catalogue, folder: Folder, pairs: Sequence[Pair]
 ) -> dict[str, tuple[Recording, float | None]]:
     """The maps that are made, by name: of what recording, and of how much of it."""
-    maps: dict[str, tuple[Recording, float | None]] = {
-        r.name: (r, None) for r in catalogue.mapped if not folder.missing(r)
-    }
+    maps: dict[str, tuple[Recording, float | None]] = {}
+    maps |= {r.name: (r, None) for r in catalogue.mapped if not folder.missing(r)}
     for pair in pairs:
         maps[pair.map_name] = (catalogue.recordings[pair.map], pair.until_s)
         query = catalogue.recordings[pair.query]
@@ -183,22 +187,16 @@ def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[Task]:
     return [_locate(folder, query, pair, window) for _, window in windows]
 
 
-def _gap(catalogue: Catalogue, folder: Folder, pair: Pair) -> bool:
-    return any(folder.missing(catalogue.recordings[name]) for name in (pair.query, pair.map))
-
-
-def _run(tasks: Sequence[Task], jobs: int) -> Iterator[int]:
-    """Do the tasks, the longest first, and yield how many are done."""
+def _run(tasks: Sequence[Task], jobs: int, advance: Callable[[float], None]) -> None:
+    """Do the tasks whose result is not there, the longest first. advance : called with how many are done."""
     waiting = sorted((task for task in tasks if kept(task.file) is None), key=lambda task: -task.weight)
-    with ThreadPoolExecutor(jobs) as pool:
-        futures = [pool.submit(_do, task) for task in waiting]
-        try:
-            for done, future in enumerate(as_completed(futures), start=1):
-                future.result()
-                yield len(tasks) - len(waiting) + done
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise
+    there = len(tasks) - len(waiting)
+    run_in(
+        ThreadPoolExecutor(jobs),
+        _do,
+        [(task,) for task in waiting],
+        lambda share: advance(there + share * len(waiting)),
+    )
 
 
 def _do(task: Task) -> None:
@@ -209,15 +207,7 @@ def _do(task: Task) -> None:
 
 def _convert(folder: Folder, name: str, recording: Recording, until_s: float | None) -> Task:
     database, source = folder.map(name), folder.source(recording)
-    options: list[str | Path] = [
-        *recording.options,
-        "--name",
-        "map",
-        "--json",
-        "--force",
-        "-o",
-        database,
-    ]
+    options = [*recording.options, "--name", "map", "--json", "--force", "-o", str(database)]
     if until_s is not None:
         options += ["--duration", f"{until_s:g}"]
 
@@ -240,13 +230,6 @@ def _bare(folder: Folder, recording: Recording) -> Task:
 
 def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) -> Task:
     span = ("--start", f"{window.start_s:.3f}", "--duration", f"{window.duration_s:g}")
-    arguments: tuple[str | Path, ...] = (
-        folder.source(recording),
-        "-d",
-        folder.map(pair.map_name),
-        *recording.options,
-        *span,
-        "--set",
-        f"relocalize.shortlist_by={folder.shortlist}",
-    )
+    by = ("--set", f"relocalize.shortlist_by={folder.shortlist}")
+    arguments = (folder.source(recording), "-d", folder.map(pair.map_name), *recording.options, *span, *by)
     return Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *arguments, "--json"), 0.0)
