@@ -55,14 +55,8 @@ def change_plan(plan: OccupancyGrid, config: WorldConfig) -> tuple[OccupancyGrid
         return plan, ()
     rng = np.random.default_rng([config.seed, _CHANGE])
     chosen = [piece for piece in _pieces(plan) if rng.random() < config.change]
-    furniture = [
-        _exchanged(piece, plan, rng) if rng.random() < _EXCHANGED else _moved(piece, plan, rng)
-        for piece in chosen
-    ]
-    cells = plan.cells.copy()
-    for piece in chosen:
-        cells[piece] = FREE
-    emptied = replace(plan, cells=cells)
+    furniture = [_changed(_outline(piece, plan), rng) for piece in chosen]
+    emptied = replace(plan, cells=np.where(np.any(chosen, axis=0), np.int8(FREE), plan.cells))
     doors: list[Furniture] = []
     for doorway in find_doorways(plan):
         if rng.random() >= config.change:
@@ -93,7 +87,7 @@ def _pieces(plan: OccupancyGrid) -> list[BoolGrid]:
     return found
 
 
-def _hull(mask: BoolGrid, plan: OccupancyGrid) -> F64:
+def _outline(mask: BoolGrid, plan: OccupancyGrid) -> F64:
     """Convex outline (N, 2) of the cells of a mask, map frame."""
     half = plan.resolution_m / 2
     corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
@@ -101,21 +95,18 @@ def _hull(mask: BoolGrid, plan: OccupancyGrid) -> F64:
     return np.asarray(cv2.convexHull(points.astype(np.float32))[:, 0], np.float64)
 
 
-def _moved(mask: BoolGrid, plan: OccupancyGrid, rng: np.random.Generator) -> Furniture:
-    """The piece as an upright prism of its outline, some decimetres away."""
-    hull = _hull(mask, plan)
-    middle = hull.mean(axis=0)
-    x, y = (float(v) for v in middle + rng.normal(0.0, _MOVED_M, 2))
-    pose = SE2(x, y, float(rng.normal(0.0, _TURNED_RAD)))
-    return Furniture("moved", pose, hull - middle, (Prism(hull - middle, 0.0, _TOP_M),))
-
-
-def _exchanged(mask: BoolGrid, plan: OccupancyGrid, rng: np.random.Generator) -> Furniture:
-    """Something else in the place of the piece."""
-    name = ("table", "box")[rng.integers(2)]
-    outline, parts = KINDS[name][0](rng)
-    x, y = _hull(mask, plan).mean(axis=0).tolist()
-    return Furniture(name, SE2(x, y, float(rng.uniform(-math.pi, math.pi))), outline, tuple(parts))
+def _changed(outline_m: F64, rng: np.random.Generator) -> Furniture:
+    """Something else in the place of a piece, or the piece as an upright prism, some decimetres away."""
+    middle_m = outline_m.mean(axis=0)
+    if rng.random() < _EXCHANGED:
+        name = ("table", "box")[rng.integers(2)]
+        outline, parts = KINDS[name][0](rng)
+        x, y = middle_m.tolist()
+        return Furniture(name, SE2(x, y, float(rng.uniform(-math.pi, math.pi))), outline, tuple(parts))
+    x, y = (middle_m + rng.normal(0.0, _MOVED_M, 2)).tolist()
+    outline = outline_m - middle_m
+    prism = Prism(outline, 0.0, _TOP_M)
+    return Furniture("moved", SE2(x, y, float(rng.normal(0.0, _TURNED_RAD))), outline, (prism,))
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,16 +138,12 @@ def find_doorways(plan: OccupancyGrid) -> tuple[Doorway, ...]:
     middle = skeleton_of(plan.free, plan.resolution_m, 0.5 * _WIDTH_M[0] - plan.resolution_m)
     cells = np.argwhere(middle & (clearance <= 0.5 * _WIDTH_M[1] + plan.resolution_m))
     cells = cells[np.argsort(clearance[cells[:, 0], cells[:, 1]], kind="stable")]
-    found: list[Doorway] = []
-    middles: list[F64] = []
+    found: list[tuple[F64, Doorway]] = []
     for point in plan.to_point(cells):
-        if any(np.hypot(*(point - other)) < _APART_M for other in middles):
-            continue
-        doorway = _at(plan, clearance, tree, walls, point)
-        if doorway is not None:
-            found.append(doorway)
-            middles.append(point)
-    return tuple(found)
+        beside = any(np.hypot(*(point - other)) < _APART_M for other, _ in found)
+        if not beside and (doorway := _at(plan, clearance, tree, walls, point)) is not None:
+            found.append((point, doorway))
+    return tuple(doorway for _, doorway in found)
 
 
 def _at(plan: OccupancyGrid, clearance: F32, tree: Any, walls: I64, point: F64) -> Doorway | None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.geometry import SE2
+from pc2grid.io.nav2_map import save_map
 from pc2grid.model import Scan
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
@@ -146,6 +148,33 @@ def test_clouds_are_matched_in_a_process_of_its_own(tmp_path: Path) -> None:
     assert answer.pose == pytest.approx((1.0, 2.0, 0.4), abs=0.1)
     assert answer.cpu_s > 0.0 and answer.peak_mb > 50.0
     assert answers(fpfh, tmp_path / "gone", [tmp_path / "00"], tmp_path / "kept.json") == [answer]
+
+
+def test_the_particle_filter_is_told_the_map_and_the_scans(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """MRPT's programs are stood in for; the last estimate of the last one is the answer."""
+    estimates = "".join(f"PDF estimation: ({x},2.0,30.0deg) .. tr(cov): 0.25\n" for x in (9.0, 1.0))
+    (tmp_path / "estimates").write_text(estimates)
+    for name, does in (
+        ("ros-map-yaml2mrpt", "test -f $4"),
+        ("carmen2rawlog", "cp $4 $6"),
+        ("pf-localization", f"cp $1 $(dirname $1)/query.rawlog {tmp_path} && cat {tmp_path}/estimates"),
+    ):
+        (tmp_path / name).write_text(f"#!/bin/sh\n{does}\n")
+        (tmp_path / name).chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
+    save_map(office(), tmp_path / "map")
+    driven = session()
+    driven.save(tmp_path / "00.pickle")
+    ranges_m = np.ones((len(driven), 5))
+    np.savez(tmp_path / "00.ranges.npz", ranges_m=ranges_m, fov_rad=3.0, T_base_middle=np.eye(4))
+    (kind,) = (kind for kind in PEERS if kind.name == "particle-filter")
+    (answer,) = answers(kind, tmp_path / "map", [tmp_path / "00"], tmp_path / "kept.json")
+    assert answer.pose == pytest.approx((1.0, 2.0, math.radians(30.0))) and answer.score == -0.25
+    assert (tmp_path / "query.rawlog").read_text() == carmen_log(driven, ranges_m, 3.0, SE2())
+    config = (tmp_path / "query.ini").read_text().splitlines()
+    assert {"particles_count=30000", "init_PDF_max_x=20.0", "init_PDF_max_y=14.0"} < set(config)
 
 
 def test_a_drive_through_a_plan_beside_the_peers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated
 
 import typer
 
-from pc2grid.errors import ConfigError, MapFileError
+from pc2grid.errors import ConfigError
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import SensorKind
 from pc2grid_cli.console import Console, json_text, of
@@ -87,13 +87,10 @@ def _asked(
 
 
 def _refuse(plans: Sequence[Path]) -> None:
-    """Raises ConfigError or MapFileError for plans that cannot be compared."""
+    """Raises ConfigError for plans that cannot be told apart."""
     names = [plan.stem for plan in plans]
     if len(set(names)) != len(names):
         raise ConfigError(f"two plans share a name: {', '.join(names)}", hint="rename one of the files")
-    for plan in plans:
-        if not plan.is_file():
-            raise MapFileError(f"{plan}: no such file", hint="give the path of a map.yaml")
 
 
 def _map(drives: PlanDrives, plan: Path, sensor: SensorKind) -> None:

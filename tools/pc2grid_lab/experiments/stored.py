@@ -28,9 +28,10 @@ def write_text(path: Path, text: str) -> None:
 def once(path: Path, make: Callable[[], T]) -> T:
     """What `make` returns; it is kept in a file, and read if the file is there."""
     if not path.exists():
+        made = pickle.dumps(make())
         path.parent.mkdir(parents=True, exist_ok=True)
         with replace_file(path) as draft:
-            draft.write_bytes(pickle.dumps(make()))
+            draft.write_bytes(made)
     found: T = pickle.loads(path.read_bytes())
     return found
 
