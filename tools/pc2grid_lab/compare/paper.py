@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from pc2grid.errors import ConfigError, MapFileError
+from pc2grid.errors import ConfigError
 from pc2grid_cli.console import json_text, of
 from pc2grid_cli.output_files import make_folder
 from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
@@ -74,10 +74,6 @@ def compare_paper_command(
     if min(offsets_m) <= 0:
         raise ConfigError("--offset: expected a distance above 0 m")
     found = known_maps(maps)
-    if not found:
-        raise MapFileError(
-            f"{maps}: no map is here", hint="a map.yaml, or a folder with intel.yaml, fr079.yaml, ..."
-        )
     make_folder(out)
     choices = (ABLATION if ablation else ()) + (OPEN_CHOICES if open_choices else ())
     setting: dict[str, Any] = {"queries": queries, "seed": seed, "speckle_sigma_m": speckles}

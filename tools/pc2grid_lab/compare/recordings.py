@@ -71,8 +71,6 @@ def compare_recordings_command(
 
     Example: pc2grid compare recordings data --output real-recordings --quick
     """
-    if not data.is_dir():
-        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
     own = own_recordings(data, without=out, of_base=of_base)
     catalogue = _catalogue(data, own, only, quick)
     work = out / "work" / (digest_of_product() + state_of(data, own[0]))

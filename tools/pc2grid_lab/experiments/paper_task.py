@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pc2grid.config import PartitionConfig
+from pc2grid.errors import MapFileError
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.submaps.partition import partition
@@ -289,9 +290,14 @@ def _run(task: PaperTask) -> list[PaperCell]:
 
 def known_maps(path: Path) -> list[Path]:
     """The maps that a path names: itself, if it is a file; else those of the paper in the folder, in the
-    paper's order; else every `*.yaml` in it, by name.
+    paper's order; else every `*.yaml` in it, by name. Raises MapFileError if there is none.
     """
     if path.is_file():
         return [path]
     published = [path / f"{name}.yaml" for name in MAPS if (path / f"{name}.yaml").is_file()]
-    return published or sorted(path.glob("*.yaml"))
+    found = published or sorted(path.glob("*.yaml"))
+    if not found:
+        raise MapFileError(
+            f"{path}: no map is here", hint="a map.yaml, or a folder with intel.yaml, fr079.yaml, ..."
+        )
+    return found

@@ -9,7 +9,7 @@ import hashlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from pc2grid.errors import Pc2GridError
+from pc2grid.errors import ConfigError, Pc2GridError
 from pc2grid.io import open_log
 from pc2grid_lab.experiments.recordings import catalogue
 from pc2grid_lab.experiments.recordings.catalogue import Pair, Recording, Source
@@ -23,8 +23,10 @@ def own_recordings(data: Path, *, without: Path, of_base: bool) -> tuple[list[Re
     """The recordings of a folder that the catalogue does not name, and the pairs of each with its beginning.
 
     without : a folder that is left out. of_base : whether the poses in `NAME.tum` are of the base, not of the
-        sensor.
+        sensor. Raises ConfigError if the folder is not there.
     """
+    if not data.is_dir():
+        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
     rows, named = [], {recording.file for recording in catalogue.RECORDINGS}
     for file in _recordings(data, without.resolve()):
         name = file.relative_to(data).as_posix()
