@@ -150,7 +150,7 @@ def query_trials(name: str, seed: int, session: RegisteredSession, maps: Sequenc
             continue
         answers = localize(session.scans(), [m.index for m in searched], after=set(after[first:].tolist()))
         for travel_m, found in zip(travels_m[first:], answers, strict=True):
-            about = {
+            about: dict[str, Any] = {
                 "query_sensor": session.sensor,
                 "seed": seed,
                 "travel_m": travel_m,

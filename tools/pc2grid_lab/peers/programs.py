@@ -69,7 +69,7 @@ def missing(kind: PeerKind) -> str | None:
     if kind.name == "particle-filter" and not all(map(shutil.which, PROGRAMS)):
         return "apt-get install mrpt-apps"
     if kind.apart:
-        imports = [kind.python, "-c", f"import {kind.name.replace('-', '_')}"]
+        imports = [str(kind.python), "-c", f"import {kind.name.replace('-', '_')}"]
         if not kind.python.exists() or subprocess.run(imports, check=False).returncode:
             return f"python -m venv {ENVIRONMENT} && {kind.python} -m pip install {' '.join(PINS)}"
     return None

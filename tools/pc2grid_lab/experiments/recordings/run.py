@@ -230,6 +230,8 @@ def _bare(folder: Folder, recording: Recording) -> Task:
 
 def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) -> Task:
     span = ("--start", f"{window.start_s:.3f}", "--duration", f"{window.duration_s:g}")
-    by = ("--set", f"relocalize.shortlist_by={folder.shortlist}")
-    arguments = (folder.source(recording), "-d", folder.map(pair.map_name), *recording.options, *span, *by)
-    return Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *arguments, "--json"), 0.0)
+    options = (*recording.options, *span, "--set", f"relocalize.shortlist_by={folder.shortlist}")
+    where = (folder.source(recording), "-d", folder.map(pair.map_name))
+    return Task(
+        folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *where, *options, "--json"), 0.0
+    )
