@@ -7,7 +7,6 @@ Nothing here is fitted to recordings of real sensors; numbers whose origin is no
 from pc2grid.simulate.building import Building, load_building
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.floorplan import office_floorplan
-from pc2grid.simulate.hand import carried_camera
 from pc2grid.simulate.record import SimulatedSession, simulate_session
 from pc2grid.simulate.session import Session, iter_session, prepare_session
 
@@ -16,7 +15,6 @@ __all__ = [
     "Session",
     "SimulatedSession",
     "SimulationConfig",
-    "carried_camera",
     "iter_session",
     "load_building",
     "office_floorplan",

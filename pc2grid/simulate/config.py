@@ -35,17 +35,6 @@ class OdometryConfig(Section):
     veer_rpm: float = Field(default=0.001, ge=0, description="standard deviation, radians per metre")
 
 
-class ImuConfig(Section):
-    """An IMU at the origin of the base: errors of a phone's, and a bias that is constant in a session."""
-
-    enabled: bool = Field(default=False, description="true: the log has a topic with an IMU")
-    rate_hz: float = Field(default=100.0, ge=5, le=1000)
-    turn_noise_rps: float = Field(default=0.005, ge=0, description="standard deviation of the turn rate")
-    turn_bias_rps: float = Field(default=0.005, ge=0, description="the same, constant in a session")
-    acceleration_noise_mps2: float = Field(default=0.1, ge=0, description="standard deviation")
-    acceleration_bias_mps2: float = Field(default=0.1, ge=0, description="the same, constant in a session")
-
-
 class LidarConfig(Section):
     """A spinning lidar like a VLP-16."""
 
@@ -78,18 +67,6 @@ class DepthConfig(Section):
     max_range_m: float = Field(default=6.0, gt=0)
     dropout: float = Field(default=0.01, ge=0, le=1, description="share of the pixels that are lost")
     edge_dropout: float = Field(default=0.3, ge=0, le=1, description="the same at jumps in depth")
-    flying: float = Field(
-        default=0.0,
-        ge=0,
-        le=1,
-        description="share of the pixels at jumps in depth that lie between both sides",
-    )
-    holes: float = Field(
-        default=0.0,
-        ge=0,
-        le=0.9,
-        description="share of the pixels that are lost in patches, as on dark surfaces",
-    )
     mount_m: tuple[float, float, float] = Field(default=(0.2, 0.0, 0.6), description="x, y, z on the base")
 
 
@@ -106,20 +83,6 @@ class LaserConfig(Section):
     mount_m: tuple[float, float, float] = Field(default=(0.15, 0.0, 0.28), description="x, y, z on the base")
 
 
-class HandConfig(Section):
-    """The hand of somebody who carries the sensor; the base is what is in the hand."""
-
-    carried: bool = Field(default=False, description="true: the sensor is carried, false: it is on wheels")
-    height_m: float = Field(default=1.5, gt=0, le=2.5, description="of the base above the floor")
-    height_sway_m: float = Field(default=0.1, ge=0, le=1, description="up and down by at most so much")
-    pitch_deg: float = Field(default=20.0, ge=-60, le=60, description="down, in the mean")
-    pitch_sway_deg: float = Field(default=20.0, ge=0, le=60, description="more and less by at most so much")
-    roll_sway_deg: float = Field(default=5.0, ge=0, le=45, description="to both sides by at most so much")
-    periods_s: tuple[float, ...] = Field(
-        default=(2.0, 5.0, 11.0), min_length=1, description="of the sway; steps follow each other in 0.5 s"
-    )
-
-
 class SimulationConfig(Section):
     """One session. The same configuration gives the same bytes."""
 
@@ -131,8 +94,6 @@ class SimulationConfig(Section):
     wall_height_m: float = Field(default=2.5, gt=0.5, le=20)
     drive: DriveConfig = DriveConfig()
     odometry: OdometryConfig = OdometryConfig()
-    imu: ImuConfig = ImuConfig()
     lidar: LidarConfig = LidarConfig()
     depth: DepthConfig = DepthConfig()
     laser: LaserConfig = LaserConfig()
-    hand: HandConfig = HandConfig()

@@ -28,7 +28,6 @@ TOPICS: dict[SensorKind, str] = {
 }
 INFO_TOPIC = "/camera/depth/camera_info"
 ODOMETRY_TOPIC = "/odom"
-IMU_TOPIC = "/imu/data_raw"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,8 +64,7 @@ def simulate_session(
     progress : called with the share that is done, 0..1.
 
     Topics: the sensor's (TOPICS; a camera has INFO_TOPIC too), /tf_static base_link -> sensor and, unless
-    switched off, nav_msgs/Odometry with /tf odom -> base_link; with `imu.enabled`, IMU_TOPIC. The same
-    arguments give the same bytes.
+    switched off, nav_msgs/Odometry with /tf odom -> base_link. The same arguments give the same bytes.
     Raises ConfigError if there is no room for the robot, OutputError if a file cannot be written.
 
     >>> made = simulate_session("drive.mcap", sensor="laser", config=SimulationConfig(length_m=1.0))
@@ -84,15 +82,12 @@ def simulate_session(
         about = {"sensor": session.sensor.kind, "config": session.config.model_dump_json()}
         log.metadata("pc2grid.simulation", about)
         log.tf_static(EPOCH_NS, BASE_FRAME, session.sensor.frame, session.sensor.T_base_sensor)
-        if session.imu is not None:
-            for message in session.imu.messages(EPOCH_NS, BASE_FRAME):
-                log.imu(IMU_TOPIC, message)
         odometry_sent = 0
         for reading in session.readings():
             odometry_sent = _write_odometry(log, session, odometry_sent, reading.time_s)
             _write_reading(log, session, reading)
             stamps.append(reading.stamp_ns)
-            poses.append(session.pose(reading.time_s))
+            poses.append(session.drive.pose(reading.time_s).lift())
             if progress is not None:
                 progress((reading.index + 1) / count)
         _write_odometry(log, session, odometry_sent, np.inf)
@@ -116,7 +111,7 @@ def _write_odometry(log: LogWriter, session: Session, sent: int, until_s: float)
     end = int(np.searchsorted(odometry.times_s, until_s, side="right"))
     for time_s, (x, y, yaw) in zip(odometry.times_s[sent:end], odometry.poses[sent:end], strict=True):
         stamp_ns = EPOCH_NS + round(float(time_s) * 1e9)
-        T_odom_base = session.in_space(SE2(float(x), float(y), wrap_angle(float(yaw))), float(time_s))
+        T_odom_base = SE2(float(x), float(y), wrap_angle(float(yaw))).lift()
         log.odometry(ODOMETRY_TOPIC, stamp_ns, T_odom_base, ODOM_FRAME, BASE_FRAME)
         log.tf(stamp_ns, ODOM_FRAME, BASE_FRAME, T_odom_base)
     return end

@@ -18,7 +18,6 @@ OPTICAL = np.array([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
 
 # A neighbour whose depth differs by more than this share of the depth and this distance is a depth jump.
 _JUMP_SHARE, _JUMP_M = 0.1, 0.1
-_PATCH_PIXELS = 4.0  # about the radius of a patch of lost pixels
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,15 +65,7 @@ def _measure_depth(true_m: F32, config: DepthConfig, rng: np.random.Generator) -
     lost = np.full(len(depth), config.dropout, np.float32)
     image = depth.reshape(config.height, config.width)
     near, far = ndimage.minimum_filter(image, 3), ndimage.maximum_filter(image, 3)
-    jump = (far - near) > _JUMP_SHARE * image + _JUMP_M
-    lost[jump.ravel()] = config.edge_dropout
-    if config.flying:
-        between = near + rng.random(image.shape, dtype=np.float32) * (far - near)
-        flies = jump & (rng.random(image.shape) < config.flying)
-        depth = np.where(flies, between, image).ravel()
-    if config.holes:
-        patches = ndimage.gaussian_filter(rng.standard_normal(image.shape), _PATCH_PIXELS)
-        lost[(patches <= np.quantile(patches, config.holes)).ravel()] = 1.0
+    lost[((far - near) > _JUMP_SHARE * image + _JUMP_M).ravel()] = config.edge_dropout
     noise = rng.standard_normal(len(depth), dtype=np.float32) * spread
     reading = np.round((depth + noise) * 1000) / np.float32(1000)
     kept = rng.random(len(depth), dtype=np.float32) >= lost

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,8 +15,6 @@ from pc2grid.simulate.clutter import Furniture, covered, place_clutter
 from pc2grid.simulate.config import SimulationConfig
 from pc2grid.simulate.drive import Drive, drive_along
 from pc2grid.simulate.floorplan import office_floorplan
-from pc2grid.simulate.hand import Hand
-from pc2grid.simulate.imu import SimulatedImu, imu_of
 from pc2grid.simulate.odometry import SimulatedOdometry, odometry_of
 from pc2grid.simulate.route import plan_route
 from pc2grid.simulate.scene import Mesh, Scene, extrude
@@ -28,7 +26,7 @@ EPOCH_NS = 1_700_000_000_000_000_000
 RAYS_PER_CAST = 300_000  # bounds the memory of one call of the ray caster
 
 # Each purpose has its own stream of random numbers, so that more clutter does not change the noise.
-_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE, _HAND, _IMU = range(7)
+_CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +56,6 @@ class Session:
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
     shell : geometry of a real building; None where the plan is extruded.
     added : further objects that the plan does not show.
-    hand : what carries the sensor; None: it is on wheels. imu : None when switched off.
     """
 
     sensor: Sensor
@@ -69,13 +66,6 @@ class Session:
     config: SimulationConfig
     shell: Mesh | None = None
     added: tuple[Furniture, ...] = ()
-    hand: Hand | None = None
-    imu: SimulatedImu | None = None
-
-    @property
-    def objects(self) -> tuple[Furniture, ...]:
-        """All that stands in the plan."""
-        return (*self.clutter, *self.added)
 
     @property
     def scan_count(self) -> int:
@@ -85,7 +75,7 @@ class Session:
     def mesh(self) -> Mesh:
         """Building and objects as triangles in the map frame."""
         shell = extrude(self.grid, self.config.wall_height_m) if self.shell is None else self.shell
-        return Mesh.join([shell, *(furniture.mesh() for furniture in self.objects)])
+        return Mesh.join([shell, *(furniture.mesh() for furniture in (*self.clutter, *self.added))])
 
     def readings(self) -> Iterator[Reading]:
         """Cast all scans, several in a call; each ray starts at the robot's pose at the time of the ray."""
@@ -97,35 +87,14 @@ class Session:
         for first in range(0, self.scan_count, batch):
             indices = np.arange(first, min(first + batch, self.scan_count))
             times_s = indices[:, None] / sensor.rate_hz + sensor.offsets_s
-            poses = self.drive.at(times_s)
-            if self.hand is None:
-                rays = _rays(poses, T[:3, 3], directions)
-            else:
-                rays = np.stack([self._carried_rays(of_scan) for of_scan in times_s])
+            rays = _rays(self.drive.at(times_s), T[:3, 3], directions)
             true_m = scene.cast(rays.reshape(-1, 6)).reshape(times_s.shape)
             for index, ranges in zip(indices, true_m, strict=True):
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
 
-    def _carried_rays(self, times_s: F64) -> F32:
-        """Rays (R, 6) in the map frame, each at its time (R,)."""
-        moments, of_ray = np.unique(times_s, return_inverse=True)
-        poses = np.array([self.pose(float(time_s)) for time_s in moments])
-        T = (poses @ self.sensor.T_base_sensor)[of_ray]
-        rays = np.empty((len(T), 6), np.float32)
-        rays[:, :3], rays[:, 3:] = T[:, :3, 3], np.einsum("nij,nj->ni", T[:, :3, :3], self.sensor.directions)
-        return rays
-
-    def pose(self, time_s: float) -> F64:
-        """The true T_map_base (4, 4)."""
-        return self.in_space(self.drive.pose(time_s), time_s)
-
-    def in_space(self, pose: SE2, time_s: float) -> F64:
-        """A pose on the floor as that of the base (4, 4), which a hand may carry."""
-        return pose.lift() if self.hand is None else pose.lift() @ self.hand.at(time_s)
-
     def scan(self, reading: Reading) -> Scan:
-        """A reading as the scan that `pc2grid.io` decodes from the recording, but for what an IMU says."""
+        """A reading as the scan that `pc2grid.io` decodes from the recording."""
         T = self.sensor.T_base_sensor
         kept = np.isfinite(reading.values_m)
         points = (reading.values_m[kept, None] * self.sensor.directions[kept]).astype(np.float32)
@@ -149,7 +118,7 @@ class Session:
 
     def _odometry_at(self, time_s: float) -> F64 | None:
         """T_odom_base (4, 4) by the odometry; None if there is none."""
-        return None if self.odometry is None else self.in_space(self.odometry.at(time_s), time_s)
+        return None if self.odometry is None else self.odometry.at(time_s).lift()
 
     def scans(self) -> Iterator[tuple[Scan, SE2]]:
         """Scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
@@ -214,13 +183,7 @@ def plan_session(
     )
     drive = drive_along(route, config.drive, stream(_DRIVE))
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
-    carried = make_sensor(sensor, config)
-    hand = Hand.of(config.hand, stream(_HAND)) if config.hand.carried else None
-    session = Session(carried, plan, clutter, drive, odometry, config, shell, added, hand)
-    if config.imu.enabled:
-        imu = imu_of(session.pose, drive.duration_s, config.imu, stream(_IMU))
-        session = replace(session, imu=imu)
-    return session
+    return Session(make_sensor(sensor, config), plan, clutter, drive, odometry, config, shell, added)
 
 
 def iter_session(
@@ -231,6 +194,6 @@ def iter_session(
 ) -> Iterator[tuple[Scan, SE2]]:
     """A session in memory: each scan with the true T_map_base at its stamp.
 
-    The same scans as in the log that `simulate_session` writes, without the log and without what an IMU says.
+    The same scans as in the log that `simulate_session` writes, without the log.
     """
     yield from prepare_session(sensor=sensor, grid=grid, config=config).scans()

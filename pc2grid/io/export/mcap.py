@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import mcap
 import numpy as np
@@ -20,9 +20,6 @@ from pc2grid.geometry import SE2
 from pc2grid.io.atomic import refuse_existing, replace_file
 from pc2grid.io.export import ros_messages as ros
 from pc2grid.model import MapOf, OccupancyGrid, Trajectory
-
-if TYPE_CHECKING:
-    from pc2grid.io.messages.types import Imu
 
 _FLOAT32 = 7  # sensor_msgs/PointField
 _FARTHEST_DEPTH_M = 65.0  # an image of 16UC1 ends at 65.535 m
@@ -162,17 +159,6 @@ class LogWriter:
         )
         header = ros.header(stamp_ns, frame)
         self._add(topic, stamp_ns, ros.new("nav_msgs/Odometry", header, child, pose, twist))
-
-    def imu(self, topic: str, message: Imu) -> None:
-        """sensor_msgs/Imu; what the message does not tell is marked so (REP-145), else covariance is
-        unknown (0)."""
-        header = ros.header(message.header.stamp_ns, message.header.frame)
-        values = message.orientation, message.turn_rate_rps, message.acceleration_mps2
-        known = [np.append(-1.0 if value is None else 0.0, np.zeros(8)) for value in values]
-        orientation = ros.new("geometry_msgs/Quaternion", *(message.orientation or (0.0, 0.0, 0.0, 1.0)))
-        turn, push = (ros.vector(*(value or (0.0, 0.0, 0.0))) for value in values[1:])
-        fields = (orientation, known[0], turn, known[1], push, known[2])
-        self._add(topic, message.header.stamp_ns, ros.new("sensor_msgs/Imu", header, *fields))
 
     def tf(self, stamp_ns: int, parent: str, child: str, T_parent_child: F64) -> None:
         """One transform (4, 4) on /tf."""
