@@ -9,7 +9,7 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import Config, ProjectionConfig
+from pc2grid.config import Config, PartitionConfig
 from pc2grid.errors import NoScans
 from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.geometry import SE2
@@ -18,12 +18,8 @@ from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LOOPS
-from pc2grid.mapping.part_maps import PartMap, draw_parts, long_enough
-from pc2grid.mapping.report import (
-    check_followed,
-    part_reports,
-    with_track_warnings,
-)
+from pc2grid.mapping.part_maps import draw_parts, long_enough
+from pc2grid.mapping.report import check_followed, part_reports, with_track_warnings
 from pc2grid.mapping.track import Track, TrackRecord
 from pc2grid.model import (
     Loop,
@@ -141,53 +137,25 @@ def build_maps(
     planar = SENSOR_MODELS[sensor].planar
     if not any(len(part.trajectory) for part in parts):
         raise NoScans(f"{log.info.path}: no scans in the part asked for", hint="check --start and --duration")
-    if not track.with_odometry:
-        _check_without_odometry(track, planar, str(log.info.path))
+    if planar and not track.with_odometry:
+        check_followed(track.trajectory, str(log.info.path))
     kept = long_enough(parts)
     reports = part_reports(with_track_warnings(log.report(), track), session, parts, kept)
     maps = tuple(
-        _session_map(
-            part,
-            reports[k],
-            session=part_name(session, k),
-            sensor=sensor,
-            config=config,
-        )
-        for k, part in enumerate(kept)
+        _divided(part, report, session=part_name(session, k), sensor=sensor, config=config.partition)
+        for k, (part, report) in enumerate(zip(kept, reports, strict=True))
     )
     observer.on_progress(1.0)
     return maps
 
 
-def _check_without_odometry(track: Track, planar: bool, name: str) -> None:
-    """Raise TrackingLost if the scans of a laser, or of a sensor in the hand, do not tell where they are."""
-    if planar:
-        check_followed(track.trajectory, name)
-
-
-def _session_map(
-    part: PartMap,
-    report: ReadReport,
-    *,
-    session: str,
-    sensor: SensorKind,
-    config: Config,
+def _divided(
+    part: SessionMap, report: ReadReport, *, session: str, sensor: SensorKind, config: PartitionConfig
 ) -> SessionMap:
-    """The session of a part, cut into submaps."""
-    graph, submaps = divide(part.grid, config.partition)
-    return SessionMap(
-        session=session,
-        sensor=sensor,
-        grid=part.grid,
-        submaps=submaps,
-        trajectory=part.trajectory,
-        loops=part.loops,
-        graph=graph,
-        consistency=part.consistency,
-        odometry=part.odometry,
-        precision=part.precision,
-        points=part.points,
-        report=report,
+    """The map of a part under its name, cut into submaps."""
+    graph, submaps = divide(part.grid, config)
+    return dataclasses.replace(
+        part, session=session, sensor=sensor, submaps=submaps, graph=graph, report=report
     )
 
 
@@ -239,7 +207,7 @@ def _map(
     recognizer: PlaceRecognizer | None,
     *,
     whole: bool = False,
-) -> tuple[list[PartMap], Track]:
+) -> tuple[list[SessionMap], Track]:
     """Track the scans, close the loops, and draw a map of each part; see `build_maps`. Returns what tracking
     says, too.
 
@@ -248,12 +216,15 @@ def _map(
     projection = config.projection
     rest = iter(scans)
     beginning = _begin(rest)
-    narrow = any(SENSOR_MODELS[scan.sensor].narrow for scan in beginning.scans[:1])
-    in_hand = not all(is_rolling(scan) for scan in beginning.scans[:1])
+    first = beginning.scans[:1]  # a recording has one kind of sensor
+    narrow = any(SENSOR_MODELS[scan.sensor].narrow for scan in first)
+    planar = any(SENSOR_MODELS[scan.sensor].planar for scan in first)
+    in_hand = not all(is_rolling(scan) for scan in first)
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
-        points = _keyframe_points(projection, beginning.scans[:1])
-        if points is not None:
+        points = None
+        if projection.points_voxel_m is not None and not planar:
+            points = KeyframePoints(projection.points_voxel_m, projection.max_range_m)
             stack.enter_context(closing(points))
         closer = LoopCloser(
             keyframes,
@@ -262,9 +233,8 @@ def _map(
             parameters=EXACT_TRACKING if narrow or in_hand else LOOPS,
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
-        scans = chain(beginning.scans, rest)
-        track = _track(scans, _tracker(config), closer, points, observer)
-        track = dataclasses.replace(track, left_out=beginning.left_out, warning=beginning.warning)
+        record = _track(chain(beginning.scans, rest), _tracker(config), closer, points, observer)
+        track = record.track(beginning.left_out, beginning.warning)
         closed = closer.finish()
         if whole:
             closed = closed.undivided()
@@ -278,7 +248,7 @@ def _track(
     closer: LoopCloser,
     points: KeyframePoints | None,
     observer: Observer,
-) -> Track:
+) -> TrackRecord:
     """Track all scans, keep the keyframes, and close loops on the way."""
     record = TrackRecord()
     for scan in scans:
@@ -287,11 +257,11 @@ def _track(
         if tracked.keyframe:
             pose = SE2.from_matrix(registered.T_session_base)
             closer.add(Keyframe(len(record), tracked.planar_scan, pose, tracked.restart))
-            if points is not None and not SENSOR_MODELS[scan.sensor].planar:
+            if points is not None:
                 points.append(len(record), registered.scan)
         record.append(scan, tracked)
         observer.on_scan(registered)
-    return record.track(tracker)
+    return record
 
 
 def _begin(scans: Iterator[Scan]) -> Beginning:
@@ -299,14 +269,6 @@ def _begin(scans: Iterator[Scan]) -> Beginning:
     from pc2grid.estimation.carried import begin
 
     return begin(scans)
-
-
-def _keyframe_points(projection: ProjectionConfig, first: Sequence[Scan]) -> KeyframePoints | None:
-    """What keeps the points in space of a session; None if they are not wanted, and of a laser."""
-    planar = all(SENSOR_MODELS[scan.sensor].planar for scan in first)
-    if projection.points_voxel_m is None or planar:
-        return None
-    return KeyframePoints(projection.points_voxel_m, projection.max_range_m)
 
 
 def _tracker(config: Config) -> Tracker:

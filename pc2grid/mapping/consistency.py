@@ -16,13 +16,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from itertools import chain, tee
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64, BoolGrid
-from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.mapping.keyframes import Keyframe
 from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Trajectory
@@ -155,15 +155,15 @@ def _drawn(
     keyframe: Keyframe, pose: SE2, grid: OccupancyGrid, clear: BoolGrid, parameters: ConsistencyParameters
 ) -> _Drawn:
     """The hits that end the view, and which of them lie on clear ground."""
-    planar_scan = keyframe.planar_scan
-    range_m, bearing_rad = _polar(planar_scan)
+    rays_m = keyframe.planar_scan.hits_m - keyframe.planar_scan.origin_m
+    range_m, bearing_rad = np.hypot(*rays_m.T), np.arctan2(rays_m[:, 1], rays_m[:, 0])
     sector = (
         np.floor(bearing_rad / (2.0 * math.pi) * parameters.sectors).astype(np.int64) % parameters.sectors
     )
     farthest_m = np.zeros(parameters.sectors)
     np.maximum.at(farthest_m, sector, range_m)
     ends_view = range_m > farthest_m[sector] - parameters.behind_m
-    hits_m = pose.apply(planar_scan.hits_m[ends_view & (range_m < parameters.reach_m)])
+    hits_m = pose.apply(keyframe.planar_scan.hits_m[ends_view & (range_m < parameters.reach_m)])
     cells = grid.to_cell(hits_m)
     inside = ((cells >= 0) & (cells < clear.shape)).all(axis=1)
     on_clear = np.zeros(len(hits_m), np.bool_)
@@ -171,22 +171,11 @@ def _drawn(
     return _Drawn(keyframe.index, hits_m, on_clear)
 
 
-def _polar(planar_scan: PlanarScan) -> tuple[F64, F64]:
-    """Range and bearing of the hits of a scan, (M,) each, from its sensor."""
-    rays_m = planar_scan.hits_m - planar_scan.origin_m
-    return np.hypot(rays_m[:, 0], rays_m[:, 1]), np.arctan2(rays_m[:, 1], rays_m[:, 0])
-
-
 def _with_neighbours(scans: Iterable[_Drawn]) -> Iterator[tuple[_Drawn | None, _Drawn, _Drawn | None]]:
     """Each scan between the one before and the one after it; None at the two ends."""
-    before: _Drawn | None = None
-    scan: _Drawn | None = None
-    for after in scans:
-        if scan is not None:
-            yield before, scan, after
-        before, scan = scan, after
-    if scan is not None:
-        yield before, scan, None
+    before, here, after = tee(scans, 3)
+    next(after, None)
+    return zip(chain((None,), before), here, chain(after, (None,)), strict=False)
 
 
 def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m: float) -> int:

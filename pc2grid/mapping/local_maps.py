@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64, SUBPIXEL_BITS, polygon_corners
-from pc2grid.estimation.point_to_line import Match, PointGrid, best_placements
+from pc2grid.estimation.point_to_line import Match, PointGrid, best_placements, evenly
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
@@ -28,6 +28,13 @@ class LocalMapParameters:
     radii_cells : neighbourhoods of the refinement, see `PointGrid.match`.
     every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them add no new walls.
     cached : local maps that stay in memory.
+
+    Of two local maps that are compared with each other:
+
+    search_points : points of each that are compared.
+    min_observed : at least this share of the points of one of the two must lie in cells that the other one
+        observed.
+    min_agreement : share of those that must meet an obstacle instead of free space, in both directions.
     """
 
     range_m: float = 12.0
@@ -37,6 +44,9 @@ class LocalMapParameters:
     radii_cells: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1)
     every_keyframe: int = 2
     cached: int = 24
+    search_points: int = 400
+    min_observed: float = 0.35
+    min_agreement: float = 0.8
 
 
 LOCAL_MAPS = LocalMapParameters()
@@ -116,14 +126,6 @@ class LocalMap:
             points_m, normal_rad, guess, guess, no_prior, radii=self._parameters.radii_cells
         )
 
-    def search(
-        self, points_m: F64, guess: SE2, window_m: float, window_rad: float
-    ) -> list[tuple[float, SE2]]:
-        """The best few poses of points (N, 2) in a window around `guess`, with their scores 0..1."""
-        return best_placements(
-            self._field, self._low_m, self._parameters.cell_m, points_m, guess, window_m, window_rad
-        )
-
     def agreement(self, points_m: F64, pose: SE2) -> tuple[float, float]:
         """How well points (N, 2) placed at `pose` fit what this local map observed.
 
@@ -141,60 +143,78 @@ class LocalMap:
         cells: I64 = np.floor((points - self._low_m) / self._parameters.cell_m)[:, ::-1].astype(np.int64)
         return cells
 
+    def sample(self) -> tuple[F64, F64]:
+        """The points (S, 2) that are compared with another local map, and their normals (S,)."""
+        chosen = evenly(len(self.points_m), self._parameters.search_points)
+        return self.points_m[chosen], self.normal_rad[chosen]
+
+    def information(self, newer: LocalMap, T_self_newer: SE2) -> F64:
+        """Information (3, 3) on the pose of a newer local map by what both show; none along a bare wall."""
+        return self.match(*newer.sample(), T_self_newer).information
+
+    def overlap(self, newer: LocalMap, guess: SE2, window_m: float, window_rad: float) -> Match | None:
+        """The pose of a newer local map in this one, near a guess; None if they do not overlap or agree.
+
+        Correlative scan matching over the window proposes poses. Of those at which enough of each local map
+        lies on what the other one observed, the one at which they agree best counts: a wrong one contradicts
+        the other loops in the pose graph.
+        """
+        p, fits = self._parameters, []
+        (points, normals), (points_back, _) = newer.sample(), self.sample()
+        for _, start in best_placements(
+            self._field, self._low_m, p.cell_m, points, guess, window_m, window_rad
+        ):
+            match = self.match(points, normals, start)
+            observed, agreement = self.agreement(points, match.pose)
+            observed_back, agreement_back = newer.agreement(points_back, match.pose.inverse())
+            if max(observed, observed_back) > p.min_observed:
+                fits.append((min(agreement, agreement_back), match))
+        agreement, best = max(fits, key=lambda fit: fit[0], default=(0.0, None))
+        return best if agreement >= p.min_agreement else None
+
 
 class LocalMaps:
-    """The local maps of a session, drawn on demand from its keyframes; the last used ones are kept.
+    """The local maps of a session: runs of its keyframes. Each is drawn when it is needed.
 
-    runs : of each local map, the numbers of its keyframes.
+    runs : (N,) numbers of the keyframes of each. anchors : (N,) the keyframe in whose frame each is drawn.
     """
 
     def __init__(self, keyframes: Keyframes, parameters: LocalMapParameters = LOCAL_MAPS) -> None:
         self._keyframes = keyframes
         self._parameters = parameters
         self.runs: list[range] = []
+        self.anchors: list[int] = []
         self._settled: F64 | None = None
-        self._drawn: OrderedDict[int, LocalMap] = OrderedDict()
+        self._drawn = lru_cache(parameters.cached)(self._draw)
 
-    def append(self, run: range) -> None:
-        """Add the local map of one more run of keyframes."""
+    def complete(self) -> None:
+        """The keyframes since the last local map become one."""
+        run = range(self.runs[-1].stop if self.runs else 0, len(self._keyframes))
         self.runs.append(run)
-
-    @property
-    def end(self) -> int:
-        """The number of the keyframe behind the last run."""
-        return self.runs[-1].stop if self.runs else 0
-
-    def anchors(self) -> list[int]:
-        """The keyframe in whose frame each local map is drawn."""
-        return [self.anchor(number) for number in range(len(self.runs))]
-
-    def anchor(self, number: int) -> int:
-        """The keyframe in whose frame a local map is drawn."""
-        run = self.runs[number]
-        return run[len(run) // 2]
+        self.anchors.append(run[len(run) // 2])
 
     def redraw(self, settled: F64) -> None:
         """From now on, draw with settled keyframe poses (K, 3), x, y, yaw, in place of the tracked ones."""
         self._settled = settled
-        self._drawn.clear()
+        self._drawn.cache_clear()
 
     def __getitem__(self, number: int) -> LocalMap:
-        if number not in self._drawn:
-            run, anchor = self.runs[number], self.anchor(number)
-            every = self._parameters.every_keyframe
-            drawn = run[(anchor - run.start) % every :: every]
-            keyframes, poses = self.keyframes(drawn, anchor)
-            self._drawn[number] = LocalMap(keyframes, poses, self._parameters)
-            if len(self._drawn) > self._parameters.cached:
-                self._drawn.popitem(last=False)
-        self._drawn.move_to_end(number)
-        return self._drawn[number]
+        return self._drawn(number)
 
     def keyframes(self, numbers: range, anchor: int) -> tuple[list[Keyframe], list[SE2]]:
         """Keyframes, and their poses T_anchor_base in the frame of the keyframe `anchor`."""
-        keyframes = [self._keyframes[k] for k in numbers]
+        return [self._keyframes[k] for k in numbers], self.poses(numbers, anchor)
+
+    def poses(self, numbers: Iterable[int], anchor: int) -> list[SE2]:
+        """T_anchor_base of keyframes in the frame of the keyframe `anchor`."""
         T_anchor_session = self._pose(anchor).inverse()
-        return keyframes, [T_anchor_session @ self._pose(k) for k in numbers]
+        return [T_anchor_session @ self._pose(k) for k in numbers]
+
+    def _draw(self, number: int) -> LocalMap:
+        run, anchor = self.runs[number], self.anchors[number]
+        every = self._parameters.every_keyframe
+        keyframes, poses = self.keyframes(run[(anchor - run.start) % every :: every], anchor)
+        return LocalMap(keyframes, poses, self._parameters)
 
     def _pose(self, number: int) -> SE2:
         """T_session_base of a keyframe: settled, or as tracked if loops are not closed yet."""

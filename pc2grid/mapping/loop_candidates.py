@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,12 +95,8 @@ class LoopCandidates:
         """Add what was recognised on the newest stretch."""
         self._pending = [*self._pending, *candidates][-self._parameters.pending :]
 
-    def remove(self, candidate: Candidate) -> None:
-        """Forget a candidate that was accepted or found to be wrong."""
-        self._pending.remove(candidate)
-
-    def acceptable(self, nodes: F64, travel_m: F64) -> list[Candidate]:
-        """The candidates that are loops by drift and by each other.
+    def take(self, nodes: F64, travel_m: F64) -> list[Candidate]:
+        """The candidates that are loops by drift and by each other. They, and those that cannot be, go.
 
         nodes : (N, 3) settled poses of the local maps. travel_m : (N,) metres of travel at each.
         """
@@ -128,8 +125,8 @@ class LoopCandidates:
         less_likely = (support == support[:, None]) & (likely <= likely[:, None] - p.rival)
         beaten = weaker | less_likely | ~(same & ~agrees & in_reach)
         chosen = fits & beaten.all(axis=1)
-        self._pending = [c for c, kept in zip(pending, in_reach & ~known, strict=True) if kept]
-        return [c for c, accepted in zip(pending, chosen, strict=True) if accepted]
+        self._pending = list(compress(pending, in_reach & ~known & ~chosen))
+        return list(compress(pending, chosen))
 
     def _agreement(
         self, older: I64, newer: I64, measured: F64, nodes: F64, travel_m: F64

@@ -22,13 +22,13 @@ import numpy as np
 
 from pc2grid.arrays import F64, I64
 from pc2grid.config import ProjectionConfig
+from pc2grid.estimation.point_to_line import evenly
 from pc2grid.geometry import SE2
 from pc2grid.mapping.building_axes import wall_direction
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps, pose_at
-from pc2grid.mapping.loop_candidates import CANDIDATES, Candidate, CandidateParameters, LoopCandidates
+from pc2grid.mapping.loop_candidates import CANDIDATES, CandidateParameters, LoopCandidates
 from pc2grid.mapping.loop_parameters import LOOPS, LoopParameters
-from pc2grid.mapping.loop_verification import LoopVerification, spread_over_visits
 from pc2grid.mapping.parts import PARTS, PartParameters, connected
 from pc2grid.mapping.place_recognition import PlaceRecognizer
 from pc2grid.mapping.pose_graph import Edge, Solution
@@ -43,7 +43,7 @@ class LoopCloser:
 
     keyframes : gets those of the session; local maps are drawn from them when needed.
     recognizer : asked for every stretch of travel; None: loops are searched near the tracked pose only.
-    projection : how the grids for the recognizer are drawn; None: the defaults.
+    projection : how the grids for the recognizer are drawn.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class LoopCloser:
         keyframes: Keyframes,
         *,
         recognizer: PlaceRecognizer | None = None,
-        projection: ProjectionConfig | None = None,
+        projection: ProjectionConfig = ProjectionConfig(),
         parameters: LoopParameters = LOOPS,
         local_map_parameters: LocalMapParameters = LOCAL_MAPS,
         candidate_parameters: CandidateParameters = CANDIDATES,
@@ -61,16 +61,10 @@ class LoopCloser:
         self._part_parameters = part_parameters
         self._keyframes = keyframes
         self._local_maps = LocalMaps(keyframes, local_map_parameters)
-        self._verification = LoopVerification(self._local_maps, parameters)
         self._graph = SessionGraph(parameters)
         self._candidates = LoopCandidates(candidate_parameters)
         self._stretches = Stretches(
-            self._local_maps,
-            self._keyframes,
-            self._candidates,
-            parameters,
-            recognizer,
-            projection or ProjectionConfig(),
+            self._local_maps, self._candidates, parameters.stretch_maps, recognizer, projection
         )
         self._travel_m = 0.0  # in the local map that is not complete yet
         self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
@@ -98,9 +92,9 @@ class LoopCloser:
 
     def _complete_local_map(self) -> None:
         """The last keyframes become a local map: placed by tracking, then compared with older ones."""
-        newest, begin = len(self._graph), self._local_maps.end
-        restart = begin in self._keyframes.restarts
-        self._local_maps.append(range(begin, len(self._keyframes)))
+        newest = len(self._graph)
+        self._local_maps.complete()
+        restart = self._local_maps.runs[newest].start in self._keyframes.restarts
         self._travel_m = 0.0
         self._place(newest, restart)
         overlaps = list(self._overlaps(newest))
@@ -114,18 +108,21 @@ class LoopCloser:
     def _place(self, newest: int, restart: bool) -> None:
         """Add the newest local map to the pose graph, by tracking."""
         walls = wall_direction(self._local_maps[newest].normal_rad)
-        tracked = self._keyframes.poses()
-        pose = pose_at(tracked, self._local_maps.anchor(newest))
+        pose = self._tracked(newest)
         if not newest:
-            self._graph.begin(pose, walls)
+            self._graph.add(pose, walls)
             self._travelled_m.append(0.0)
             return
-        step = pose_at(tracked, self._local_maps.anchor(newest - 1)).inverse() @ pose
+        step = self._tracked(newest - 1).inverse() @ pose
         drift_m = self._parameters.lost_m if restart else math.hypot(step.x, step.y)
         self._drift_m += drift_m
         self._travelled_m.append(self._travelled_m[-1] + drift_m)
-        shown = None if restart else self._verification.information(newest - 1, newest, step)
+        shown = None if restart else self._local_maps[newest - 1].information(self._local_maps[newest], step)
         self._graph.extend(step, walls, shown)
+
+    def _tracked(self, number: int) -> SE2:
+        """The pose of a local map as tracked."""
+        return self._keyframes.pose(self._local_maps.anchors[number])
 
     def _close(self, loops: list[Edge]) -> None:
         """Add loops to the pose graph, and solve it again."""
@@ -136,53 +133,48 @@ class LoopCloser:
 
     def _overlaps(self, newest: int) -> Iterator[Edge]:
         """Verified overlaps of the newest local map with older ones, near its tracked pose."""
-        window_m, window_rad = self._parameters.window(self._drift_m)
+        window = self._parameters.window(self._drift_m)
         nodes = self._graph.nodes
         # The local map before the newest is left out: tracking matched both against the same walls.
         before = nodes[: max(newest - 1, 0), :2]
         distance_m = np.hypot(*(before - nodes[newest, :2]).T)
-        near_m = self._parameters.near_m + window_m
+        near_m = self._parameters.near_m + window[0]
         for older in spread_over_visits(distance_m, near_m, self._parameters.compared):
-            edge = self._compare(older, newest, window_m, window_rad)
-            if edge is not None:
-                yield edge
+            yield from self._compare(older, newest, self._graph.relative(older, newest), window)
 
-    def _compare(self, older: int, newer: int, window_m: float, window_rad: float) -> Edge | None:
-        """The measured relative pose of two local maps, near the present one; None if they do not match."""
-        guess = self._graph.relative(older, newer)
-        return self._verification.edge(older, newer, guess, window_m, window_rad)
+    def _compare(self, older: int, newer: int, guess: SE2, window: tuple[float, float]) -> list[Edge]:
+        """The measured relative pose of two local maps near a guess; none if they do not match.
+
+        window : half widths of the search around the guess, metres and radians.
+        """
+        match = self._local_maps[older].overlap(self._local_maps[newer], guess, *window)
+        if match is None:
+            return []
+        information = self._parameters.information_share * match.information
+        return [Edge(older, newer, match.pose, information, loop=True)]
 
     # --- place recognition --------------------------------------------------------------------------------
 
     def _close_candidates(self) -> None:
-        """Close the loops among the recognised places that drift allows and that agree with each other."""
-        accepted = self._candidates.acceptable(self._graph.nodes, np.array(self._travelled_m))
+        """Close the loops among the recognised places that drift allows and that agree with each other: those
+        whose local maps match near where they were recognised."""
+        p = self._parameters
         loops: list[Edge] = []
-        for candidate in accepted:
-            self._candidates.remove(candidate)
-            loops += self._confirmed(candidate)
+        for candidate in self._candidates.take(self._graph.nodes, np.array(self._travelled_m)):
+            for older, newer, guess in self._stretches.guesses(candidate)[: p.compared_pairs]:
+                loops += self._compare(older, newer, guess, (p.recognized_m, p.certain_rad))
         self._close(loops)
         if loops:
             # The newest stretch lies where it belongs now: what the search near the tracked pose missed is
             # near.
             self._close([edge for number in self._stretches.latest() for edge in self._overlaps(number)])
 
-    def _confirmed(self, candidate: Candidate) -> list[Edge]:
-        """Loops between the local maps of two stretches: those that match near where one was recognised."""
-        parameters = self._parameters
-        guesses = self._stretches.guesses(candidate)[: parameters.compared_pairs]
-        edges = [
-            self._verification.edge(older, newer, guess, parameters.recognized_m, parameters.certain_rad)
-            for older, newer, guess in guesses
-        ]
-        return [edge for edge in edges if edge is not None]
-
     # --- at the end of the session ------------------------------------------------------------------------
 
     def _settled_keyframes(self) -> SettledKeyframes:
         """Solve the pose graph; the poses, loops and parts that this gives."""
         solution = self._settle()
-        scans, anchors = self._keyframes.scans, self._local_maps.anchors()
+        scans, anchors = self._keyframes.scans, self._local_maps.anchors
         loops = tuple(
             Loop(
                 older=scans[anchors[edge.first]],
@@ -214,12 +206,14 @@ class LoopCloser:
         """
         self._graph.solve()
         self._local_maps.redraw(self._settled())
-        p, edges = self._parameters, self._graph.edges
-        again = (
-            self._compare(e.first, e.second, p.certain_m, p.certain_rad) if e.loop else None for e in edges
-        )
-        self._graph.edges = [new or old for new, old in zip(again, edges, strict=True)]
+        self._graph.edges = [self._again(edge) if edge.loop else edge for edge in self._graph.edges]
         return self._graph.solve()
+
+    def _again(self, edge: Edge) -> Edge:
+        """An overlap as the local maps show it now; as it was if they no longer do."""
+        guess = self._graph.relative(edge.first, edge.second)
+        window = self._parameters.certain_m, self._parameters.certain_rad
+        return next(iter(self._compare(edge.first, edge.second, guess, window)), edge)
 
     def _settled(self) -> F64:
         """Keyframe poses (K, 3) that follow the anchors of their local maps.
@@ -230,7 +224,7 @@ class LoopCloser:
         tracked = self._keyframes.poses()
         known: dict[int, SE2] = {}
         for number, run in enumerate(self._local_maps.runs):
-            anchor = self._local_maps.anchor(number)
+            anchor = self._local_maps.anchors[number]
             correction = pose_at(self._graph.nodes, number) @ pose_at(tracked, anchor).inverse()
             restarts = self._keyframes.restarts
             ends = [k for k, at in ((run[0], run.start), (run[-1], run.stop)) if at in restarts]
@@ -252,3 +246,19 @@ class LoopCloser:
         """(N,) number of the part of each local map."""
         loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
         return connected(self._segments(), loops, self._part_parameters)
+
+
+def spread_over_visits(distance_m: F64, near_m: float, count: int) -> list[int]:
+    """Which older local maps, `distance_m` (N,) away from the newest, to compare it with; `count` at most.
+
+    A robot that drives up and down sees a place dozens of times. The nearest local map of the first visit,
+    of the last and of some in between are chosen, so that the newest is connected to all visits.
+    """
+    near = np.flatnonzero(distance_m < near_m)
+    if not len(near):
+        return []
+    visits = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
+    chosen = [visits[k] for k in evenly(len(visits), count)]
+    nearest = [int(visit[np.argmin(distance_m[visit])]) for visit in chosen]
+    others = [int(k) for k in near[np.argsort(distance_m[near], kind="stable")] if k not in nearest]
+    return nearest + others[: count - len(nearest)]

@@ -31,13 +31,6 @@ class LoopParameters:
     max_window_m, max_window_rad : its largest size.
     lost_m : travel that a lost stretch counts as; enough for the largest window.
 
-    Which poses are accepted:
-
-    search_points : points of each local map that are compared.
-    min_observed : at least this share of the points of one of the two local maps must lie in cells that the
-        other one observed.
-    min_agreement : share of those that must meet an obstacle instead of free space, in both directions.
-
     What they count in the pose graph:
 
     information_share : of the information that a match reports: the errors of points on one wall are
@@ -66,9 +59,6 @@ class LoopParameters:
     max_window_m: float = 3.0
     max_window_rad: float = math.radians(20.0)
     lost_m: float = 150.0
-    search_points: int = 400
-    min_observed: float = 0.35
-    min_agreement: float = 0.8
     information_share: float = 0.1
     tracking_sigma_m: float = 0.02
     tracking_sigma_per_m: float = 0.01

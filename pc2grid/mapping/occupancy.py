@@ -7,13 +7,15 @@ for the empty rectangle around it.
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import I64, SUBPIXEL_BITS, U8, polygon_corners
+from pc2grid.arrays import I64, SUBPIXEL_BITS, polygon_corners
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
@@ -31,7 +33,6 @@ class OccupancyParameters:
     body_m : radius of the robot's body around the origin of the base, where no obstacle can be.
     lone_window, lone_cells : a cell that was hit once is noise if at least `lone_cells` cells in the square
         of `lone_window` around it were hit more often.
-    merged : marks of cells that are collected before each cell is reduced to one entry.
     """
 
     hit: int = 150
@@ -40,80 +41,40 @@ class OccupancyParameters:
     body_m: float = 0.15
     lone_window: int = 3
     lone_cells: int = 3
-    merged: int = 200_000
 
 
 OCCUPANCY = OccupancyParameters()
+Window = tuple[slice, slice]
+"""Rows and columns of a part of an array."""
 
 _TILE = 256  # cells along the edge of a tile
-_COLUMN_OFFSET = 1 << 31  # makes column numbers positive, so that row and column fit into one int64
 
 
-class _Tiles:
-    """Log-odds in hundredths, in tiles that are created where there is something to add.
+class _Tile:
+    """A square of cells: evidence for walls and for things, log-odds in hundredths, and heights (`SLICES`).
 
-    log_odds, observed : tiles by the row and column of a tile; `observed` is what something was added to.
+    observed : cells that something was added to.
     """
 
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self.log_odds: dict[tuple[int, int], NDArray[np.int16]] = {}
-        self.observed: dict[tuple[int, int], NDArray[np.bool_]] = {}
-
-    def add(self, update: NDArray[np.int16], x0: int, y0: int) -> None:
-        """Add log-odds (h, w), whose first cell is in column `x0` and row `y0`."""
-        height, width = update.shape
-        for row in range(y0 // _TILE, (y0 + height - 1) // _TILE + 1):
-            for column in range(x0 // _TILE, (x0 + width - 1) // _TILE + 1):
-                r, c = row * _TILE - y0, column * _TILE - x0
-                part = update[max(r, 0) : max(r + _TILE, 0), max(c, 0) : max(c + _TILE, 0)]
-                touched = part != 0
-                if not touched.any():
-                    continue
-                if (row, column) not in self.log_odds:
-                    self.log_odds[row, column] = np.zeros((_TILE, _TILE), dtype=np.int16)
-                    self.observed[row, column] = np.zeros((_TILE, _TILE), dtype=np.bool_)
-                where = np.s_[
-                    max(-r, 0) : max(-r, 0) + part.shape[0], max(-c, 0) : max(-c, 0) + part.shape[1]
-                ]
-                tile = self.log_odds[row, column][where]
-                np.clip(tile + part, -self._limit, self._limit, out=tile)
-                self.observed[row, column][where] |= touched
+    def __init__(self) -> None:
+        self.walls = np.zeros((_TILE, _TILE), np.int16)
+        self.things = np.zeros((_TILE, _TILE), np.int16)
+        self.observed = np.zeros((_TILE, _TILE), np.bool_)
+        self.heights = np.zeros((_TILE, _TILE), np.uint8)
 
 
-class _Marks:
-    """A byte for each of some cells, of which bits are set; memory grows with these cells, not with the
-    number of times that they are marked.
+def _under(low: I64, shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, int], Window, Window]]:
+    """The tiles under a window (h, w) whose first cell is in the column and the row `low`.
 
-    at_once : marks that are collected before each cell is reduced to one entry.
+    Of each its row and column among the tiles, and which of its cells are which of the window.
     """
-
-    def __init__(self, at_once: int) -> None:
-        self._at_once = at_once
-        self._kept: list[tuple[I64, U8]] = [(np.empty(0, np.int64), np.empty(0, np.uint8))]
-
-    def add(self, cells: I64, bits: U8) -> None:
-        """Set bits (N,) of cells (N, 2), column and row."""
-        self._kept.append(((cells[:, 1] << 32) + (cells[:, 0] + _COLUMN_OFFSET), bits))
-        if sum(len(codes) for codes, _ in self._kept[1:]) > self._at_once:
-            self._merge()
-
-    def within(self, first: tuple[int, int], shape: tuple[int, ...]) -> tuple[I64, I64, U8]:
-        """Rows, columns and bits (N,) of the marked cells of a window; `first` is the cell (0, 0) there."""
-        codes, bits = self._merge()
-        rows, columns = (
-            (codes >> 32) - first[0],
-            (codes & (2 * _COLUMN_OFFSET - 1)) - _COLUMN_OFFSET - first[1],
-        )
-        inside = (rows >= 0) & (rows < shape[0]) & (columns >= 0) & (columns < shape[1])
-        return rows[inside], columns[inside], bits[inside]
-
-    def _merge(self) -> tuple[I64, U8]:
-        codes, bits = (np.concatenate(parts) for parts in zip(*self._kept, strict=True))
-        order = np.argsort(codes, kind="stable")
-        unique, starts = np.unique(codes[order], return_index=True)
-        self._kept = [(unique, np.bitwise_or.reduceat(bits[order], starts) if len(starts) else bits)]
-        return self._kept[0]
+    (x0, y0), (height, width) = low.tolist(), shape
+    for row in range(y0 // _TILE, (y0 + height - 1) // _TILE + 1):
+        for column in range(x0 // _TILE, (x0 + width - 1) // _TILE + 1):
+            r, c = row * _TILE - y0, column * _TILE - x0
+            of_window = np.s_[max(r, 0) : min(r + _TILE, height), max(c, 0) : min(c + _TILE, width)]
+            of_tile = np.s_[max(-r, 0) : min(_TILE, height - r), max(-c, 0) : min(_TILE, width - c)]
+            yield (row, column), of_tile, of_window
 
 
 class GridBuilder:
@@ -127,9 +88,9 @@ class GridBuilder:
     def __init__(self, config: ProjectionConfig, parameters: OccupancyParameters = OCCUPANCY) -> None:
         self._config = config
         self._parameters = parameters
-        self._walls, self._things = _Tiles(parameters.limit), _Tiles(parameters.limit)
-        self._heights_m: tuple[float, float] | None = None  # lowest and highest plane; NaN: not of planes
-        self._heights = _Marks(parameters.merged)
+        self._tiles: defaultdict[tuple[int, int], _Tile] = defaultdict(_Tile)
+        self._things_seen = self._heights_seen = False
+        self._planes_m: tuple[float, float] | None = None  # lowest and highest plane; NaN: not of planes
 
     def add(self, planar_scan: PlanarScan, T_grid_base: SE2) -> None:
         """Draw one planar scan taken at `T_grid_base`.
@@ -137,86 +98,104 @@ class GridBuilder:
         Raises LimitExceeded if the map needs more than `max_cells`.
         """
         height_m = math.nan if planar_scan.height_m is None else planar_scan.height_m
-        low_m, high_m = self._heights_m or (height_m, height_m)
-        self._heights_m = float(np.minimum(low_m, height_m)), float(np.maximum(high_m, height_m))
+        low_m, high_m = self._planes_m or (height_m, height_m)
+        self._planes_m = float(np.minimum(low_m, height_m)), float(np.maximum(high_m, height_m))
+        walls, hits, things, low = self._drawn(planar_scan, T_grid_base)
+        standing, heights = np.zeros_like(walls), np.zeros(walls.shape, np.uint8)
+        self._things_seen |= len(things) > 0
+        if self._things_seen:
+            standing[walls != 0] = self._parameters.miss
+            standing[things[:, 1], things[:, 0]] = self._parameters.hit
+            standing[walls > 0] = self._parameters.miss
+        if len(planar_scan.heights):
+            self._heights_seen = True
+            columns, rows = np.concatenate((hits, things)).T
+            np.bitwise_or.at(heights, (rows, columns), planar_scan.heights)
+        for number, of_tile, of_window in _under(low, walls.shape):
+            touched = walls[of_window] != 0
+            if touched.any():
+                tile = self._tiles[number]
+                tile.observed[of_tile] |= touched
+                self._sum(tile.walls[of_tile], walls[of_window])
+                if self._things_seen:
+                    self._sum(tile.things[of_tile], standing[of_window])
+                if self._heights_seen:
+                    tile.heights[of_tile] |= heights[of_window]
+        self._check_size(len(self._tiles) * _TILE * _TILE)
+
+    def _drawn(self, planar_scan: PlanarScan, T_grid_base: SE2) -> tuple[NDArray[np.int16], I64, I64, I64]:
+        """The log-odds (h, w) that a planar scan adds for walls, and the cells of its hits and things.
+
+        The latter (M, 2) and (L, 2) are columns and rows of the window, whose first cell is at the last array
+        (2,), column and row in the grid's frame.
+        """
         p, resolution = self._parameters, self._config.resolution_m
         outline = T_grid_base.apply(planar_scan.free_polygon()) / resolution
-        hits = np.floor(T_grid_base.apply(planar_scan.hits_m) / resolution).astype(np.int64)
-        low = np.floor(outline.min(axis=0)).astype(np.int64) - 1
-        high = np.floor(outline.max(axis=0)).astype(np.int64) + 2
+        hits, things = (
+            np.floor(T_grid_base.apply(points_m) / resolution).astype(np.int64)
+            for points_m in (planar_scan.hits_m, planar_scan.low_m)
+        )
         here = np.floor(np.array([T_grid_base.x, T_grid_base.y]) / resolution).astype(np.int64)
         around = math.ceil(p.body_m / resolution) + 1
-        low, high = np.minimum(low, here - around), np.maximum(high, here + around + 1)
-        if len(hits):
-            low, high = np.minimum(low, hits.min(axis=0)), np.maximum(high, hits.max(axis=0) + 1)
-        update = np.zeros((high[1] - low[1], high[0] - low[0]), dtype=np.int16)
+        edge = np.floor(outline).astype(np.int64)
+        covered = np.concatenate((edge - 1, edge + 1, here[None] - around, here[None] + around, hits, things))
+        low = covered.min(axis=0)
+        columns, rows = (covered.max(axis=0) + 1 - low).tolist()
+        update = np.zeros((rows, columns), dtype=np.int16)
         corners = polygon_corners(outline - low)
         cv2.fillPoly(update, [corners], p.miss, shift=SUBPIXEL_BITS)
         # The outline runs through cells of obstacles, most of all along a wall that is seen at a small angle:
         # these cells are not drawn as free.
         cv2.polylines(update, _rims(corners, planar_scan.free_m), False, 0, shift=SUBPIXEL_BITS)
-        things = np.floor(T_grid_base.apply(planar_scan.low_m) / resolution).astype(np.int64)
-        if len(planar_scan.heights):
-            self._heights.add(np.concatenate((hits, things)), planar_scan.heights)
-        things = things[((things >= low) & (things < high)).all(axis=1)] - low
+        hits, things = hits - low, things - low
         update[things[:, 1], things[:, 0]] = p.miss
-        update[hits[:, 1] - low[1], hits[:, 0] - low[0]] = p.hit
+        update[hits[:, 1], hits[:, 0]] = p.hit
         cv2.circle(update, (here - low).tolist(), round(p.body_m / resolution), 2 * p.miss, -1)
-        if len(things) or self._things.log_odds:
-            standing = np.where(update != 0, np.int16(p.miss), np.int16(0))
-            standing[things[:, 1], things[:, 0]] = p.hit
-            standing[update > 0] = p.miss
-            self._things.add(standing, int(low[0]), int(low[1]))
-        self._walls.add(update, int(low[0]), int(low[1]))
-        self._check_size(len(self._walls.log_odds) * _TILE * _TILE)
+        return update, hits, things, low
+
+    def _sum(self, evidence: NDArray[np.int16], more: NDArray[np.int16]) -> None:
+        """Add log-odds in place, within the limit."""
+        limit = self._parameters.limit
+        np.clip(evidence + more, -limit, limit, out=evidence)
 
     def grid(self) -> OccupancyGrid:
         """The map so far: 0..100 where observed, unknown elsewhere, cropped to the observed part."""
-        tiles = self._walls.log_odds
-        if not tiles:
-            return OccupancyGrid(
-                cells=np.zeros((0, 0), np.int8), resolution_m=self._config.resolution_m, origin_m=(0.0, 0.0)
-            )
-        rows, columns = zip(*tiles, strict=True)
-        height = (max(rows) - min(rows) + 1) * _TILE
-        width = (max(columns) - min(columns) + 1) * _TILE
-        self._check_size(height * width)
-        cells = np.full((height, width), UNKNOWN, dtype=np.int8)
-        summed = np.zeros((height, width), dtype=np.int16)
-        for (row, column), log_odds in tiles.items():
-            percent = np.rint(_percent(log_odds.astype(np.float32))).astype(np.int8)
-            known = np.where(self._walls.observed[row, column], percent, UNKNOWN)
-            if (row, column) in self._things.log_odds:
-                things = self._things.log_odds[row, column]
-                known[(things > 0) & (things >= log_odds)] = THING
-            r, c = (row - min(rows)) * _TILE, (column - min(columns)) * _TILE
-            cells[r : r + _TILE, c : c + _TILE] = known
-            summed[r : r + _TILE, c : c + _TILE] = log_odds
-        self._erase_lone_hits(cells, summed)
-        known_rows = np.flatnonzero((cells >= FREE).any(axis=1))
-        known_columns = np.flatnonzero((cells >= FREE).any(axis=0))
-        r0, r1 = int(known_rows[0]), int(known_rows[-1]) + 1
-        c0, c1 = int(known_columns[0]), int(known_columns[-1]) + 1
         resolution = self._config.resolution_m
-        shape = r1 - r0, c1 - c0
-        at_row, at_column, bits = self._heights.within(
-            (min(rows) * _TILE + r0, min(columns) * _TILE + c0), shape
-        )
-        heights = np.zeros(shape, np.uint8) if len(bits) else None
-        if heights is not None:
-            heights[at_row, at_column] = bits
+        if not self._tiles:
+            return OccupancyGrid(
+                cells=np.zeros((0, 0), np.int8), resolution_m=resolution, origin_m=(0.0, 0.0)
+            )
+        numbers = np.array(list(self._tiles))
+        first = numbers.min(axis=0)
+        rows, columns = ((np.ptp(numbers, axis=0) + 1) * _TILE).tolist()
+        self._check_size(rows * columns)
+        cells = np.full((rows, columns), UNKNOWN, dtype=np.int8)
+        walls = np.zeros((rows, columns), dtype=np.int16)
+        heights = np.zeros((rows, columns), dtype=np.uint8)
+        for number, tile in self._tiles.items():
+            r, c = ((np.array(number) - first) * _TILE).tolist()
+            here = np.s_[r : r + _TILE, c : c + _TILE]
+            percent = np.rint(_percent(tile.walls.astype(np.float32))).astype(np.int8)
+            known = np.where(tile.observed, percent, UNKNOWN)
+            known[(tile.things > 0) & (tile.things >= tile.walls)] = THING
+            cells[here], walls[here], heights[here] = known, tile.walls, tile.heights
+        self._erase_lone_hits(cells, walls)
+        known_rows, known_columns = (np.flatnonzero((cells >= FREE).any(axis=axis)) for axis in (1, 0))
+        r0, c0 = int(known_rows[0]), int(known_columns[0])
+        kept = np.s_[r0 : int(known_rows[-1]) + 1, c0 : int(known_columns[-1]) + 1]
+        y, x = (first * _TILE + (r0, c0)).tolist()
         return OccupancyGrid(
-            cells=cells[r0:r1, c0:c1].copy(),
-            heights=heights,
+            cells=cells[kept].copy(),
+            heights=heights[kept].copy() if self._heights_seen else None,
             resolution_m=resolution,
-            origin_m=((min(columns) * _TILE + c0) * resolution, (min(rows) * _TILE + r0) * resolution),
+            origin_m=(x * resolution, y * resolution),
             height_m=self._height_m,
         )
 
     @property
     def _height_m(self) -> float | None:
         """Of the plane that all planar scans are of; None if they are not of one."""
-        low_m, high_m = self._heights_m or (math.nan, math.nan)
+        low_m, high_m = self._planes_m or (math.nan, math.nan)
         return low_m if high_m - low_m < self._config.resolution_m else None
 
     def _erase_lone_hits(self, cells: NDArray[np.int8], log_odds: NDArray[np.int16]) -> None:

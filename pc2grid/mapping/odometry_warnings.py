@@ -8,7 +8,7 @@ odometry has a wrong sign, stands still, or knows no turns. A map of such a reco
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,22 +21,45 @@ _APART_NS = 10**9
 """Motions are compared over this time at least: late or bunched odometry has caught up by then; by hand."""
 _LEAST_MOTION = 0.1
 """Motions of less than this, in metres or radians, are noise; chosen by hand."""
-_LEAST_TRAVEL_M, _LEAST_TURN_RAD = 2.0, 1.5
-"""Less than this in all says nothing of odometry; chosen by hand."""
 _OPPOSITE, _LEAST, _MOST = -0.5, 0.25, 1.75
 """Shares of what the scans show. Odometry that reports less than the first has the sign wrong; what is not
 between the others is no measure of it. In eight real recordings it reports .93 to 1.15."""
 
 
-class _Compared(NamedTuple):
-    """Motions that the scans show, and what odometry reports of them.
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """A kind of motion.
 
-    shown, reported : sums of their lengths. share : how much of what is shown odometry reports.
+    columns : of motions (M, 6). least : less than this in all, metres or radians, says nothing of odometry;
+    chosen by hand. opposite, otherwise : what a user is told of odometry that reports the opposite, and of
+    odometry that is no measure of it.
     """
 
-    shown: float
-    reported: float
-    share: float
+    columns: slice
+    least: float
+    opposite: str
+    otherwise: str
+
+
+_KINDS = (
+    _Kind(
+        slice(3),
+        2.0,
+        "odometry reports travel the other way than the scans show: the sensor is mounted turned by half "
+        "a turn and tf does not say so, or odometry counts backwards",
+        "odometry reports {reported:.1f} m where the scans show {shown:.1f} m of travel, "
+        "or in another direction: it stands still, has another unit, or the sensor is mounted otherwise "
+        "than tf says; --odometry none ignores it",
+    ),
+    _Kind(
+        slice(3, 6),
+        1.5,
+        "odometry turns the other way than the scans: the sensor is mounted upside down and tf does not "
+        "say so, which mirrors the map, or odometry has left and right exchanged",
+        "odometry reports {reported:.1f} rad where the scans show turns of {shown:.1f} rad "
+        "in all, or about another axis; --odometry none ignores it",
+    ),
+)
 
 
 def odometry_warnings(trajectory: Trajectory, readings: F64) -> list[str]:
@@ -44,30 +67,14 @@ def odometry_warnings(trajectory: Trajectory, readings: F64) -> list[str]:
 
     readings : (N, 4, 4) T_odom_base at each scan, not finite where there is none.
     """
-    shown, reported = _motions(trajectory, readings)
-    travel, turns = (_compared(shown[:, part], reported[:, part]) for part in (slice(3), slice(3, 6)))
+    motions = _motions(trajectory, readings)
     warnings = []
-    if travel.shown >= _LEAST_TRAVEL_M and travel.share < _OPPOSITE:
-        warnings.append(
-            "odometry reports travel the other way than the scans show: the sensor is mounted turned by half "
-            "a turn and tf does not say so, or odometry counts backwards"
-        )
-    elif travel.shown >= _LEAST_TRAVEL_M and not _LEAST <= travel.share <= _MOST:
-        warnings.append(
-            f"odometry reports {travel.reported:.1f} m where the scans show {travel.shown:.1f} m of travel, "
-            "or in another direction: it stands still, has another unit, or the sensor is mounted otherwise "
-            "than tf says; --odometry none ignores it"
-        )
-    if turns.shown >= _LEAST_TURN_RAD and turns.share < _OPPOSITE:
-        warnings.append(
-            "odometry turns the other way than the scans: the sensor is mounted upside down and tf does not "
-            "say so, which mirrors the map, or odometry has left and right exchanged"
-        )
-    elif turns.shown >= _LEAST_TURN_RAD and not _LEAST <= turns.share <= _MOST:
-        warnings.append(
-            f"odometry reports {turns.reported:.1f} rad where the scans show turns of {turns.shown:.1f} rad "
-            "in all, or about another axis; --odometry none ignores it"
-        )
+    for kind in _KINDS:
+        shown, reported, share = _compared(*(motion[:, kind.columns] for motion in motions))
+        if shown < kind.least or _LEAST <= share <= _MOST:
+            continue
+        text = kind.opposite if share < _OPPOSITE else kind.otherwise
+        warnings.append(text.format(shown=shown, reported=reported))
     return warnings
 
 
@@ -101,12 +108,16 @@ def _step(a: F64, b: F64) -> F64:
     return np.concatenate((motion[:3, 3], rotation_vector(motion)))
 
 
-def _compared(shown: F64, reported: F64) -> _Compared:
-    """Motions (M, 3) beside those that are reported (M, 3). A jump of odometry counts no more than twice."""
+def _compared(shown: F64, reported: F64) -> tuple[float, float, float]:
+    """Motions (M, 3) beside those that are reported (M, 3).
+
+    Returns the sums of their lengths, and how much of what is shown odometry reports; a jump of it counts no
+    more than twice.
+    """
     lengths = np.linalg.norm(shown, axis=1)
     moves = lengths >= _LEAST_MOTION
     shown, reported, lengths = shown[moves], reported[moves], lengths[moves]
     shares = np.clip(np.einsum("nk,nk->n", shown, reported) / lengths**2, -2.0, 2.0)
     total = float(lengths.sum())
     share = float((lengths * shares).sum()) / total if total else 1.0
-    return _Compared(total, float(np.linalg.norm(reported, axis=1).sum()), share)
+    return total, float(np.linalg.norm(reported, axis=1).sum()), share

@@ -11,27 +11,17 @@ from pc2grid.arrays import F64, I64
 from pc2grid.config import ProjectionConfig
 from pc2grid.estimation.overruled import check_odometry
 from pc2grid.geometry import SE2
-from pc2grid.mapping.consistency import measure_consistency
+from pc2grid.mapping.consistency import consistency_warning, measure_consistency
 from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.mapping.keyframes import Keyframes, grid_of
 from pc2grid.mapping.parts import PARTS
-from pc2grid.mapping.precision import precision_of
+from pc2grid.mapping.precision import precision_of, precision_warning
 from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
-from pc2grid.mapping.track import Track, chosen
-from pc2grid.model import Consistency, Loop, OccupancyGrid, OdometryCheck, PointMap, Precision, Trajectory
+from pc2grid.mapping.track import Track
+from pc2grid.model import Health, Loop, ReadReport, SessionMap, Trajectory
 
-
-@dataclasses.dataclass(frozen=True, slots=True)
-class PartMap:
-    """The map of a part of a session."""
-
-    grid: OccupancyGrid
-    trajectory: Trajectory
-    loops: tuple[Loop, ...]
-    consistency: Consistency
-    odometry: OdometryCheck
-    precision: Precision
-    points: PointMap | None = None
+_WARN_DEGENERATE = 0.1
+"""Share of degenerate scans above which the report says so; chosen by hand."""
 
 
 def draw_parts(
@@ -40,45 +30,83 @@ def draw_parts(
     closed: SettledKeyframes,
     projection: ProjectionConfig,
     points: KeyframePoints | None = None,
-) -> list[PartMap]:
+) -> list[SessionMap]:
     """The map of each part of a session in a frame of its own, compared with its scans.
 
     points : in space, of the keyframes; None: the maps have none.
+    The maps have no name, no sensor and no submaps yet.
     """
-    tracked = track.trajectory
-    part, T_part_base = _settled(tracked, closed)
-    everywhere = dataclasses.replace(tracked, T_session_base=T_part_base)
+    part, T_part_base = _settled(track.trajectory, closed)
+    everywhere = dataclasses.replace(track.trajectory, T_session_base=T_part_base)
     drawn = []
     for number in range(int(part.max(initial=0)) + 1):
         scans = np.flatnonzero(part == number)
-        own = [k for k, other in enumerate(closed.parts.tolist()) if other == number]
+        trajectory = _of_scans(everywhere, scans)
+        own = np.flatnonzero(closed.parts == number).tolist()
         poses = [SE2.from_matrix(T_part_base[closed.scans[k]]) for k in own]
         grid = grid_of(zip((keyframes[k] for k in own), poses, strict=True), projection)
-        trajectory = chosen(everywhere, scans)
         anchored = np.flatnonzero(closed.parts[closed.anchors] == number)
-        anchor_scans = closed.scans[closed.anchors[anchored]]
+        anchor_scans = np.searchsorted(scans, closed.scans[closed.anchors[anchored]])
+        consistency = measure_consistency((keyframes[k] for k in own), grid, everywhere)
+        odometry = check_odometry(
+            trajectory.stamps_ns.tolist(), [track.disagreements[k] for k in scans.tolist()]
+        )
+        precision = precision_of(trajectory, anchor_scans, closed.sigma_m[anchored])
+        warnings = (
+            consistency_warning(consistency, trajectory, with_odometry=odometry.compared > 0),
+            precision_warning(precision, trajectory),
+        )
         drawn.append(
-            PartMap(
+            SessionMap(
+                session="",
+                sensor="",
                 grid=grid,
+                submaps=(),
                 trajectory=trajectory,
                 loops=_loops_within(closed.loops, scans),
-                consistency=measure_consistency((keyframes[k] for k in own), grid, everywhere),
-                odometry=check_odometry(
-                    tracked.stamps_ns[scans].tolist(), [track.disagreements[k] for k in scans.tolist()]
-                ),
-                precision=precision_of(
-                    trajectory, np.searchsorted(scans, anchor_scans), closed.sigma_m[anchored]
-                ),
+                consistency=consistency,
+                odometry=odometry,
+                precision=precision,
                 points=None if points is None else points.registered(T_part_base, part == number),
+                report=_report(trajectory, [text for text in warnings if text is not None]),
             )
         )
     return drawn
 
 
-def long_enough(parts: Sequence[PartMap]) -> list[PartMap]:
+def long_enough(parts: Sequence[SessionMap]) -> list[SessionMap]:
     """The parts that are long enough to be recognised, or the longest one if none is."""
     kept = [part for part in parts if part.trajectory.length_m >= PARTS.least_travel_m]
     return kept or [max(parts, key=lambda part: part.trajectory.length_m)]
+
+
+def _report(trajectory: Trajectory, of_map: Sequence[str]) -> ReadReport:
+    """The report of a part alone: its scans, those that were lost, and warnings, the last ones `of_map`."""
+    lost = [k for k, health in enumerate(trajectory.health) if health is Health.LOST]
+    weak = sum(health is Health.DEGENERATE for health in trajectory.health)
+    total, warnings = len(trajectory), []
+    if lost:
+        seconds = (trajectory.stamps_ns[lost[0]] - trajectory.stamps_ns[0]) * 1e-9
+        warnings.append(
+            f"registration was lost for {len(lost)} of {total} scans, first {seconds:.1f} s after the first "
+            "scan; they are not in the map"
+        )
+    if weak > _WARN_DEGENERATE * total:
+        warnings.append(
+            f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
+            "or on the motion before"
+        )
+    skipped = {"registration lost": len(lost)} if lost else {}
+    return ReadReport(scans_read=total, scans_skipped=skipped, warnings=(*warnings, *of_map))
+
+
+def _of_scans(trajectory: Trajectory, scans: I64) -> Trajectory:
+    """Some scans of a trajectory, by their numbers (M,)."""
+    return Trajectory(
+        stamps_ns=trajectory.stamps_ns[scans],
+        T_session_base=trajectory.T_session_base[scans],
+        health=tuple(trajectory.health[k] for k in scans.tolist()),
+    )
 
 
 def _settled(tracked: Trajectory, closed: SettledKeyframes) -> tuple[I64, F64]:

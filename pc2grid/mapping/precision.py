@@ -15,19 +15,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
 from pc2grid.mapping.building_axes import WallDirection
 from pc2grid.mapping.parts import PARTS
 from pc2grid.mapping.pose_graph import Edge, information_matrix
 from pc2grid.model import Precision, Trajectory, UncertainStretch
-
-if TYPE_CHECKING:
-    from scipy.sparse import coo_matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,15 +32,12 @@ class PrecisionParameters:
     promised_m : standard deviation of a position from which a place is called uncertain. Beyond it, an answer
         that is exact to the walls around it is off in the map by more than that as often as one in three.
     rounds : in which the weights of the places are found; they change little after two.
-    most_places : whose covariance is computed, evenly chosen. It is interpolated between them, so that the
-        time grows linearly with the length of a session.
     first_information : per square metre and radian, on the first pose, so that the matrix can be inverted.
         The result does not depend on it.
     """
 
     promised_m: float = 0.5
     rounds: int = 3
-    most_places: int = 1000
     first_information: float = 1e4
 
 
@@ -67,15 +59,19 @@ def position_sigmas(
     walls : of each pose, if the building's axes constrain the headings.
     weights : with which the places count when the map is placed on the truth.
     """
+    from scipy.sparse import diags
+    from scipy.sparse.linalg import splu
+
     count = len(poses)
-    weight = np.ones(count)
+    sigma, weight = np.zeros(count), np.ones(count)
     if count < 2:
-        return np.zeros(count), weight
-    places = np.unique(np.linspace(0, count - 1, parameters.most_places).astype(np.int64))
-    solve = _inverse(poses, information_matrix(poses, edges, walls), parameters)
-    blocks = _diagonal_blocks(solve, count, places)
+        return sigma, weight
+    first = np.zeros(3 * count)
+    first[:3] = parameters.first_information
+    information = information_matrix(poses, edges, walls) + diags(first)
+    solve = splu(information.tocsc(), permc_spec="MMD_AT_PLUS_A").solve
+    blocks = _diagonal_blocks(solve, count)
     moved = _moved_by_whole(poses)
-    sigma = np.zeros(count)
     for _ in range(parameters.rounds):
         # The whole is placed by weighted least squares: its motion is `placing` (3, 3 N) times the errors.
         normal = np.einsum("n,nai,naj->ij", weight, moved, moved)
@@ -84,43 +80,27 @@ def position_sigmas(
         placing = by_pose.reshape(-1, 3)
         with_errors = solve(placing)
         of_whole = placing.T @ with_errors
-        here = moved[places]
-        across = with_errors.reshape(-1, 3, 3)[places, :2] @ here.transpose(0, 2, 1)
-        covariance = blocks - across - across.transpose(0, 2, 1) + here @ of_whole @ here.transpose(0, 2, 1)
-        variance = np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0)
-        sigma = np.sqrt(np.interp(np.arange(count), places, variance))
+        across = with_errors.reshape(-1, 3, 3)[:, :2] @ moved.transpose(0, 2, 1)
+        covariance = blocks - across - across.transpose(0, 2, 1)
+        covariance += moved @ of_whole @ moved.transpose(0, 2, 1)
+        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
         weight = 1.0 / (sigma**2 + parameters.promised_m**2)
     return sigma, weight
 
 
-def _inverse(poses: F64, information: coo_matrix, parameters: PrecisionParameters) -> Callable[[F64], F64]:
-    """The product of columns (3 N, K) with the covariance (3 N, 3 N) of the poses; the first one is fixed."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.linalg import splu
+def _diagonal_blocks(solve: Callable[[F64], F64], count: int) -> F64:
+    """The covariance (N, 2, 2) of x and y of each of the poses.
 
-    first = coo_matrix(
-        (np.full(3, parameters.first_information), (np.arange(3), np.arange(3))), shape=(3 * len(poses),) * 2
-    )
-    factors = splu((information + first).tocsc(), permc_spec="MMD_AT_PLUS_A")
-
-    def solve(columns: F64) -> F64:
-        product: F64 = factors.solve(columns)
-        return product
-
-    return solve
-
-
-def _diagonal_blocks(solve: Callable[[F64], F64], count: int, places: NDArray[np.int64]) -> F64:
-    """The covariance (P, 2, 2) of x and y of some of the poses."""
-    blocks = np.empty((len(places), 2, 2))
-    for begin in range(0, len(places), _TOGETHER):
-        some = places[begin : begin + _TOGETHER]
-        columns = np.zeros((3 * count, 2 * len(some)))
+    solve : the product of columns (3 N, K) with the covariance (3 N, 3 N) of all.
+    """
+    blocks = np.empty((count, 2, 2))
+    for begin in range(0, count, _TOGETHER):
+        some = np.arange(begin, min(begin + _TOGETHER, count))
         rows = (3 * some[:, None] + np.arange(2)).ravel()
+        columns = np.zeros((3 * count, len(rows)))
         columns[rows, np.arange(len(rows))] = 1.0
-        found = solve(columns)
-        for k, place in enumerate(some.tolist()):
-            blocks[begin + k] = found[3 * place : 3 * place + 2, 2 * k : 2 * k + 2]
+        found = solve(columns)[rows].reshape(len(some), 2, len(some), 2)
+        blocks[some] = found[some - begin, :, some - begin]
     return blocks
 
 

@@ -9,19 +9,14 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.errors import TrackingLost
-from pc2grid.mapping.consistency import consistency_warning
 from pc2grid.mapping.odometry_warnings import odometry_warnings
-from pc2grid.mapping.part_maps import PartMap
 from pc2grid.mapping.parts import PARTS
-from pc2grid.mapping.precision import precision_warning
 from pc2grid.mapping.track import Track
-from pc2grid.model import Health, ReadReport, Trajectory, part_name
+from pc2grid.model import Health, ReadReport, SessionMap, Trajectory, part_name
 
 _MOST_LOST = 0.2
-"""Share of lost scans above which a laser, or a sensor in the hand, gives no map without odometry: its parts
-do not hang together. Chosen by hand."""
-_WARN_DEGENERATE = 0.1
-"""Share of degenerate scans above which the report says so; chosen by hand."""
+"""Share of lost scans above which a laser gives no map without odometry: its parts do not hang together.
+Chosen by hand."""
 _STOREY_M = 2.0
 """A hand lifts a sensor by less than this, and storeys are at least 2.4 m high; chosen by hand."""
 
@@ -53,37 +48,32 @@ def lost_warnings(health: Sequence[Health]) -> list[str]:
 
 
 def part_reports(
-    report: ReadReport,
-    session: str,
-    parts: Sequence[PartMap],
-    kept: Sequence[PartMap],
+    report: ReadReport, session: str, parts: Sequence[SessionMap], kept: Sequence[SessionMap]
 ) -> list[ReadReport]:
-    """The report of each part that is kept, with the warnings of registration and of its map.
+    """The report of each part that is kept.
 
-    report : of the reader. It becomes that of the first part; the scans of the others are counted in theirs.
+    report : of the reader. It becomes part of that of the first part; the scans of the others are counted in
+        theirs.
     """
-    elsewhere = sum(len(part.trajectory) for part in kept[1:])
-    warnings, skipped = list(report.warnings), dict(report.scans_skipped)
-    if len(parts) > 1:
-        warnings.append(division_warning(session, parts, kept))
-    left_out = sum(len(part.trajectory) for part in parts) - elsewhere - len(kept[0].trajectory)
-    if left_out:
-        skipped["in a part too short to be of use"] = left_out
+    first, *others = (part.report for part in kept)
+    elsewhere = sum(other.scans_read for other in others)
+    left_out = sum(len(part.trajectory) for part in parts) - elsewhere - first.scans_read
+    skipped = {"in a part too short to be of use": left_out} if left_out else {}
+    division = [division_warning(session, parts, kept)] if len(parts) > 1 else []
     first = dataclasses.replace(
         report,
         scans_read=report.scans_read - elsewhere,
-        scans_skipped=skipped,
-        warnings=tuple(warnings),
+        scans_skipped={**report.scans_skipped, **skipped, **first.scans_skipped},
+        warnings=(*report.warnings, *division, *first.warnings),
     )
-    others = [ReadReport(scans_read=len(part.trajectory)) for part in kept[1:]]
-    return [_with_warnings(r, part) for r, part in zip([first, *others], kept, strict=True)]
+    return [first, *others]
 
 
-def division_warning(session: str, parts: Sequence[PartMap], kept: Sequence[PartMap]) -> str:
+def division_warning(session: str, parts: Sequence[SessionMap], kept: Sequence[SessionMap]) -> str:
     """One sentence that says into what a recording was divided, where, and what to do."""
     start_ns = min(int(part.trajectory.stamps_ns[0]) for part in parts if len(part.trajectory))
 
-    def begin_s(part: PartMap) -> float:
+    def begin_s(part: SessionMap) -> float:
         return (int(part.trajectory.stamps_ns[0]) - start_ns) * 1e-9
 
     named = ", ".join(
@@ -91,7 +81,7 @@ def division_warning(session: str, parts: Sequence[PartMap], kept: Sequence[Part
         for k, part in enumerate(kept)
     )
     advice = "come back to known places more often, to keep them together"
-    if not any(part.odometry.compared for part in parts):
+    if not any(part.odometry and part.odometry.compared for part in parts):
         advice = f"record with odometry, or {advice}"
     short = len(parts) - len(kept)
     dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
@@ -126,31 +116,3 @@ def height_warnings(heights_m: F64, trajectory: Trajectory) -> list[str]:
         f"more than {_STOREY_M:.1f} m: a map is one floor, and this one shows several as one; cut the "
         "recording there, with --start and --duration, and name each floor with --floor"
     ]
-
-
-def _with_warnings(report: ReadReport, part: PartMap) -> ReadReport:
-    """The report of a part with the warnings of registration and of the map added."""
-    trajectory = part.trajectory
-    lost = sum(h is Health.LOST for h in trajectory.health)
-    weak = sum(h is Health.DEGENERATE for h in trajectory.health)
-    total, skipped, warnings = len(trajectory), dict(report.scans_skipped), list(report.warnings)
-    if lost:
-        skipped["registration lost"] = lost
-        first = next(k for k, h in enumerate(trajectory.health) if h is Health.LOST)
-        seconds = (trajectory.stamps_ns[first] - trajectory.stamps_ns[0]) * 1e-9
-        warnings.append(
-            f"registration was lost for {lost} of {total} scans, first {seconds:.1f} s after the first scan; "
-            "they are not in the map"
-        )
-    if weak > _WARN_DEGENERATE * total:
-        warnings.append(
-            f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
-            "or on the motion before"
-        )
-    bent = consistency_warning(part.consistency, trajectory, with_odometry=part.odometry.compared > 0)
-    if bent is not None:
-        warnings.append(bent)
-    uncertain = precision_warning(part.precision, trajectory)
-    if uncertain is not None:
-        warnings.append(uncertain)
-    return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))

@@ -35,9 +35,9 @@ class SessionGraph:
     def __len__(self) -> int:
         return len(self.nodes)
 
-    def begin(self, pose: SE2, walls: WallDirection) -> None:
-        """Add the first local map, at its tracked pose."""
-        self.nodes = np.array([(pose.x, pose.y, pose.yaw)])
+    def add(self, pose: SE2, walls: WallDirection) -> None:
+        """Add a local map at a pose."""
+        self.nodes = np.vstack((self.nodes, (pose.x, pose.y, pose.yaw)))
         self._walls.append(walls)
 
     def extend(self, step: SE2, walls: WallDirection, shown: F64 | None) -> None:
@@ -50,9 +50,7 @@ class SessionGraph:
         self.edges.append(Edge(newest - 1, newest, step, information))
         if shown is not None:
             self._step_information[newest - 1, newest] = shown
-        pose = pose_at(self.nodes, newest - 1) @ step
-        self.nodes = np.vstack((self.nodes, (pose.x, pose.y, pose.yaw)))
-        self._walls.append(walls)
+        self.add(pose_at(self.nodes, newest - 1) @ step, walls)
 
     def relative(self, first: int, second: int) -> SE2:
         """T_first_second by the present poses."""
@@ -71,19 +69,18 @@ class SessionGraph:
         step is by what its local maps show of each other is added here.
         """
         sigma_m = np.zeros(len(part))
-        kept = list(compress(self.edges, solution.accepted))
-        for number in range(int(part.max(initial=-1)) + 1):
-            own = np.flatnonzero(part == number)
-            position = {int(local_map): k for k, local_map in enumerate(own)}
+        number = np.empty(len(part), np.int64)  # of each local map within its part
+        for own in (np.flatnonzero(part == k) for k in range(int(part.max(initial=-1)) + 1)):
+            number[own] = np.arange(len(own))
             within = [
                 replace(
                     edge,
-                    first=position[edge.first],
-                    second=position[edge.second],
+                    first=int(number[edge.first]),
+                    second=int(number[edge.second]),
                     information=edge.information + self._step_information.get((edge.first, edge.second), 0.0),
                 )
-                for edge in kept
-                if edge.first in position and edge.second in position
+                for edge in compress(self.edges, solution.accepted)
+                if part[edge.first] == part[edge.second] == part[own[0]]
             ]
             walls = [self._walls[local_map] for local_map in own]
             sigma_m[own] = position_sigmas(solution.poses[own], within, walls)[0]

@@ -12,35 +12,29 @@ import numpy as np
 
 from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
-from pc2grid.mapping.keyframes import Keyframes, grid_of
-from pc2grid.mapping.local_maps import LocalMaps, pose_at
+from pc2grid.mapping.keyframes import grid_of
+from pc2grid.mapping.local_maps import LocalMaps
 from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates
-from pc2grid.mapping.loop_parameters import LoopParameters
 from pc2grid.mapping.place_recognition import PlaceRecognizer, Stretch
 
 
 class Stretches:
     """The stretches of a session that its recognizer was asked for.
 
-    recognizer : None: there are no stretches. candidates : get what it finds.
-    projection : how the grids for the recognizer are drawn.
+    candidates : get what it finds. maps : consecutive local maps that make a stretch.
+    recognizer : None: there are no stretches. projection : how the grids for the recognizer are drawn.
     """
 
     def __init__(
         self,
         local_maps: LocalMaps,
-        keyframes: Keyframes,
         candidates: LoopCandidates,
-        parameters: LoopParameters,
+        maps: int,
         recognizer: PlaceRecognizer | None,
         projection: ProjectionConfig,
     ) -> None:
-        self._local_maps = local_maps
-        self._keyframes = keyframes
-        self._candidates = candidates
-        self._parameters = parameters
-        self._recognizer = recognizer
-        self._projection = projection
+        self._local_maps, self._candidates, self._maps = local_maps, candidates, maps
+        self._recognizer, self._projection = recognizer, projection
         self._asked: list[range] = []  # the local maps of each
         self._known_places: list[bool] = []  # whether each local map overlaps one of an earlier visit
         self._begin = 0  # first local map of the stretch that is not complete yet
@@ -53,23 +47,19 @@ class Stretches:
         A stretch does not reach across a lost part of the session: its map would be bent. Where all its local
         maps overlap those of an earlier visit already, there is nothing to ask and nothing new to remember.
         """
-        newest = len(self._known_places)
-        self._known_places.append(known)
         if restart:
-            self._begin = newest
-        if newest + 1 - self._begin < self._parameters.stretch_maps:
+            self._begin = len(self._known_places)
+        self._known_places.append(known)
+        stretch = range(self._begin, len(self._known_places))
+        if len(stretch) < self._maps:
             return False
-        numbers = range(self._begin, newest + 1)
-        self._begin = numbers.stop
-        return self._ask(numbers)
+        self._begin = stretch.stop
+        return self._ask(stretch)
 
     def finish(self) -> bool:
         """The last local maps make a stretch that may overlap the one before; returns as `extend` does."""
         stop = len(self._known_places)
-        if self._begin >= stop:
-            return False
-        begin = max(stop - self._parameters.stretch_maps, 0)
-        return self._ask(range(begin, stop))
+        return self._begin < stop and self._ask(range(max(stop - self._maps, 0), stop))
 
     def latest(self) -> range:
         """The local maps of the stretch that was asked for last."""
@@ -87,15 +77,15 @@ class Stretches:
                 if newer - older < 2:
                     continue
                 guess = T_stretch_older.inverse() @ candidate.T_older_newer @ T_stretch_newer
-                pairs.append((math.hypot(guess.x, guess.y), older, newer, guess))
-        return [pair[1:] for pair in sorted(pairs, key=lambda pair: pair[:3])]
+                pairs.append((older, newer, guess))
+        return sorted(pairs, key=lambda pair: (math.hypot(pair[2].x, pair[2].y), *pair[:2]))
 
     def _around(self, middle: int) -> list[tuple[int, SE2]]:
         """The local maps of the stretch around one, and their tracked poses in its frame."""
-        tracked = self._keyframes.poses()
-        at = pose_at(tracked, self._local_maps.anchor(middle)).inverse()
         stretch = next(numbers for numbers in self._asked if _middle(numbers) == middle)
-        return [(k, at @ pose_at(tracked, self._local_maps.anchor(k))) for k in stretch]
+        anchors = self._local_maps.anchors
+        poses = self._local_maps.poses((anchors[number] for number in stretch), anchors[middle])
+        return list(zip(stretch, poses, strict=True))
 
     def _ask(self, numbers: range) -> bool:
         """Ask where the stretch of some local maps was seen before, unless all of it is known."""
@@ -120,9 +110,8 @@ class Stretches:
     def _draw(self, index: int, numbers: range) -> Stretch:
         """The stretch of some consecutive local maps, in the frame of the anchor of the middle one."""
         runs = self._local_maps.runs
-        anchor = self._local_maps.anchor(_middle(numbers))
         keyframes, poses = self._local_maps.keyframes(
-            range(runs[numbers[0]].start, runs[numbers[-1]].stop), anchor
+            range(runs[numbers[0]].start, runs[numbers[-1]].stop), self._local_maps.anchors[_middle(numbers)]
         )
         return Stretch(
             index=index,

@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid.arrays import F64, I64
+from pc2grid.arrays import F64
 from pc2grid.estimation.overruled import Disagreement
 from pc2grid.model import Health, Scan, Trajectory
 
 if TYPE_CHECKING:
-    from pc2grid.estimation.tracker import Tracked, Tracker
-
+    from pc2grid.estimation.tracker import Tracked
 
 _NO_READING = np.full((4, 4), np.nan)
 
@@ -25,14 +24,13 @@ class Track:
     """The results of tracking for all scans of a session.
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. readings : (N, 4, 4) of
-    odometry, NaN where there is none. carried : see `Tracker`.
+    odometry, NaN where there is none.
     left_out : scans before the first of the trajectory. warning : why, or what was assumed of that.
     """
 
     trajectory: Trajectory
     disagreements: Sequence[Disagreement | None]
     readings: F64
-    carried: bool = False
     left_out: int = 0
     warning: str | None = None
 
@@ -46,15 +44,6 @@ class Track:
         """(N,) by odometry, as a base on wheels is tracked in the plane; without odometry as tracked."""
         poses = self.readings if self.with_odometry else self.trajectory.T_session_base
         return poses[:, 2, 3]
-
-
-def chosen(trajectory: Trajectory, scans: I64) -> Trajectory:
-    """Some scans of a trajectory, by their numbers (M,)."""
-    return Trajectory(
-        stamps_ns=trajectory.stamps_ns[scans],
-        T_session_base=trajectory.T_session_base[scans],
-        health=tuple(trajectory.health[k] for k in scans.tolist()),
-    )
 
 
 class TrackRecord:
@@ -76,16 +65,12 @@ class TrackRecord:
         self._disagreements.append(tracked.disagreement)
         self._readings.extend((_NO_READING if scan.T_odom_base is None else scan.T_odom_base).ravel())
 
-    def track(self, tracker: Tracker) -> Track:
-        """The track of all scans, which were tracked by `tracker`."""
+    def track(self, left_out: int, warning: str | None) -> Track:
+        """The track of all scans; `left_out` and `warning` as of a `Track`."""
         trajectory = Trajectory(
             stamps_ns=np.array(self._stamps, dtype=np.int64),
             T_session_base=np.frombuffer(self._poses).reshape(-1, 4, 4),
             health=tuple(self._health),
         )
-        return Track(
-            trajectory=trajectory,
-            disagreements=self._disagreements,
-            readings=np.frombuffer(self._readings).reshape(-1, 4, 4),
-            carried=tracker.carried,
-        )
+        readings = np.frombuffer(self._readings).reshape(-1, 4, 4)
+        return Track(trajectory, self._disagreements, readings, left_out, warning)

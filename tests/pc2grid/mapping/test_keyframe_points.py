@@ -7,7 +7,7 @@ import pytest
 
 from pc2grid.config import Config, ProjectionConfig
 from pc2grid.geometry import SE2, transform_points
-from pc2grid.mapping import keyframe_points
+from pc2grid.mapping import spool
 from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.model import POINT_STEPS, PointMap, Scan, SensorKind
 from pc2grid.pipeline import build_map
@@ -45,7 +45,7 @@ def test_points_of_some_scans() -> None:
 
 
 def test_a_file_is_used_where_memory_does_not_suffice(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(keyframe_points, "_IN_MEMORY_BYTES", 100)
+    monkeypatch.setattr(spool, "IN_MEMORY_BYTES", 100)
     points = KeyframePoints(0.05, 20.0)
     for k in range(3):
         points.append(k, scan())

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
@@ -41,7 +40,7 @@ def accepted(*batches: list[Candidate]) -> list[Candidate]:
     candidates = LoopCandidates()
     for batch in batches:
         candidates.add(batch)
-    return candidates.acceptable(*corridor(41))
+    return candidates.take(*corridor(41))
 
 
 NODES = corridor(41)[0]
@@ -75,9 +74,8 @@ def test_what_is_not_accepted_waits_and_what_cannot_be_is_forgotten() -> None:
     off = SE2(0.0, 4.0, 0.0)
     first, impossible = seen(NODES, 9, 10, 31, off=off), seen(NODES, 9, 10, 31, off=SE2(0.0, 90.0, 2.0))
     candidates.add([first, impossible])
-    assert candidates.acceptable(*corridor(41)) == []
-    with pytest.raises(ValueError, match="not in list"):
-        candidates.remove(impossible)
+    assert candidates.take(*corridor(41)) == []
     second = seen(NODES, 10, 7, 34, off=off)
     candidates.add([second])
-    assert candidates.acceptable(*corridor(41)) == [first, second]
+    assert candidates.take(*corridor(41)) == [first, second]
+    assert candidates.take(*corridor(41)) == []

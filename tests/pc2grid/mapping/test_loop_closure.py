@@ -12,8 +12,8 @@ from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
 from pc2grid.estimation.point_to_line import Match
 from pc2grid.geometry import SE2
-from pc2grid.mapping import loop_verification
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
+from pc2grid.mapping.local_maps import LocalMap
 from pc2grid.mapping.loop_candidates import CandidateParameters
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import LoopParameters
@@ -167,13 +167,13 @@ def test_a_lost_stretch_is_a_guess_and_its_error_stays_in_it() -> None:
 def test_work_and_loops_grow_with_the_way_and_not_with_its_square(monkeypatch: pytest.MonkeyPatch) -> None:
     """One more lap does not change how many local maps each one is compared with."""
     compared: list[int] = []
-    fit = loop_verification.fit
+    overlap = LocalMap.overlap
 
     def counted(*arguments: Any) -> Match | None:
         compared[-1] += 1
-        return fit(*arguments)
+        return overlap(*arguments)
 
-    monkeypatch.setattr(loop_verification, "fit", counted)
+    monkeypatch.setattr(LocalMap, "overlap", counted)
     for laps in (2, 3, 4):
         compared.append(0)
         truth = square(30) * laps
