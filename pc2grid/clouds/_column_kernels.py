@@ -35,43 +35,36 @@ def clear(evidence: NDArray[np.int8], sums: F32, low: I64, new: I64) -> None:
 
 
 @njit(cache=True)
-def observe(
+def observe_points(
     evidence: NDArray[np.int8],
     seen: NDArray[np.uint8],
     touched: NDArray[np.uint8],
     sums: F32,
     low: I64,
     points: F64,
-    rays: F64,
-    sensor: F64,
     cell: tuple[float, float],
     band: tuple[float, float],
     stamp: int,
     hit: int,
-    miss: int,
-    limits: tuple[int, int],
-    margin: tuple[float, float],
+    most: int,
 ) -> None:
-    """Enter a scan: a hit where its points (N, 3) lie, a miss along its rays to (M, 3), one a cell and scan.
+    """Enter a hit where the points (N, 3) of a scan lie, one a cell and scan.
 
     evidence, seen : (W, W, L), `seen` is the stamp of the last scan that entered a cell. touched : (W, W) the
     same of columns. sums : (W, W, 3) sums of x and y, relative to the column's corner, of the points in the
     band, and their number. cell : edge and height of a cell. band : lowest and highest z of an obstacle.
-    margin : (a, b), a ray ends a + b * range^2 before its point.
     """
     size, layers = evidence.shape[0], evidence.shape[2]
     edge, height = cell
     for n in range(len(points)):
         i, j = math.floor(points[n, 0] / edge), math.floor(points[n, 1] / edge)
         k = math.floor(points[n, 2] / height)
-        if not (
-            low[0] <= i < low[0] + size and low[1] <= j < low[1] + size and low[2] <= k < low[2] + layers
-        ):
+        if not (_within(low, size, i, j) and low[2] <= k < low[2] + layers):
             continue
         a, b, c = i % size, j % size, k % layers
         if seen[a, b, c] != stamp:
             seen[a, b, c] = stamp
-            evidence[a, b, c] = min(evidence[a, b, c] + hit, limits[1])
+            evidence[a, b, c] = min(evidence[a, b, c] + hit, most)
             touched[a, b] = stamp
         if band[0] <= points[n, 2] <= band[1]:
             if sums[a, b, 2] >= 200.0:
@@ -80,6 +73,28 @@ def observe(
             sums[a, b, 0] += points[n, 0] - i * edge
             sums[a, b, 1] += points[n, 1] - j * edge
             sums[a, b, 2] += 1.0
+
+
+@njit(cache=True)
+def observe_rays(
+    evidence: NDArray[np.int8],
+    seen: NDArray[np.uint8],
+    touched: NDArray[np.uint8],
+    low: I64,
+    rays: F64,
+    sensor: F64,
+    cell: tuple[float, float],
+    margin: tuple[float, float],
+    stamp: int,
+    miss: int,
+    least: int,
+) -> None:
+    """Enter a miss along the rays of a scan to points (M, 3) where it has no hit, one a cell and scan.
+
+    The others as for `observe_points`. margin : (a, b), a ray ends a + b * range^2 before its point.
+    """
+    size, layers = evidence.shape[0], evidence.shape[2]
+    edge, height = cell
     for n in range(len(rays)):
         dx, dy, dz = rays[n, 0] - sensor[0], rays[n, 1] - sensor[1], rays[n, 2] - sensor[2]
         away = math.sqrt(dx * dx + dy * dy + dz * dz)
@@ -89,15 +104,21 @@ def observe(
             i = math.floor((sensor[0] + step * dx) / edge)
             j = math.floor((sensor[1] + step * dy) / edge)
             k = math.floor((sensor[2] + step * dz) / height)
-            if not (low[0] <= i < low[0] + size and low[1] <= j < low[1] + size):
+            if not _within(low, size, i, j):
                 break
             if not low[2] <= k < low[2] + layers:
                 continue
             a, b, c = i % size, j % size, k % layers
             if seen[a, b, c] != stamp:
                 seen[a, b, c] = stamp
-                evidence[a, b, c] = max(evidence[a, b, c] - miss, limits[0])
+                evidence[a, b, c] = max(evidence[a, b, c] - miss, least)
                 touched[a, b] = stamp
+
+
+@njit(cache=True)
+def _within(low: I64, size: int, i: int, j: int) -> bool:
+    """Whether the column (i, j) of the map is one of the window."""
+    return low[0] <= i < low[0] + size and low[1] <= j < low[1] + size
 
 
 @njit(cache=True)
@@ -125,35 +146,51 @@ def classify(
     to be free.
     """
     size, layers = evidence.shape[0], evidence.shape[2]
-    first, last = max(band[0], low[2]), min(band[1], low[2] + layers)
+    band = max(band[0], low[2]), min(band[1], low[2] + layers)
+    ground = max(floor - 1, low[2]), min(floor + 2, low[2] + layers)
     for a in range(size):
         for b in range(size):
-            if stamp != 0 and touched[a, b] != stamp:
-                continue
-            occupied, free, passed_over = 0, 0, 0
-            filled, empty = 0, 0
-            for k in range(first, last):
-                value = evidence[a, b, k % layers]
-                slice_bit = 1 << ((k >= borders[0]) + (k >= borders[1]))
-                filled |= slice_bit * (value > 0)
-                empty |= slice_bit * (value < 0)
-                occupied += value > 0
-                free += value < 0
-                passed_over = 0 if value > 0 else passed_over + (value < 0)
-            found = UNKNOWN
-            if occupied:
-                found = LOW
-                tall = occupied >= least and passed_over < over
-                if tall and occupied >= share * (occupied + free) and sums[a, b, 2] > 0:
-                    found = WALL
-            elif free:
-                found = FREE
-            else:
-                for k in range(max(floor - 1, low[2]), min(floor + 2, low[2] + layers)):
-                    if evidence[a, b, k % layers] > 0:
-                        found = FREE
-            state[a, b] = found
-            heights[a, b] = filled | (empty & ~filled) << SLICES if occupied else 0
+            if stamp == 0 or touched[a, b] == stamp:
+                measured = sums[a, b, 2] > 0
+                state[a, b], heights[a, b] = _column(
+                    evidence[a, b], ground, band, borders, share, least, over, measured
+                )
+
+
+@njit(cache=True)
+def _column(
+    evidence: NDArray[np.int8],
+    ground: tuple[int, int],
+    band: tuple[int, int],
+    borders: tuple[int, int],
+    share: float,
+    least: int,
+    over: int,
+    measured: bool,
+) -> tuple[int, int]:
+    """State and heights of a column by the evidence (L,) in its cells.
+
+    ground, band : the first and behind the last layer of the floor, and of an obstacle. measured : whether
+    points tell where a wall is.
+    """
+    layers = len(evidence)
+    occupied, free, passed_over = 0, 0, 0
+    filled, empty = 0, 0
+    for k in range(band[0], band[1]):
+        value = evidence[k % layers]
+        slice_bit = 1 << ((k >= borders[0]) + (k >= borders[1]))
+        filled |= slice_bit * (value > 0)
+        empty |= slice_bit * (value < 0)
+        occupied += value > 0
+        free += value < 0
+        passed_over = 0 if value > 0 else passed_over + (value < 0)
+    if occupied:
+        tall = occupied >= least and passed_over < over
+        is_wall = tall and measured and occupied >= share * (occupied + free)
+        return WALL if is_wall else LOW, filled | (empty & ~filled) << SLICES
+    for k in range(ground[0], ground[1]):
+        free += evidence[k % layers] > 0
+    return FREE if free else UNKNOWN, 0
 
 
 @njit(cache=True)
@@ -186,50 +223,94 @@ def view(
     count = 0
     for bearing in range(bearings):
         angle = turn + bearing * (2.0 * math.pi / bearings)
-        ux, uy = math.cos(angle), math.sin(angle)
-        free, first = 0.0, -1.0
-        known = False
-        sx = sy = total = 0.0
-        last_a, last_b = -1, -1
-        r = 0.0
-        while r < reach:
-            r += 0.5 * edge
-            i, j = math.floor((origin[0] + r * ux) / edge), math.floor((origin[1] + r * uy) / edge)
-            if not (low[0] <= i < low[0] + size and low[1] <= j < low[1] + size):
-                break
-            a, b = i % size, j % size
-            if a == last_a and b == last_b:
-                continue
-            last_a, last_b = a, b
-            is_wall = state[a, b] == WALL
-            if first >= 0.0:
-                if r - first > depth[0] + depth[1] * first * first:
-                    break
-                if not is_wall:
-                    continue
-            if is_wall:
-                if first < 0.0:
-                    first = r
-                total += sums[a, b, 2]
-                sx += sums[a, b, 0] + i * edge * sums[a, b, 2]
-                sy += sums[a, b, 1] + j * edge * sums[a, b, 2]
-            elif state[a, b] == UNKNOWN:
-                if known and r - free > gap:
-                    break
-            else:
-                known = True
-                free = r
-                if state[a, b] == LOW and not passed[a, b]:
-                    passed[a, b] = 1
-                    lows[count, 0], lows[count, 1] = (i + 0.5) * edge, (j + 0.5) * edge
-                    count += 1
-        if first >= 0.0 and first - free <= gap:
-            free = max(first - 0.5 * edge, free)
-        free_m[bearing] = free
+        along = (math.cos(angle), math.sin(angle))
+        free, first, count = _first_wall(state, low, origin, along, reach, edge, gap, passed, lows, count)
         if first >= 0.0:
+            if first - free <= gap:
+                free = max(first - 0.5 * edge, free)
+            thick = depth[0] + depth[1] * first * first
+            sx, sy, total = _wall(state, sums, low, origin, along, first, thick, reach, edge)
             walls[found, 0], walls[found, 1], walls[found, 2] = sx, sy, total
             found += 1
+        free_m[bearing] = free
     return free_m, walls[:found].copy(), lows[:count].copy()
+
+
+@njit(cache=True)
+def _first_wall(
+    state: NDArray[np.uint8],
+    low: I64,
+    origin: F64,
+    along: tuple[float, float],
+    reach: float,
+    edge: float,
+    gap: float,
+    passed: NDArray[np.uint8],
+    lows: F64,
+    count: int,
+) -> tuple[float, float, int]:
+    """How far a bearing is free, the range of its first wall (-1: none), and how many low columns are passed.
+
+    passed : (W, W), whether a low column was passed before. lows : gets the middles of those that were not.
+    """
+    size = state.shape[0]
+    free, known = 0.0, False
+    last_a, last_b = -1, -1
+    r = 0.0
+    while r < reach:
+        r += 0.5 * edge
+        i, j = math.floor((origin[0] + r * along[0]) / edge), math.floor((origin[1] + r * along[1]) / edge)
+        if not _within(low, size, i, j):
+            break
+        a, b = i % size, j % size
+        if a == last_a and b == last_b:
+            continue
+        last_a, last_b = a, b
+        if state[a, b] == WALL:
+            return free, r, count
+        if state[a, b] == UNKNOWN:
+            if known and r - free > gap:
+                break
+            continue
+        known, free = True, r
+        if state[a, b] == LOW and not passed[a, b]:
+            passed[a, b] = 1
+            lows[count, 0], lows[count, 1] = (i + 0.5) * edge, (j + 0.5) * edge
+            count += 1
+    return free, -1.0, count
+
+
+@njit(cache=True)
+def _wall(
+    state: NDArray[np.uint8],
+    sums: F32,
+    low: I64,
+    origin: F64,
+    along: tuple[float, float],
+    first: float,
+    thick: float,
+    reach: float,
+    edge: float,
+) -> tuple[float, float, float]:
+    """The sums of x, y and 1 of the points of a wall that begins at the range `first` and is so thick."""
+    size = state.shape[0]
+    sx = sy = total = 0.0
+    last_a, last_b = -1, -1
+    r = first
+    while True:
+        i, j = math.floor((origin[0] + r * along[0]) / edge), math.floor((origin[1] + r * along[1]) / edge)
+        a, b = i % size, j % size
+        new = a != last_a or b != last_b
+        last_a, last_b = a, b
+        if not _within(low, size, i, j) or (new and r - first > thick):
+            return sx, sy, total
+        if new and state[a, b] == WALL:
+            total += sums[a, b, 2]
+            sx += sums[a, b, 0] + i * edge * sums[a, b, 2]
+            sy += sums[a, b, 1] + j * edge * sums[a, b, 2]
+        if r >= reach:
+            return sx, sy, total
+        r += 0.5 * edge
 
 
 @njit(cache=True)

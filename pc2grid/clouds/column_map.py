@@ -102,11 +102,14 @@ class ColumnMap:
             self._stamp = 1
             self._seen[:] = 0
             self._touched[:] = 0
-        noise_m = p.margin_sigmas * self._noise_per_m2
-        kernels.observe(
-            self._evidence, self._seen, self._touched, self._sums, self._low, points_m, rays_m, sensor_m,
-            (edge_m, p.layer_m), self._band_m(floor_m), self._stamp, p.hit, p.miss, p.limits,
-            (p.margin_m, noise_m),
+        cell, margin = (edge_m, p.layer_m), (p.margin_m, p.margin_sigmas * self._noise_per_m2)
+        kernels.observe_points(
+            self._evidence, self._seen, self._touched, self._sums, self._low, points_m, cell,
+            self._band_m(floor_m), self._stamp, p.hit, p.limits[1],
+        )  # fmt: skip
+        kernels.observe_rays(
+            self._evidence, self._seen, self._touched, self._low, rays_m, sensor_m, cell, margin,
+            self._stamp, p.miss, p.limits[0],
         )  # fmt: skip
         same_floor = abs(floor_m - self._floor_m) < 0.5 * p.layer_m
         if not same_floor:
