@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
@@ -30,7 +30,6 @@ class Sensor:
     directions : (R, 3) in the sensor frame; a reading times its direction is the point. Unit vectors for
         ranges; z = 1 for depths.
     offsets_s : (R,) when each ray is cast, relative to the scan's stamp; all zero for a camera.
-    image : (height, width) when the rays are the pixels of an image, row by row.
     """
 
     kind: SensorKind
@@ -40,7 +39,6 @@ class Sensor:
     directions: F64
     offsets_s: F64
     config: LidarConfig | LaserConfig | DepthConfig
-    image: tuple[int, int] | None = field(default=None)
 
     def __post_init__(self) -> None:
         freeze(self, "T_base_sensor", np.float64, (4, 4))
@@ -116,17 +114,8 @@ def depth(config: DepthConfig) -> Sensor:
     directions = np.column_stack(((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.size)))
     pose = _mount(config.mount_m)
     pose[:3, :3] = OPTICAL
-    size = (config.height, config.width)
-    return Sensor(
-        "depth",
-        "camera_depth_optical_frame",
-        pose,
-        config.rate_hz,
-        directions,
-        np.zeros(u.size),
-        config,
-        size,
-    )
+    frame, at_once = "camera_depth_optical_frame", np.zeros(u.size)
+    return Sensor("depth", frame, pose, config.rate_hz, directions, at_once, config)
 
 
 def depth_intrinsics(config: DepthConfig) -> F64:

@@ -146,26 +146,17 @@ def prepare_session(
     sensor: SensorKind,
     grid: OccupancyGrid | Building | None = None,
     config: SimulationConfig | None = None,
+    added: tuple[Furniture, ...] = (),
 ) -> Session:
     """Place the clutter, plan the drive and compute its odometry.
 
     grid : the floor plan, or a real building; None for the procedural office of `config.building_seed`.
+    added : further objects that the plan does not show.
     Raises ConfigError if there is no room for the robot in the building, or at the given start.
     """
     config = config or SimulationConfig()
     building = office_floorplan(config.building_seed) if grid is None else grid
     plan, shell = (building, None) if isinstance(building, OccupancyGrid) else (building.plan, building.shell)
-    return plan_session(sensor, plan, shell, config)
-
-
-def plan_session(
-    sensor: SensorKind,
-    plan: OccupancyGrid,
-    shell: Mesh | None,
-    config: SimulationConfig,
-    added: tuple[Furniture, ...] = (),
-) -> Session:
-    """A session in a plan, or in a real building (`shell`) of that plan. added : objects that stand there."""
 
     def stream(number: int) -> np.random.Generator:
         return np.random.default_rng([config.seed, number])

@@ -12,13 +12,14 @@ from pydantic import Field
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from pc2grid import simulate
 from pc2grid.arrays import F32, F64, I64, BoolGrid
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OccupancyGrid, SensorKind
 from pc2grid.simulate import SimulationConfig
 from pc2grid.simulate.clutter import KINDS, Furniture, Prism, covered
 from pc2grid.simulate.passage import clearance_m
-from pc2grid.simulate.session import Session, plan_session
+from pc2grid.simulate.session import Session
 from pc2grid.submaps.skeleton import clearance_of, skeleton_of
 
 _CHANGE = 6  # stream of random numbers beside those of `pc2grid.simulate.session`
@@ -46,7 +47,7 @@ class WorldConfig(SimulationConfig):
 def prepare_session(*, sensor: SensorKind, grid: OccupancyGrid, config: WorldConfig) -> Session:
     """As `pc2grid.simulate.prepare_session`, in a plan that has changed."""
     plan, added = change_plan(grid, config)
-    return plan_session(sensor, plan, None, config, added)
+    return simulate.prepare_session(sensor=sensor, grid=plan, config=config, added=added)
 
 
 def change_plan(plan: OccupancyGrid, config: WorldConfig) -> tuple[OccupancyGrid, tuple[Furniture, ...]]:
