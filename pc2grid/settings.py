@@ -149,12 +149,6 @@ def _closest(model: type[Section], key: str) -> str | None:
 
 
 def _toml(value: Any) -> str:
-    if value is None:
-        return '"null"'
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return repr(value)
+    """A value as TOML, which writes numbers, booleans, texts and lists of them as JSON does."""
+    text = "null" if value is None else value
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
