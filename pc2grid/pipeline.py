@@ -11,7 +11,9 @@ from typing import TYPE_CHECKING
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import Config, PartitionConfig
 from pc2grid.errors import NoScans
+from pc2grid.estimation.carried import begin
 from pc2grid.estimation.ground_model import is_rolling
+from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
@@ -38,8 +40,6 @@ from pc2grid.submaps.partition import divide
 from pc2grid.time_span import TimeSpan
 
 if TYPE_CHECKING:
-    from pc2grid.estimation.carried import Beginning
-    from pc2grid.estimation.tracker import Tracker
     from pc2grid.io import Log
     from pc2grid.mapping.place_recognition import PlaceRecognizer
 
@@ -63,9 +63,9 @@ def follow(
     >>> poses[0].shape, float(poses[0][0, 3])
     ((4, 4), 0.0)
     """
-    tracker = _tracker(config)
+    tracker = Tracker(config.registration, config.projection)
     rest = iter(scans)
-    beginning = _begin(rest)
+    beginning = begin(rest)
     if beginning.warning is not None:
         observer.on_warning(beginning.warning)
     for scan in chain(beginning.scans, rest):
@@ -215,7 +215,7 @@ def _map(
     """
     projection = config.projection
     rest = iter(scans)
-    beginning = _begin(rest)
+    beginning = begin(rest)
     first = beginning.scans[:1]  # a recording has one kind of sensor
     narrow = any(SENSOR_MODELS[scan.sensor].narrow for scan in first)
     planar = any(SENSOR_MODELS[scan.sensor].planar for scan in first)
@@ -233,7 +233,8 @@ def _map(
             parameters=EXACT_TRACKING if narrow or in_hand else LOOPS,
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
-        record = _track(chain(beginning.scans, rest), _tracker(config), closer, points, observer)
+        tracker = Tracker(config.registration, config.projection)
+        record = _track(chain(beginning.scans, rest), tracker, closer, points, observer)
         track = record.track(beginning.left_out, beginning.warning)
         closed = closer.finish()
         if whole:
@@ -262,17 +263,3 @@ def _track(
         record.append(scan, tracked)
         observer.on_scan(registered)
     return record
-
-
-def _begin(scans: Iterator[Scan]) -> Beginning:
-    """The first scans, see `pc2grid.estimation.carried`; loaded late, like the tracker."""
-    from pc2grid.estimation.carried import begin
-
-    return begin(scans)
-
-
-def _tracker(config: Config) -> Tracker:
-    """A tracker with these settings; loading it takes as long as scipy."""
-    from pc2grid.estimation.tracker import Tracker
-
-    return Tracker(config.registration, config.projection)

@@ -21,6 +21,7 @@ from itertools import chain, tee
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F64, I64, BoolGrid
 from pc2grid.geometry import SE2, wrap_angle
@@ -183,8 +184,6 @@ def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m
 
     Something that moves is elsewhere in the next keyframe; a wall in the wrong place is not.
     """
-    from scipy.spatial import cKDTree
-
     doubtful_m = scan.hits_m[scan.on_clear]
     seen_again = np.zeros(len(doubtful_m), np.bool_)
     for neighbour in (before, after):

@@ -29,7 +29,7 @@ from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps, pose_at
 from pc2grid.mapping.loop_candidates import CANDIDATES, CandidateParameters, LoopCandidates
 from pc2grid.mapping.loop_parameters import LOOPS, LoopParameters
-from pc2grid.mapping.parts import PARTS, PartParameters, connected
+from pc2grid.mapping.parts import connected
 from pc2grid.mapping.place_recognition import PlaceRecognizer
 from pc2grid.mapping.pose_graph import Edge, Solution
 from pc2grid.mapping.session_graph import SessionGraph
@@ -55,10 +55,8 @@ class LoopCloser:
         parameters: LoopParameters = LOOPS,
         local_map_parameters: LocalMapParameters = LOCAL_MAPS,
         candidate_parameters: CandidateParameters = CANDIDATES,
-        part_parameters: PartParameters = PARTS,
     ) -> None:
         self._parameters = parameters
-        self._part_parameters = part_parameters
         self._keyframes = keyframes
         self._local_maps = LocalMaps(keyframes, local_map_parameters)
         self._graph = SessionGraph(parameters)
@@ -245,7 +243,7 @@ class LoopCloser:
     def _parts(self, solution: Solution) -> I64:
         """(N,) number of the part of each local map."""
         loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
-        return connected(self._segments(), loops, self._part_parameters)
+        return connected(self._segments(), loops)
 
 
 def spread_over_visits(distance_m: F64, near_m: float, count: int) -> list[int]:

@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pc2grid.arrays import I64
 from pc2grid.mapping.pose_graph import Edge
@@ -33,23 +35,20 @@ class PartParameters:
 PARTS = PartParameters()
 
 
-def connected(segment: I64, loops: Sequence[Edge], parameters: PartParameters = PARTS) -> I64:
+def connected(segment: I64, loops: Sequence[Edge]) -> I64:
     """(N,) number of the part of each local map, in the order in which the parts begin.
 
     segment : (N,) number of the segment of each, from 0. loops : that were accepted. Two segments are joined
     if enough different local maps of the one lie on enough different ones of the other.
     """
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-
     ends: dict[tuple[int, int], list[Edge]] = {}
     for loop in loops:
         ends.setdefault((int(segment[loop.first]), int(segment[loop.second])), []).append(loop)
     joined = [
         pair
         for pair, between in ends.items()
-        if len({loop.first for loop in between}) >= parameters.joining
-        and len({loop.second for loop in between}) >= parameters.joining
+        if len({loop.first for loop in between}) >= PARTS.joining
+        and len({loop.second for loop in between}) >= PARTS.joining
     ]
     count = int(segment.max(initial=-1)) + 1
     rows, columns = np.array(joined, dtype=np.int64).reshape(-1, 2).T

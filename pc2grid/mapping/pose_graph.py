@@ -10,17 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csc_matrix, identity
+from scipy.sparse.linalg import spsolve
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.mapping.building_axes import WallDirection, pull_to_axes
-
-if TYPE_CHECKING:
-    from scipy.sparse import coo_matrix, csc_matrix
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,9 +81,6 @@ def optimise(
     shrinks to its final value during the iterations (graduated non-convexity, Yang et al. 2020): large drift
     is taken out by loops that agree, and a false loop is outvoted.
     """
-    from scipy.sparse import identity
-    from scipy.sparse.linalg import spsolve
-
     poses = np.array(poses, dtype=np.float64)
     if not edges or len(poses) < 2:
         return Solution(poses, np.ones(len(edges), np.bool_))
@@ -153,16 +148,12 @@ def information_matrix(
 
 def _of_edges(information: F64, rows: NDArray[np.intp], count: int) -> coo_matrix:
     """The information matrix (3 N, 3 N) of edges, (E, 6, 6), between their unknowns (E, 6); N: `count`."""
-    from scipy.sparse import coo_matrix
-
     row, column = np.repeat(rows, 6, axis=1).ravel(), np.tile(rows, (1, 6)).ravel()
     return coo_matrix((information.ravel(), (row, column)), shape=(3 * count, 3 * count))
 
 
 def _of_headings(information: F64) -> coo_matrix:
     """The information matrix (3 N, 3 N) of headings that are known with `information` (N,)."""
-    from scipy.sparse import coo_matrix
-
     yaw = 3 * np.arange(len(information)) + 2
     return coo_matrix((information, (yaw, yaw)), shape=(3 * len(yaw), 3 * len(yaw)))
 

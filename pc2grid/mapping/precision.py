@@ -17,6 +17,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import diags
+from scipy.sparse.linalg import splu
 
 from pc2grid.arrays import F64, I64
 from pc2grid.mapping.building_axes import WallDirection
@@ -59,9 +61,6 @@ def position_sigmas(
     walls : of each pose, if the building's axes constrain the headings.
     weights : with which the places count when the map is placed on the truth.
     """
-    from scipy.sparse import diags
-    from scipy.sparse.linalg import splu
-
     count = len(poses)
     sigma, weight = np.zeros(count), np.ones(count)
     if count < 2:
