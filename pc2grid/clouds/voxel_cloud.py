@@ -90,16 +90,12 @@ class VoxelCloud:
         """A corner (3,) of a voxel."""
         return np.zeros(3) if self._corner_m is None else self._corner_m
 
-    def points_m(self, least: int = 1) -> F64:
-        """The mean (V, 3) of each voxel that holds at least `least` points, by increasing x, then y, then z
-        of the voxels."""
+    def points_m(self) -> F64:
+        """The mean (V, 3) of each voxel that holds points, by increasing x, then y, then z of the voxels."""
         self._merge()
         if self._corner_m is None:
             return np.empty((0, 3))
         kept = self._merged
-        if least > 1:
-            chosen = kept.count >= least
-            kept = _Voxels(kept.code[chosen], kept.sum_m[chosen], kept.count[chosen])
         points: F64 = kept.sum_m / kept.count[:, None].astype(np.float64)
         mask = (1 << _AXIS_BITS) - 1
         for axis in range(3):

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, U8
+from pc2grid.arrays import F32, F64, I64, U8, BoolGrid
 from pc2grid.clouds.ground import Ground, find_ground
 from pc2grid.clouds.planar_scan import project_to_plane
 from pc2grid.clouds.sampling import random_subset
@@ -57,7 +57,6 @@ class CloudMapParameters:
         bearing of a planar scan (0.25 degrees), so that no bearing looks through a wall.
     hidden_m : ground farther than this from seen floor is not free, even if it lies before a wall.
     ceiling_m : what is higher above the floor is not used: it belongs to the storey above.
-    neighbours : a voxel with fewer others within two edges of it is noise.
     tall_m : the largest height of a building. What is higher is not in metres.
     small_m : the least width and depth of a building.
     """
@@ -199,9 +198,7 @@ def drivable_plan(
     def counts(chosen: NDArray[np.bool_]) -> I64:
         return np.bincount(cell[chosen], minlength=shape[0] * shape[1]).reshape(shape)
 
-    floor = (counts(np.abs(height_m) < p.floor_m) > 0).astype(np.uint8)
-    side = 2 * round(p.gap_m / p.resolution_m / 2) + 1
-    floor = cv2.morphologyEx(floor, cv2.MORPH_CLOSE, np.ones((side, side), np.uint8)).astype(np.uint8)
+    floor = _without_gaps(counts(np.abs(height_m) < p.floor_m) > 0, p.gap_m / p.resolution_m)
     obstacles = counts((height_m > p.passage_m[0]) & (height_m < p.passage_m[1]))
     cells = np.full(shape, UNKNOWN, np.int8)
     cells[floor > 0] = FREE
@@ -330,16 +327,14 @@ def _viewpoints(near: F64, corner_m: F64, projection: ProjectionConfig, p: Cloud
     cell = np.floor((near[:, :2] - low_m) / cell_m).astype(np.int64)
     inside = ((cell >= 0) & (cell < side)).all(axis=1)
 
-    def seen(chosen: NDArray[np.bool_]) -> U8:
-        mask = np.zeros((side, side), np.uint8)
-        mask[tuple(cell[chosen & inside, ::-1].T)] = 1
+    def seen(chosen: NDArray[np.bool_]) -> BoolGrid:
+        mask = np.zeros((side, side), np.bool_)
+        mask[tuple(cell[chosen & inside, ::-1].T)] = True
         return mask
 
-    floor = seen(np.abs(near[:, 2]) < p.floor_m)
-    width = 2 * round(p.gap_m / cell_m / 2) + 1
-    floor = cv2.morphologyEx(floor, cv2.MORPH_CLOSE, np.ones((width, width), np.uint8)).astype(np.uint8)
+    floor = _without_gaps(seen(np.abs(near[:, 2]) < p.floor_m), p.gap_m / cell_m)
     obstacle = (near[:, 2] > projection.band_min_m) & (near[:, 2] < projection.band_max_m)
-    room_m = cv2.distanceTransform(floor & (1 - seen(obstacle)), cv2.DIST_L2, 5) * cell_m
+    room_m = cv2.distanceTransform(floor * ~seen(obstacle), cv2.DIST_L2, 5) * cell_m
     step = round(p.spacing_m / cell_m)
     squares = room_m[step:-step, step:-step]
     count = len(squares) // step
@@ -350,6 +345,13 @@ def _viewpoints(near: F64, corner_m: F64, projection: ProjectionConfig, p: Cloud
     roomy = squares.reshape(count * count, step * step).max(axis=1) >= p.clearance_m
     xy_m = corner_m + (at[roomy] + 0.5) * cell_m
     return np.column_stack((xy_m, np.full(len(xy_m), p.height_m)))
+
+
+def _without_gaps(floor: BoolGrid, gap_cells: float) -> U8:
+    """The seen floor (H, W), 0 or 1, with its narrow gaps closed."""
+    side = 2 * round(gap_cells / 2) + 1
+    kernel = np.ones((side, side), np.uint8)
+    return cv2.morphologyEx(floor.astype(np.uint8), cv2.MORPH_CLOSE, kernel).astype(np.uint8)
 
 
 def _draw(

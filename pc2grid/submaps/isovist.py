@@ -45,16 +45,6 @@ class Isovist:
         freeze(self, "ranges_m", np.float32, (None,))
         freeze(self, "ends", np.int8, (len(self.ranges_m),))
 
-    @property
-    def observed(self) -> float:
-        """Share of the rays, 0..1, whose end is known (not HIDDEN)."""
-        return float(np.mean(self.ends != HIDDEN))
-
-    @property
-    def area_m2(self) -> float:
-        """Area of the star-shaped polygon."""
-        return float(np.mean(self.ranges_m.astype(np.float64) ** 2) * np.pi)
-
 
 def look_around(
     grid: OccupancyGrid,
