@@ -63,22 +63,10 @@ def test_a_package_that_is_broken_is_missing(tmp_path: Path, monkeypatch: pytest
     [
         ("compare paper --maps {0} -o {0}/new", ("paper",), ConfigError, "pip install mahotas"),
         (
-            "convert a.mcap -o {0}/b.submaps --dask tcp://h:1",
-            ("cluster",),
-            ClusterError,
-            "pip install dask distributed",
-        ),
-        (
             "convert a.mcap -o postgresql://u:secret@h/d --dask tcp://h:1",
             ("cluster", "postgres"),
             ClusterError,
             "pip install dask distributed 'psycopg[binary]'",
-        ),
-        (
-            "relocalize a.mcap -d postgres://h/d",
-            ("postgres",),
-            DatabaseError,
-            "pip install 'psycopg[binary]'",
         ),
         ("export postgresql://h/d --map m", ("postgres",), DatabaseError, "pip install 'psycopg[binary]'"),
         (
@@ -88,7 +76,6 @@ def test_a_package_that_is_broken_is_missing(tmp_path: Path, monkeypatch: pytest
             "pip install websockets 'psycopg[binary]'",
         ),
         ("view {0}/no.submaps wss://robot", ("live",), LiveError, "pip install websockets"),
-        ("db info postgresql://h/d", ("postgres",), DatabaseError, "pip install 'psycopg[binary]'"),
     ],
 )
 def test_commands_say_all_that_is_missing_before_any_work(

@@ -12,7 +12,7 @@ from pc2grid.clouds.column_map import ColumnMap
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
-from pc2grid.simulate.scene import Mesh, Scene
+from pc2grid.simulate.scene import Mesh, Scene, prism
 
 EYE = np.array((1.0, 2.0, 1.5))
 CONFIG = ProjectionConfig()
@@ -20,11 +20,8 @@ CONFIG = ProjectionConfig()
 
 def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
     """The six faces of a box."""
-    import open3d as o3d
-
-    mesh = o3d.geometry.TriangleMesh.create_box(*(b - a for a, b in zip(low, high, strict=True)))
-    mesh.translate(low)
-    return Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
+    (a, b, bottom), (c, d, top) = low, high
+    return prism(np.array([(a, b), (c, b), (c, d), (a, d)]), bottom, top)
 
 
 def room() -> Scene:

