@@ -109,12 +109,10 @@ class ProjectionConfig(Section):
 class PartitionConfig(Section):
     """Occupancy grid -> submaps (paper III-A).
 
-    There are two presets. `paper` is the method of the paper: one disc of 8 m around each junction of the
-    free space. `travelled` is the default: what is seen within 5 m from a point every metre along the free
-    space. A robot that has driven a few metres has seen only a part of a disc, but all of such a view.
+    By default a submap is what is seen within 5 m from a point every metre along the free space. A robot that
+    has driven a few metres has seen all of such a view, but only a part of a disc. `paper` is the method of
+    the paper: one disc of 8 m around each junction of the free space.
 
-    >>> PartitionConfig() == PartitionConfig.travelled()
-    True
     >>> PartitionConfig.paper().view, PartitionConfig.paper().radius_m
     ('disc', 8.0)
     """
@@ -143,11 +141,6 @@ class PartitionConfig(Section):
     def paper(cls, radius_m: float = 8.0) -> Self:
         """Discs around junctions, as in the paper (III-A; 8 m is r of Table II)."""
         return cls(view="disc", radius_m=radius_m, spacing_m=None)
-
-    @classmethod
-    def travelled(cls) -> Self:
-        """Views close enough that every place a robot drives by has one."""
-        return cls(view="isovist", radius_m=5.0, spacing_m=1.0)
 
 
 class Config(Section):

@@ -74,18 +74,6 @@ class PlanarScan:
             heights=self.heights[np.concatenate((kept, things))] if len(self.heights) else self.heights,
         )
 
-    def emptied(self) -> PlanarScan:
-        """The scan of a sensor that has seen nothing."""
-        none = np.empty((0, 2), np.float32)
-        return replace(
-            self,
-            hits_m=none,
-            normal_rad=none[:, 0],
-            free_m=np.zeros_like(self.free_m),
-            low_m=none,
-            heights=self.heights[:0],
-        )
-
     def free_polygon(self, limit_m: float = np.inf) -> F64:
         """Return the outline (B, 2) of the free space up to `limit_m`, metres, levelled base frame."""
         free_m = np.minimum(self.free_m, limit_m)
