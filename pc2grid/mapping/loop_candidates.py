@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F64, I64
-from pc2grid.geometry import SE2
+from pc2grid.mapping.place_recognition import Recognition
 from pc2grid.mapping.pose_graph import between, compose
 
 
@@ -68,37 +68,21 @@ class CandidateParameters:
 CANDIDATES = CandidateParameters()
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Candidate:
-    """A place that was recognised: the pose of a newer local map in an older one.
-
-    recognition : number of the recognition; its candidates show one stretch at several places, at most one
-        of which is right, or at one place that several older stretches saw.
-    older, newer : numbers of the local maps. probability : that it is right, by what the places look like.
-    """
-
-    recognition: int
-    older: int
-    newer: int
-    T_older_newer: SE2
-    probability: float
-
-
 class LoopCandidates:
     """Recognised places that are not accepted as loops yet."""
 
     def __init__(self, parameters: CandidateParameters = CANDIDATES) -> None:
         self._parameters = parameters
-        self._pending: list[Candidate] = []
+        self._pending: list[Recognition] = []
 
-    def add(self, candidates: Sequence[Candidate]) -> None:
+    def add(self, candidates: Sequence[Recognition]) -> None:
         """Add what was recognised on the newest stretch."""
         self._pending = [*self._pending, *candidates][-self._parameters.pending :]
 
-    def take(self, nodes: F64, travel_m: F64) -> list[Candidate]:
+    def take(self, nodes: F64, travel_m: F64) -> list[Recognition]:
         """The candidates that are loops by drift and by each other. They, and those that cannot be, go.
 
-        nodes : (N, 3) settled poses of the local maps. travel_m : (N,) metres of travel at each.
+        nodes : (N, 3) settled poses of the stretches. travel_m : (N,) metres of travel at each.
         """
         pending, p = self._pending, self._parameters
         if not pending:
@@ -113,9 +97,8 @@ class LoopCandidates:
         in_reach, known = off <= p.possible, way_m <= p.known_way_m
 
         agrees = self._agreement(older, newer, measured, nodes, travel_m)
-        recognition = np.array([c.recognition for c in pending])
-        same = recognition[:, None] == recognition
-        support = np.array([len(set(recognition[row])) for row in agrees & ~same & in_reach])
+        same = newer[:, None] == newer
+        support = np.array([len(set(newer[row])) for row in agrees & ~same & in_reach])
         likely = np.log(probability / (1.0 - probability)) - 0.5 * off**2
 
         reach = np.choose(np.minimum(support, 2), (p.alone, p.supported, p.possible))
@@ -133,7 +116,7 @@ class LoopCandidates:
     ) -> NDArray[np.bool_]:
         """Which candidates (C, C) fit together with the travel between them.
 
-        older, newer : (C,) local maps. measured : (C, 3) x, y, yaw of the newer in the older.
+        older, newer : (C,) stretches. measured : (C, 3) x, y, yaw of the newer in the older.
         """
         p = self._parameters
         travelled_m = np.abs(travel_m[newer][:, None] - travel_m[newer])

@@ -60,9 +60,9 @@ class LoopCloser:
         self._keyframes = keyframes
         self._local_maps = LocalMaps(keyframes, local_map_parameters)
         self._graph = SessionGraph(parameters)
-        self._candidates = LoopCandidates(candidate_parameters)
+        candidates = LoopCandidates(candidate_parameters)
         self._stretches = Stretches(
-            self._local_maps, self._candidates, parameters.stretch_maps, recognizer, projection
+            self._local_maps, candidates, parameters.stretch_maps, recognizer, projection
         )
         self._travel_m = 0.0  # in the local map that is not complete yet
         self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
@@ -158,8 +158,8 @@ class LoopCloser:
         whose local maps match near where they were recognised."""
         p = self._parameters
         loops: list[Edge] = []
-        for candidate in self._candidates.take(self._graph.nodes, np.array(self._travelled_m)):
-            for older, newer, guess in self._stretches.guesses(candidate)[: p.compared_pairs]:
+        for found in self._stretches.accepted(self._graph.nodes, np.array(self._travelled_m)):
+            for older, newer, guess in self._stretches.guesses(found)[: p.compared_pairs]:
                 loops += self._compare(older, newer, guess, (p.recognized_m, p.certain_rad))
         self._close(loops)
         if loops:

@@ -41,16 +41,20 @@ class Stretch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recognition:
-    """An earlier stretch that shows the same place as the newest one, and how the two lie to each other.
+    """Two stretches that show the same place, and how they lie to each other.
 
-    older : index of the earlier stretch.
-    T_older_newest : the frame of the newest stretch in the frame of the older one.
-        Exact to some decimetres; loop closure refines it on the local maps.
+    older, newer : their indices.
+    T_older_newer : the frame of the newer stretch in the frame of the older one. Exact to some decimetres;
+        loop closure refines it on the local maps.
     probability : 0..1, calibrated, that both show the same place, by what they look like.
+
+    Of the recognitions of one newer stretch, which show it at several places, at most one is right, or those
+    at one place that several older stretches saw.
     """
 
     older: int
-    T_older_newest: SE2
+    newer: int
+    T_older_newer: SE2
     probability: float
 
 

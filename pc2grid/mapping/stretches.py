@@ -10,12 +10,13 @@ import math
 
 import numpy as np
 
+from pc2grid.arrays import F64
 from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import grid_of
 from pc2grid.mapping.local_maps import LocalMaps
-from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates
-from pc2grid.mapping.place_recognition import PlaceRecognizer, Stretch
+from pc2grid.mapping.loop_candidates import LoopCandidates
+from pc2grid.mapping.place_recognition import PlaceRecognizer, Recognition, Stretch
 
 
 class Stretches:
@@ -65,46 +66,41 @@ class Stretches:
         """The local maps of the stretch that was asked for last."""
         return self._asked[-1]
 
-    def guesses(self, candidate: Candidate) -> list[tuple[int, int, SE2]]:
-        """The pairs of local maps of the two stretches of a candidate, the nearest first.
+    def accepted(self, nodes: F64, travel_m: F64) -> list[Recognition]:
+        """What was recognised and is a loop, by drift and by each other; each is returned once.
+
+        nodes : (N, 3) settled poses of the local maps. travel_m : (N,) metres of travel at each.
+        """
+        middles = [_middle(stretch) for stretch in self._asked]
+        return self._candidates.take(nodes[middles], travel_m[middles])
+
+    def guesses(self, found: Recognition) -> list[tuple[int, int, SE2]]:
+        """The pairs of local maps of two stretches, the nearest first.
 
         Of each the older, the newer, and T_older_newer by the recognition.
         """
         pairs = []
-        for older, T_stretch_older in self._around(candidate.older):
-            for newer, T_stretch_newer in self._around(candidate.newer):
+        for older, T_stretch_older in self._within(self._asked[found.older]):
+            for newer, T_stretch_newer in self._within(self._asked[found.newer]):
                 # The last stretch overlaps the one before. Neighbours are matched by tracking already.
                 if newer - older < 2:
                     continue
-                guess = T_stretch_older.inverse() @ candidate.T_older_newer @ T_stretch_newer
+                guess = T_stretch_older.inverse() @ found.T_older_newer @ T_stretch_newer
                 pairs.append((older, newer, guess))
         return sorted(pairs, key=lambda pair: (math.hypot(pair[2].x, pair[2].y), *pair[:2]))
 
-    def _around(self, middle: int) -> list[tuple[int, SE2]]:
-        """The local maps of the stretch around one, and their tracked poses in its frame."""
-        stretch = next(numbers for numbers in self._asked if _middle(numbers) == middle)
+    def _within(self, stretch: range) -> list[tuple[int, SE2]]:
+        """The local maps of a stretch, and their tracked poses in its frame."""
         anchors = self._local_maps.anchors
-        poses = self._local_maps.poses((anchors[number] for number in stretch), anchors[middle])
+        poses = self._local_maps.poses((anchors[number] for number in stretch), anchors[_middle(stretch)])
         return list(zip(stretch, poses, strict=True))
 
-    def _ask(self, numbers: range) -> bool:
-        """Ask where the stretch of some local maps was seen before, unless all of it is known."""
-        if self._recognizer is None or all(self._known_places[k] for k in numbers):
+    def _ask(self, stretch: range) -> bool:
+        """Ask where a stretch was seen before, unless all of its local maps are known."""
+        if self._recognizer is None or all(self._known_places[k] for k in stretch):
             return False
-        index = len(self._asked)
-        self._asked.append(numbers)
-        self._candidates.add(
-            [
-                Candidate(
-                    recognition=index,
-                    older=_middle(self._asked[found.older]),
-                    newer=_middle(numbers),
-                    T_older_newer=found.T_older_newest,
-                    probability=found.probability,
-                )
-                for found in self._recognizer.recognize(self._draw(index, numbers))
-            ]
-        )
+        self._asked.append(stretch)
+        self._candidates.add(self._recognizer.recognize(self._draw(len(self._asked) - 1, stretch)))
         return True
 
     def _draw(self, index: int, numbers: range) -> Stretch:

@@ -103,7 +103,8 @@ class SessionRecognizer:
         return [
             Recognition(
                 older=found.session_index,
-                T_older_newest=found.fit.T_map_query,
+                newer=len(self._stored),
+                T_older_newer=found.fit.T_map_query,
                 probability=probability,
             )
             for found in align(query, areas, places, maps, self._config)

@@ -8,74 +8,65 @@ import numpy as np
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from pc2grid.mapping.loop_candidates import Candidate, LoopCandidates
+from pc2grid.mapping.loop_candidates import LoopCandidates
+from pc2grid.mapping.place_recognition import Recognition
 
 STEP_M = 4.0
 
 
 def corridor(count: int) -> tuple[F64, F64]:
-    """Local maps along a straight corridor that was driven back and forth: poses and travel."""
+    """Stretches along a straight corridor that was driven back and forth: poses and travel."""
     x = STEP_M * np.minimum(np.arange(count), 2 * (count // 2) - np.arange(count))
     nodes = np.column_stack((x, np.zeros(count), np.where(np.arange(count) < count // 2, 0.0, math.pi)))
     return nodes, STEP_M * np.arange(count)
 
 
-def seen(
-    nodes: F64,
-    recognition: int,
-    older: int,
-    newer: int,
-    *,
-    off: SE2 = SE2(0.2, 0.0, 0.0),  # noqa: B008
-    probability: float = 0.99,
-) -> Candidate:
-    """A candidate that is `off` from where tracking puts the newer local map."""
-    T = SE2(*nodes[older]).inverse() @ SE2(*nodes[newer]) @ off
-    return Candidate(
-        recognition=recognition, older=older, newer=newer, T_older_newer=T, probability=probability
-    )
+NODES = corridor(41)[0]
 
 
-def accepted(*batches: list[Candidate]) -> list[Candidate]:
+def seen(older: int, newer: int, *, off: SE2 = SE2(0.2, 0.0, 0.0)) -> Recognition:  # noqa: B008
+    """A candidate that is `off` from where tracking puts the newer stretch."""
+    T = SE2(*NODES[older]).inverse() @ SE2(*NODES[newer]) @ off
+    return Recognition(older=older, newer=newer, T_older_newer=T, probability=0.99)
+
+
+def accepted(*batches: list[Recognition]) -> list[Recognition]:
     candidates = LoopCandidates()
     for batch in batches:
         candidates.add(batch)
     return candidates.take(*corridor(41))
 
 
-NODES = corridor(41)[0]
-
-
 def test_far_from_the_tracked_pose_others_must_agree() -> None:
     off = SE2(0.0, 4.0, 0.0)  # of 84 m; 2.4 m are a standard deviation
-    alone = [seen(NODES, 9, 10, 31, off=off)]
-    again = [seen(NODES, 10, 7, 34, off=off)]
-    contrary = [seen(NODES, 10, 7, 34, off=SE2(0.0, -4.0, 0.0))]
+    alone = [seen(10, 31, off=off)]
+    again = [seen(7, 34, off=off)]
+    contrary = [seen(7, 34, off=SE2(0.0, -4.0, 0.0))]
     assert accepted(alone) == [] and accepted(alone, contrary) == []
     assert accepted(alone, again) == [*alone, *again]
-    same_stretch = [seen(NODES, 9, 13, 31, off=off)]
+    same_stretch = [seen(13, 31, off=off)]
     assert accepted([*alone, *same_stretch]) == []
 
 
 def test_a_building_turned_by_half_is_never_accepted() -> None:
-    turned = [[seen(NODES, 9 + k, 10 - 3 * k, 31 + 3 * k, off=SE2(0.0, 0.0, math.pi))] for k in range(3)]
+    turned = [[seen(10 - 3 * k, 31 + 3 * k, off=SE2(0.0, 0.0, math.pi))] for k in range(3)]
     assert accepted(*turned) == []
 
 
 def test_of_two_places_for_one_stretch_the_supported_one_is_accepted() -> None:
-    right, wrong = seen(NODES, 9, 10, 31), seen(NODES, 9, 10, 31, off=SE2(2.5, 0.0, 0.0))
+    right, wrong = seen(10, 31), seen(10, 31, off=SE2(2.5, 0.0, 0.0))
     assert accepted([right, wrong]) == []
-    support = seen(NODES, 10, 7, 34)
+    support = seen(7, 34)
     assert accepted([right, wrong], [support]) == [right, support]
 
 
 def test_what_is_not_accepted_waits_and_what_cannot_be_is_forgotten() -> None:
     candidates = LoopCandidates()
     off = SE2(0.0, 4.0, 0.0)
-    first, impossible = seen(NODES, 9, 10, 31, off=off), seen(NODES, 9, 10, 31, off=SE2(0.0, 90.0, 2.0))
+    first, impossible = seen(10, 31, off=off), seen(10, 31, off=SE2(0.0, 90.0, 2.0))
     candidates.add([first, impossible])
     assert candidates.take(*corridor(41)) == []
-    second = seen(NODES, 10, 7, 34, off=off)
+    second = seen(7, 34, off=off)
     candidates.add([second])
     assert candidates.take(*corridor(41)) == [first, second]
     assert candidates.take(*corridor(41)) == []

@@ -201,7 +201,9 @@ class KnowsTheTruth:
         for older, frame in enumerate(self.frames[:-1]):
             true = frame.inverse() @ self.frames[-1]
             if math.hypot(true.x, true.y) < 8.0:
-                found.append(Recognition(older=older, T_older_newest=true, probability=1.0))
+                found.append(
+                    Recognition(older=older, newer=newest.index, T_older_newer=true, probability=1.0)
+                )
         return found
 
 

@@ -67,9 +67,9 @@ def test_an_earlier_place_is_recognised_and_a_new_one_is_not() -> None:
     again = SE2(0.7, -0.4, 2.0)
     found = recognizer.recognize(stretch(4, seen_from(rooms(1), again)))
     best = max(found, key=lambda recognition: recognition.probability)
-    assert best.older == 1 and best.probability > 0.95
-    assert math.hypot(best.T_older_newest.x - again.x, best.T_older_newest.y - again.y) < 0.1
-    assert abs(wrap_angle(best.T_older_newest.yaw - again.yaw)) < 0.02
+    assert (best.older, best.newer) == (1, 4) and best.probability > 0.95
+    assert math.hypot(best.T_older_newer.x - again.x, best.T_older_newer.y - again.y) < 0.1
+    assert abs(wrap_angle(best.T_older_newer.yaw - again.yaw)) < 0.02
     assert all(recognition.older < 4 for recognition in found)
 
 
