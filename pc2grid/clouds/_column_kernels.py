@@ -118,7 +118,8 @@ def observe_rays(
 @njit(cache=True)
 def _within(low: I64, size: int, i: int, j: int) -> bool:
     """Whether the column (i, j) of the map is one of the window."""
-    return low[0] <= i < low[0] + size and low[1] <= j < low[1] + size
+    inside: bool = low[0] <= i < low[0] + size and low[1] <= j < low[1] + size
+    return inside
 
 
 @njit(cache=True)

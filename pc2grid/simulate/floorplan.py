@@ -90,29 +90,22 @@ def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.
     """Put pilasters, pipes, radiators and cases on corridor walls, so that no corridor is smooth."""
     unit = layout.unit
     for whole in layout.corridors:
+        others = [other for other in layout.corridors if other != whole]
         corridor = whole.grown(-wall)
-        along_x = corridor.width >= corridor.height
-        low, high = (corridor.x0, corridor.x1) if along_x else (corridor.y0, corridor.y1)
+        upright = corridor.width < corridor.height
+        low, y0, high, y1 = corridor.flipped if upright else corridor
         for near in (True, False):
             at = low + float(rng.uniform(0.3, 2.0)) * unit
             while at < high:
                 slim = rng.random() < 0.5
                 long_m = float(rng.uniform(0.15, 0.4) if slim else rng.uniform(0.6, 1.6))
                 deep = max(round(float(rng.uniform(0.05, 0.2 if slim else 0.15)) * unit), 1)
-                a, b = round(at), round(at + long_m * unit)
-                box = _at_wall(corridor, a, b, deep, near=near)
-                if not any(_touch(box, other) for other in layout.corridors if other != whole):
+                foot = y0 if near else y1 - deep
+                box = Box(round(at), foot, round(at + long_m * unit), foot + deep)
+                box = box.flipped if upright else box
+                if not any(_touch(box, other) for other in others):
                     passages.put(_corners(box) + margin)
                 at += (long_m + float(rng.uniform(0.6, 4.0))) * unit
-
-
-def _at_wall(corridor: Box, begin: int, end: int, deep: int, *, near: bool) -> Box:
-    """A box along a corridor from `begin` to `end`, at the wall with the lower coordinate or at the other."""
-    if corridor.width >= corridor.height:
-        y0 = corridor.y0 if near else corridor.y1 - deep
-        return Box(begin, y0, end, y0 + deep)
-    x0 = corridor.x0 if near else corridor.x1 - deep
-    return Box(x0, begin, x0 + deep, end)
 
 
 def _columns(passages: Passages, inside: Box, margin: int, unit: float, rng: np.random.Generator) -> None:

@@ -32,6 +32,11 @@ class Box(NamedTuple):
         """Along y."""
         return self.y1 - self.y0
 
+    @property
+    def flipped(self) -> Box:
+        """With x and y exchanged."""
+        return Box(self.y0, self.x0, self.y1, self.x1)
+
     def grown(self, by: int) -> Box:
         """Larger by `by` on every side; smaller if negative."""
         return Box(self.x0 - by, self.y0 - by, self.x1 + by, self.y1 + by)
@@ -175,46 +180,37 @@ def _rooms(block: Box, unit: float, rng: np.random.Generator) -> list[Box]:
         or (area < rng.uniform(12, 32) and long < 2.2 * short)
     ):
         return [block]
-    share = rng.uniform(0.32, 0.68)
-    if block.width >= block.height:
-        at = block.x0 + int(block.width * share)
-        parts = [Box(block.x0, block.y0, at, block.y1), Box(at, block.y0, block.x1, block.y1)]
-    else:
-        at = block.y0 + int(block.height * share)
-        parts = [Box(block.x0, block.y0, block.x1, at), Box(block.x0, at, block.x1, block.y1)]
-    return [room for part in parts for room in _rooms(part, unit, rng)]
+    upright = block.width < block.height
+    x0, y0, x1, y1 = block.flipped if upright else block
+    at = x0 + int((x1 - x0) * rng.uniform(0.32, 0.68))
+    parts = [Box(x0, y0, at, y1), Box(at, y0, x1, y1)]
+    return [room for part in parts for room in _rooms(part.flipped if upright else part, unit, rng)]
 
 
-def _shared_wall(a: Box, b: Box) -> tuple[bool, int, int, int] | None:
-    """Where two boxes touch: whether along x, the line's position, from, to."""
+def _shared_wall(a: Box, b: Box) -> tuple[int, int, int] | None:
+    """Where two boxes touch along x: the line's position, from, to."""
     low, high = max(a.x0, b.x0), min(a.x1, b.x1)
     if low < high and (a.y1 == b.y0 or b.y1 == a.y0):
-        return True, a.y1 if a.y1 == b.y0 else a.y0, low, high
-    low, high = max(a.y0, b.y0), min(a.y1, b.y1)
-    if low < high and (a.x1 == b.x0 or b.x1 == a.x0):
-        return False, a.x1 if a.x1 == b.x0 else a.x0, low, high
+        return a.y1 if a.y1 == b.y0 else a.y0, low, high
     return None
 
 
 def _door(a: Box, b: Box, wall: int, unit: float, rng: np.random.Generator) -> Box | None:
     """An opening with the width of a door, sometimes of a double one, away from the corners."""
-    shared = _shared_wall(a, b)
+    along_x = _shared_wall(a, b)
+    shared = along_x or _shared_wall(a.flipped, b.flipped)
     if shared is None:
         return None
-    along_x, line, low, high = shared
-    wide = (
-        rng.uniform(1.6, 2.2)
-        if rng.random() < 0.08 and high - low > _cells(4.0, unit)
-        else rng.uniform(0.9, 1.0)
-    )
+    line, low, high = shared
+    double = rng.random() < 0.08 and high - low > _cells(4.0, unit)
+    wide = rng.uniform(1.6, 2.2) if double else rng.uniform(0.9, 1.0)
     size, corner = _cells(float(wide), unit), _cells(0.3, unit)
     if high - low < size + 2 * corner:
         return None
     at = int(rng.integers(low + corner, high - corner - size + 1))
     across = wall + 1
-    if along_x:
-        return Box(at, line - across, at + size, line + across)
-    return Box(line - across, at, line + across, at + size)
+    box = Box(at, line - across, at + size, line + across)
+    return box if along_x else box.flipped
 
 
 class _Doors:
