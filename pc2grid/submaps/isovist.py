@@ -45,6 +45,11 @@ class Isovist:
         freeze(self, "ranges_m", np.float32, (None,))
         freeze(self, "ends", np.int8, (len(self.ranges_m),))
 
+    @property
+    def observed(self) -> float:
+        """Share of the rays, 0..1, whose end is known (not HIDDEN)."""
+        return float(np.mean(self.ends != HIDDEN))
+
 
 def look_around(
     grid: OccupancyGrid,
