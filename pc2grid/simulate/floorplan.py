@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -88,24 +90,29 @@ def _keep_doors_clear(passages: Passages, layout: Layout, margin: int) -> None:
 
 def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.random.Generator) -> None:
     """Put pilasters, pipes, radiators and cases on corridor walls, so that no corridor is smooth."""
-    unit = layout.unit
     for whole in layout.corridors:
         others = [other for other in layout.corridors if other != whole]
         corridor = whole.grown(-wall)
         upright = corridor.width < corridor.height
         low, y0, high, y1 = corridor.flipped if upright else corridor
         for near in (True, False):
-            at = low + float(rng.uniform(0.3, 2.0)) * unit
-            while at < high:
-                slim = rng.random() < 0.5
-                long_m = float(rng.uniform(0.15, 0.4) if slim else rng.uniform(0.6, 1.6))
-                deep = max(round(float(rng.uniform(0.05, 0.2 if slim else 0.15)) * unit), 1)
+            for begin, end, deep in _pieces(low, high, layout.unit, rng):
                 foot = y0 if near else y1 - deep
-                box = Box(round(at), foot, round(at + long_m * unit), foot + deep)
+                box = Box(begin, foot, end, foot + deep)
                 box = box.flipped if upright else box
                 if not any(_touch(box, other) for other in others):
                     passages.put(_corners(box) + margin)
-                at += (long_m + float(rng.uniform(0.6, 4.0))) * unit
+
+
+def _pieces(low: int, high: int, unit: float, rng: np.random.Generator) -> Iterator[tuple[int, int, int]]:
+    """Where pieces along a wall from `low` to `high` begin and end, and how deep they are, in cells."""
+    at = low + float(rng.uniform(0.3, 2.0)) * unit
+    while at < high:
+        slim = rng.random() < 0.5
+        long_m = float(rng.uniform(0.15, 0.4) if slim else rng.uniform(0.6, 1.6))
+        deep = max(round(float(rng.uniform(0.05, 0.2 if slim else 0.15)) * unit), 1)
+        yield round(at), round(at + long_m * unit), deep
+        at += (long_m + float(rng.uniform(0.6, 4.0))) * unit
 
 
 def _columns(passages: Passages, inside: Box, margin: int, unit: float, rng: np.random.Generator) -> None:
