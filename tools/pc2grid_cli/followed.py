@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pc2grid.io import open_log
-from pc2grid.io.live.feed import News
-from pc2grid.io.live.inbox import FeedCounts
+from pc2grid.io.live.feed import FeedCounts, News
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.targets import is_robot, open_live
 from pc2grid.io.map_pose import BelievedPose

@@ -21,8 +21,7 @@ from websockets.typing import Subprotocol
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LiveError
-from pc2grid.io.live.feed import Feed
-from pc2grid.io.live.inbox import INBOX, InboxParameters
+from pc2grid.io.live.feed import INBOX, Feed, InboxParameters
 from pc2grid.io.message_source import RawMessage, TopicInfo
 from pc2grid.io.messages.ros_definitions import short_name
 

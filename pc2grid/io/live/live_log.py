@@ -19,8 +19,7 @@ from pc2grid.io import topics
 from pc2grid.io.error_translation import guarded, guarded_stream
 from pc2grid.io.frames import PARAMETERS as FRAMES
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.live.feed import Feed
-from pc2grid.io.live.inbox import Arrived
+from pc2grid.io.live.feed import Arrived, Feed
 from pc2grid.io.map_pose import BelievedPose, MapPose
 from pc2grid.io.message_source import Choice, LogInfo, RawMessage, Tally, TopicInfo
 from pc2grid.io.read_plan import Plan, make_plan, published_once

@@ -14,8 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 from pc2grid.config import ReadConfig
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
+from pc2grid.io.live.feed import InboxParameters
 from pc2grid.io.live.foxglove_websocket import FoxgloveWebsocket
-from pc2grid.io.live.inbox import InboxParameters
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import POSE, Nav2Publisher
 from tests.helpers.recordings import laser_drive, write_mcap

@@ -20,8 +20,8 @@ import pytest
 from pc2grid.config import ReadConfig
 from pc2grid.errors import Pc2GridError
 from pc2grid.io import open_log
+from pc2grid.io.live.feed import InboxParameters
 from pc2grid.io.live.foxglove_websocket import ConnectionParameters, FoxgloveWebsocket
-from pc2grid.io.live.inbox import InboxParameters
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.model import Scan
 from tests.helpers.memory import bounded_memory
