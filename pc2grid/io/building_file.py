@@ -1,8 +1,8 @@
 """A building in a file: one point cloud, or a mesh, read as points block by block.
 
 Clouds in PCD and PLY are read by our own reader (`messages.cloud_files`), a block at a time from the mapped
-file, so that a map of many gigabytes needs the memory of a block. Clouds as text and meshes are read by
-Open3D; a mesh is sampled evenly.
+file, so that a map of many gigabytes needs the memory of a block. Meshes are read by Open3D, and sampled
+evenly.
 
 The folder of results that KISS-SLAM writes is read, too: `local_maps/plys` in it holds its local maps, all in
 one frame.
@@ -29,7 +29,7 @@ from pc2grid.io.messages.cloud_files import parser
 from pc2grid.io.messages.types import Header
 from pc2grid.io.sensors.pointcloud2 import decode
 
-CLOUD_SUFFIXES = (".pcd", ".ply", ".xyz", ".pts")
+CLOUD_SUFFIXES = (".pcd", ".ply")
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
 
 _BLOCK_POINTS = 1_000_000  # 24 MB
@@ -118,7 +118,8 @@ def load_mesh(path: Path) -> tuple[F64, I64]:
     from pc2grid.open3d_core import o3d
 
     _check_counts(path)
-    with _quietly():
+    # Open3D prints a warning of its own for each file without triangles.
+    with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
         found = o3d.io.read_triangle_mesh(path)
     triangles = np.array(found.triangles, np.int64)
     if not len(triangles):
@@ -136,11 +137,9 @@ def _check_counts(path: Path) -> None:
 
     Open3D takes memory for all that are announced, and more than there is ends the process.
     """
-    with _opened(path) as content:
-        head: bytes = content.read(_HEADER_BYTES)
-    suffix, counts = path.suffix.lower(), []
+    head, suffix, counts = _header(path), path.suffix.lower(), []
     if suffix == ".ply":
-        counts = re.findall(rb"^element\s+\S+\s+(\d+)", head.partition(b"end_header")[0], re.MULTILINE)
+        counts = re.findall(rb"^element\s+\S+\s+(\d+)", head, re.MULTILINE)
     elif suffix == ".off":
         counts = re.findall(rb"\d+", re.sub(rb"#.*", b"", head))[:2]
     size = path.stat().st_size
@@ -166,9 +165,8 @@ def _files(path: Path) -> list[Path]:
         )
     if not path.is_file():
         raise MapFileError(f"{path}: no such file", hint="check the path")
-    with _opened(path) as content:
-        if is_lfs_pointer(content.read(_HEADER_BYTES)):
-            raise MapFileError(f"{path}: a Git LFS pointer to a cloud or mesh", hint=LFS_HINT)
+    if is_lfs_pointer(_header(path)):
+        raise MapFileError(f"{path}: a Git LFS pointer to a cloud or mesh", hint=LFS_HINT)
     return [path]
 
 
@@ -181,20 +179,20 @@ def _opened(path: Path) -> Iterator[Any]:
         raise MapFileError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
+def _header(path: Path) -> bytes:
+    """The beginning of a file; of a .ply its header."""
+    with _opened(path) as content:
+        head: bytes = content.read(_HEADER_BYTES)
+    return head.partition(b"end_header")[0]
+
+
 def _has_faces(path: Path) -> bool:
     """Whether the header of a .ply announces faces."""
-    with _opened(path) as content:
-        head: bytes = content.read(_HEADER_BYTES).partition(b"end_header")[0]
-    counts = [line.split()[2:3] for line in head.splitlines() if line.startswith(b"element face")]
-    return any(count != [b"0"] for count in counts)
+    return re.search(rb"^element face 0*[1-9]", _header(path), re.MULTILINE) is not None
 
 
 def _cloud_blocks(path: Path) -> Iterator[F64]:
     """The points of a cloud file, in blocks. Raises PointCloudError if it contradicts itself."""
-    if path.suffix.lower() not in (".pcd", ".ply"):
-        yield from _text_blocks(path)
-        return
-
     if not path.stat().st_size:
         raise MapFileError(f"{path}: empty file")
     # The file stays mapped as long as there are views of it.
@@ -213,16 +211,6 @@ def _cloud_blocks(path: Path) -> Iterator[F64]:
         yield decode(block, unit="none").xyz_m.astype(np.float64)
 
 
-def _text_blocks(path: Path) -> Iterator[F64]:
-    from pc2grid.open3d_core import o3d
-
-    with _quietly():
-        cloud = o3d.io.read_point_cloud(path, remove_nan_points=True, remove_infinite_points=True)
-    points: F64 = np.array(cloud.points)
-    for first in range(0, len(points), _BLOCK_POINTS):
-        yield points[first : first + _BLOCK_POINTS]
-
-
 def sampled(vertices: F64, triangles: I64) -> Iterator[F64]:
     """Blocks of points (N, 3) spread evenly over triangles (T, 3) of vertices (V, 3); never random."""
     a, b, c = vertices[triangles].transpose(1, 0, 2)
@@ -238,13 +226,6 @@ def sampled(vertices: F64, triangles: I64) -> Iterator[F64]:
         u, v = np.where(flipped, 1 - u, u), np.where(flipped, 1 - v, v)
         points: F64 = a[chosen] + u * (b - a)[chosen] + v * (c - a)[chosen]
         yield points
-
-
-def _quietly() -> Any:
-    """Open3D prints a warning of its own for each file without triangles."""
-    from pc2grid.open3d_core import o3d
-
-    return o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
 
 
 def neighbour_distances_m(points_m: F64) -> F64:

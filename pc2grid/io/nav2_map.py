@@ -157,43 +157,30 @@ def save_map(
     grid: OccupancyGrid,
     stem: str | Path,
     *,
-    mode: MapMode = "trinary",
+    mode: Literal["trinary", "raw"] = "trinary",
     image_format: Literal["pgm", "png"] = "pgm",
     of: MapOf = "everything",
     comment: str = "",
 ) -> tuple[Path, Path]:
     """Write `<stem>.yaml` and `<stem>.pgm` or `.png`; returns both paths. Existing files are replaced.
 
-    of : what a trinary map shows, see `OccupancyGrid.told`; the other modes hold the cells as they are.
+    of : what a trinary map shows, see `OccupancyGrid.told`; a raw one holds the cells as they are.
     comment : lines that begin the .yaml; programs that read it skip them.
 
-    `scale` needs transparency for unknown cells and therefore always writes png, as nav2's saver does.
     Numbers have full precision (nav2's saver rounds them to three decimals).
 
     >>> [path.name for path in save_map(load_map("map.yaml"), "copy")]
     ['copy.yaml', 'copy.pgm']
     """
     stem = Path(stem)
-    if mode not in ("trinary", "scale", "raw"):
-        raise MapFileError(f"mode: {mode!r} is not one of trinary, scale, raw")
-    suffix = "png" if mode == "scale" else image_format
-    cells = grid.cells[::-1].astype(np.int16)  # row 0 of an image has the largest y
-    known = cells >= 0
-    occupied_thresh, free_thresh = _OCCUPIED_THRESH, _FREE_THRESH
-    pixels: NDArray[np.uint8]
+    if mode not in ("trinary", "raw"):
+        raise MapFileError(f"mode: {mode!r} is not one of trinary, raw")
+    cells = grid.cells if mode == "raw" else grid.told(of)
+    pixels = cells[::-1].astype(np.uint8)  # row 0 of an image has the largest y; unknown is 255
     if mode == "trinary":
-        told = grid.told(of)[::-1]
-        pixels = np.full(cells.shape, _UNKNOWN_GREY, dtype=np.uint8)
-        pixels[told == FREE] = _FREE_GREY
-        pixels[told == OCCUPIED] = _OCCUPIED_GREY
-    elif mode == "raw":
-        pixels = np.where(known, cells, 255).astype(np.uint8)
-    else:
-        occupied_thresh, free_thresh = 1.0, 0.0  # every value between them is read back unchanged
-        grey = np.where(known, np.rint((100 - cells) * 2.55), 128).astype(np.uint8)
-        pixels = np.dstack((grey, grey, grey, np.where(known, 255, 0).astype(np.uint8)))
-
-    image_path = stem.with_name(f"{stem.name}.{suffix}")
+        told = [cells[::-1] == FREE, cells[::-1] == OCCUPIED]
+        pixels = np.select(told, [_FREE_GREY, _OCCUPIED_GREY], _UNKNOWN_GREY).astype(np.uint8)
+    image_path = stem.with_name(f"{stem.name}.{image_format}")
     yaml_path = stem.with_name(f"{stem.name}.yaml")
     plain = re.fullmatch(r"[A-Za-z_][\w.\-]*", image_path.name)
     text = "".join(f"# {line}\n" for line in comment.splitlines()) + (
@@ -202,12 +189,12 @@ def save_map(
         f"resolution: {_yaml_number(grid.resolution_m)}\n"
         f"origin: [{_yaml_number(grid.origin_m[0])}, {_yaml_number(grid.origin_m[1])}, 0]\n"
         "negate: 0\n"
-        f"occupied_thresh: {occupied_thresh}\n"
-        f"free_thresh: {free_thresh}\n"
+        f"occupied_thresh: {_OCCUPIED_THRESH}\n"
+        f"free_thresh: {_FREE_THRESH}\n"
     )
     # Both files are complete before the first is renamed: a full disk leaves the old pair, not a mixed one.
     with replace_file(yaml_path) as new_yaml, replace_file(image_path) as new_image:
-        new_image.write_bytes(encode_image(pixels, suffix, grid.resolution_m))
+        new_image.write_bytes(encode_image(pixels, image_format, grid.resolution_m))
         new_yaml.write_text(text, encoding="utf-8")
     return yaml_path, image_path
 

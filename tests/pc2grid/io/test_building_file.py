@@ -47,16 +47,6 @@ def test_blocks_are_the_whole(tmp_path: Path, suffix: str, monkeypatch: pytest.M
     assert kind_of(path) == "cloud"
 
 
-@pytest.mark.parametrize("suffix", [".xyz", ".pts"])
-def test_text_is_read(tmp_path: Path, suffix: str) -> None:
-    import open3d as o3d
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(CLOUD.astype(float)))
-    path = tmp_path / f"cloud{suffix}"
-    o3d.io.write_point_cloud(str(path), cloud)
-    assert points(path) == pytest.approx(CLOUD, abs=1e-5)
-
-
 def test_mesh_is_sampled_evenly(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = square(tmp_path / "square.obj")
     monkeypatch.setattr(building_file, "_BLOCK_POINTS", 500)
@@ -140,7 +130,6 @@ MANY = 2_000_000_000
         ("far.off", b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 77777\n", "none of the 3 vertices"),
         ("far.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 999999999\n", "neither points nor triangles"),
         ("many.stl", bytes(80) + struct.pack("<I", 2**32 - 1) + bytes(500), "neither points nor triangles"),
-        ("many.pts", b"2000000000\n1 2 3\n", "neither points nor triangles"),
         (
             "many.glb",
             b"glTF" + struct.pack("<III", 2, 2**32 - 1, 2**32 - 1) + b"JSON{}",

@@ -49,7 +49,7 @@ def test_loading_agrees_with_the_oracle(mode: str, pixels: bytes, negate: int) -
 
 
 @pytest.mark.parametrize("image_format", ["pgm", "png"])
-@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+@pytest.mark.parametrize("mode", ["trinary", "raw"])
 @settings(max_examples=40, deadline=None)
 @given(
     cells=hnp.arrays(np.int8, st.tuples(st.integers(1, 6), st.integers(1, 6)), elements=st.integers(-1, 100)),
@@ -187,13 +187,6 @@ def test_what_is_a_map_and_what_is_a_recording(tmp_path: Path) -> None:
     (tmp_path / "folder.yaml").mkdir()
     names = {"a.yaml": True, "a.yml": True, "a.mcap": False, "metadata.yaml": False, "folder.yaml": False}
     assert {name: is_map_file(tmp_path / name) for name in names} == names
-
-
-def test_a_map_is_not_saved_in_an_unknown_mode(tmp_path: Path) -> None:
-    grid = OccupancyGrid(cells=np.zeros((2, 3), np.int8), resolution_m=0.1, origin_m=(0.0, 0.0))
-    with pytest.raises(MapFileError, match="mode: 'odd' is not one of"):
-        save_map(grid, tmp_path / "m", mode="odd")  # type: ignore[arg-type]
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("image_format", ["pgm", "png"])
