@@ -196,7 +196,7 @@ class FrameTree:
 
     def moving(self, target: str, source: str) -> bool:
         """Whether a transform between two connected frames depends on time."""
-        return any(child not in self._static for child in self._path(target, source))
+        return bool(self._moving_tracks(target, source))
 
     def newest_ns(self, target: str, source: str) -> int:
         """The stamp up to which the moving part of the path between two connected frames is known; 0 if it
@@ -207,9 +207,6 @@ class FrameTree:
         """The longest time without a sample of a moving part of the path between two connected frames."""
         tracks = self._moving_tracks(target, source)
         return max((track.longest_gap_ns(begin_ns, end_ns) for track in tracks), default=0)
-
-    def _moving_tracks(self, target: str, source: str) -> list[PoseTrack]:
-        return [self._moving[child] for child in self._path(target, source) if child not in self._static]
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
         """`T_target_source` (4, 4) at a time; None if a moving part of it is not known then.
@@ -223,10 +220,8 @@ class FrameTree:
             return cached
         if not self.connected(target, source):
             raise self.missing(source, target)
-        up, down = self.chain(source), self.chain(target)
-        common = next(frame for frame in up if frame in down)
-        T_common_source = self._climb(up[: up.index(common)], stamp_ns)
-        T_common_target = self._climb(down[: down.index(common)], stamp_ns)
+        up, down = self._branches(target, source)
+        T_common_source, T_common_target = self._climb(up, stamp_ns), self._climb(down, stamp_ns)
         if T_common_source is None or T_common_target is None:
             return None
         result = invert_pose(T_common_target) @ T_common_source
@@ -248,11 +243,16 @@ class FrameTree:
             "--set read.base_frame=NAME chooses another base",
         )
 
-    def _path(self, target: str, source: str) -> list[str]:
-        """Children of the edges between two connected frames."""
+    def _branches(self, target: str, source: str) -> tuple[list[str], list[str]]:
+        """Children of the edges from `source`, and from `target`, up to the frame where they meet."""
         up, down = self.chain(source), self.chain(target)
         common = next(frame for frame in up if frame in down)
-        return up[: up.index(common)] + down[: down.index(common)]
+        return up[: up.index(common)], down[: down.index(common)]
+
+    def _moving_tracks(self, target: str, source: str) -> list[PoseTrack]:
+        """The tracks of the moving edges between two connected frames."""
+        edges = itertools.chain(*self._branches(target, source))
+        return [self._moving[child] for child in edges if child not in self._static]
 
     def _climb(self, children: list[str], stamp_ns: int) -> F64 | None:
         """`T_top_bottom` from the first of `children` to the parent of the last."""

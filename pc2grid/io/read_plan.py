@@ -325,7 +325,7 @@ class _Planner:
         frames, warn = self._frames, self._source.tally.warn
         base, as_asked = self._base_frame(), self._config.assume_identity
         if self._sensors[0].kind == "lidar" and self._is_fixed(base) and not as_asked:
-            return self._base_of_odometry(base)
+            raise registered(self._frame)
         root = frames.static_root() if base is None else None
         if root is not None and frames.connected(root, self._frame):
             warn(f"tf has no {_BASE_FRAMES[0]}: {root}, the root of its static transforms, is taken for it")
@@ -340,16 +340,6 @@ class _Planner:
         else:
             raise frames.missing(self._frame, base or "the base")
         return None
-
-    def _base_of_odometry(self, base: str | None) -> str:
-        """The base frame of points in a fixed frame that tf does not connect to it.
-
-        Raises FrameError unless the odometry is in that frame.
-        """
-        for reading in self._readings:
-            if reading.content.header.frame == self._frame and (base or reading.content.child):
-                return base or str(reading.content.child)
-        raise registered(self._frame)
 
     def _tf_may_be_lost(self) -> bool:
         """Whether tf may be among what is lost: a wrong base frame would shift every scan."""

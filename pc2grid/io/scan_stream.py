@@ -121,7 +121,10 @@ class Part:
 
 
 class _Waiting(NamedTuple):
-    """A scan that waits; scans with equal stamps are sorted by their number in the log."""
+    """A scan that waits; scans with equal stamps are sorted by their number in the log.
+
+    size_bytes : of the message as it was recorded. A text of numbers takes four times as much at most.
+    """
 
     stamp_ns: int
     number: int
@@ -266,18 +269,6 @@ class _Poses:
         T_imu_base = invert_pose(self._in_base(self._imu_frame, stamp_ns))
         T_imu_base[:3, 3] = 0.0
         return T_level_imu @ T_imu_base
-
-    def points(self, frame: str, stamp_ns: int) -> F64:
-        """`T_base_points` (4, 4) of points in a frame: that of the sensor, or a fixed one.
-
-        Raises FrameError, PointCloudError.
-        """
-        if self._plan.mounted is None or self._frames.connected(self._base, frame):
-            return self.sensor(frame, stamp_ns)
-        T_fixed_base = self.odometry(stamp_ns)
-        if T_fixed_base is None:
-            raise PointCloudError("odometry is unknown at the stamp")
-        return invert_pose(T_fixed_base)
 
     def sensor(self, frame: str, stamp_ns: int) -> F64:
         """`T_base_sensor` (4, 4) of the sensor with this frame. Raises FrameError, PointCloudError."""
@@ -429,8 +420,8 @@ class Stream:
         except Pc2GridError as error:
             self._skip(error)
             return
-        size = max(len(data), message.size_bytes)
-        heapq.heappush(self._waiting, _Waiting(stamp_ns, self._part.count, log_time_ns, size, message))
+        waiting = _Waiting(stamp_ns, self._part.count, log_time_ns, len(data), message)
+        heapq.heappush(self._waiting, waiting)
 
     def _stamp_of(self, message: ScanMessage, log_time_ns: int) -> int:
         """The stamp of a scan. Raises PointCloudError for one that is none."""
@@ -484,7 +475,7 @@ class Stream:
 
     def _scan(self, stamp_ns: int, message: ScanMessage) -> Scan:
         """The scan with all that belongs to it. Raises as `ScanDecoder.scan` does, and FrameError."""
-        T_base_points = self.poses.points(message.header.frame, stamp_ns)
+        T_base_points = self.poses.sensor(message.header.frame, stamp_ns)
         scan = self._decoders[0].scan(message, stamp_ns, T_base_points, self.poses.odometry(stamp_ns))
         if self._plan.mounted is not None:
             scan = self._measured(scan, self._plan.mounted)

@@ -57,11 +57,6 @@ class PointCloud2:
     data: Bytes
     origin: Seven | None = None
 
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of memory that the message keeps."""
-        return len(self.data)
-
 
 @dataclass(frozen=True, slots=True)
 class LaserScan:
@@ -78,11 +73,6 @@ class LaserScan:
     ranges: NDArray[Any]
     origin: Seven | None = None
 
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of memory that the message keeps."""
-        return self.ranges.nbytes
-
 
 @dataclass(frozen=True, slots=True)
 class Image:
@@ -96,11 +86,6 @@ class Image:
     step: int
     data: Bytes
 
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of memory that the message keeps."""
-        return len(self.data)
-
 
 @dataclass(frozen=True, slots=True)
 class CompressedImage:
@@ -109,11 +94,6 @@ class CompressedImage:
     header: Header
     format: str
     data: Bytes
-
-    @property
-    def size_bytes(self) -> int:
-        """Bytes of memory that the message keeps."""
-        return len(self.data)
 
 
 ScanMessage = PointCloud2 | LaserScan | Image | CompressedImage
