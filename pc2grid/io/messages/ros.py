@@ -181,20 +181,18 @@ def _store_of(channel: TopicInfo, ros1: bool, needed: str) -> tuple[str, Any]:
 
     Raises UnsupportedSchema if it cannot be read, or lacks a field that is needed.
     """
-    text = channel.schema.decode("utf-8", "replace").replace("\r\n", "\n")
-    known = ("ros1msg",) if ros1 else ("ros2msg", "ros2idl")
-    if text.strip() and channel.schema_encoding not in known:
+    text = channel.schema.decode("utf-8", "replace").replace("\r\n", "\n").strip()
+    encoding = "ros1msg" if ros1 else "ros2msg"
+    if text and channel.schema_encoding != encoding:
         raise UnsupportedSchema(
             f"{channel.topic}: schema encoding {channel.schema_encoding!r:.40} is not read",
-            hint=f"supported: {', '.join(known)}",
+            hint=f"supported: {encoding}",
         )
-    if text.strip():
-        short, encoding = channel.type, channel.schema_encoding
-    else:  # tf/tfMessage is called so today
-        short, encoding = channel.type.replace("tf/tfMessage", "tf2_msgs/TFMessage"), known[0]
+    # tf/tfMessage is called so today.
+    short = channel.type if text else channel.type.replace("tf/tfMessage", "tf2_msgs/TFMessage")
     name = short.replace("/", "/msg/")
     try:
-        store = ros_definitions.store_of(short, encoding, text.strip() and text)
+        store = ros_definitions.store_of(short, encoding, text)
     except ValueError as error:
         raise UnsupportedSchema(
             f"{channel.topic}: the schema of {channel.type} is not readable: {error}"

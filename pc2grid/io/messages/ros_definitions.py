@@ -11,7 +11,7 @@ import re
 from typing import TYPE_CHECKING, Any, cast
 
 from rosbags.interfaces import Nodetype
-from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ def short_name(type_name: str) -> str:
 def store_of(type_name: str, encoding: str, text: str) -> Typestore:
     """A store with a type and all that it consists of; the names of fields in small letters.
 
-    encoding : of the schema in the log, `ros2msg`, `ros1msg` or `ros2idl`. text : the schema; empty: as ROS
+    encoding : of the schema in the log, `ros2msg` or `ros1msg`. text : the schema; empty: as ROS
     defines the type. Raises ValueError if the text cannot be understood.
     """
     store, name = Typestore(), short_name(type_name)
@@ -55,18 +55,12 @@ def _of_ros(encoding: str) -> Typesdict:
 
 
 def _parsed(name: str, encoding: str, text: str) -> Typesdict:
-    """The types in a definition; `name` is the first one of a text in the .msg language.
-
-    Raises ValueError.
-    """
+    """The types in a definition in the .msg language, of which `name` is the first. Raises ValueError."""
     if len(text) > _MOST_CHARACTERS:
         raise ValueError(f"{name}: a definition of {len(text)} characters")
     try:
-        if encoding == "ros2idl":
-            found = get_types_from_idl(_plain_idl(text))
-        else:
-            ruled = re.sub(r"^=+[ \t]*$", "=" * 80, text, flags=re.MULTILINE)
-            found = get_types_from_msg(ruled, name.replace("/", "/msg/"))
+        ruled = re.sub(r"^=+[ \t]*$", "=" * 80, text, flags=re.MULTILINE)
+        found = get_types_from_msg(ruled, name.replace("/", "/msg/"))
     except Exception as error:  # the parser raises whatever a malformed text leads it to
         raise ValueError(f"{name}: not a definition that rosbags understands") from error
     _check_names(found)
@@ -83,26 +77,6 @@ def _check_names(types: Typesdict) -> None:
     for name in names:
         if not _NAME.fullmatch(name) or keyword.iskeyword(name):
             raise ValueError(f"{name!r:.40}: not a name in ROS")
-
-
-def _plain_idl(text: str) -> str:
-    """The structs and typedefs of an IDL text as rosbag2 writes it, without what the layout does not need.
-
-    The time that rosbags takes grows by a factor of 100 with each level of parentheses
-    (`const long b = ((1));` takes 20 s), and by 2 with each level of sequences.
-
-    Raises ValueError for a text in which such are left.
-    """
-    # Comments and strings in one pass, to the end if they do not end: so each character is looked at once.
-    text = re.sub(r"//[^\n]*|/\*.*?(?:\*/|\Z)|\"(?:[^\"\\]|\\.)*(?:\"|\Z)", "", text, flags=re.DOTALL)
-    text = re.sub(r"@\w+\s*(\((?:[^()]|\([^()]*\))*\))?", "", text)
-    text = re.sub(r"^[=#][^\n]*$|^IDL:[^\n]*$", "", text, flags=re.MULTILINE)
-    text = re.sub(r"\bconst\b[^;]*;", "", text)
-    text = re.sub(r"\bmodule\s+\w+\s*\{\s*\}\s*;", "", text)  # of constants only
-    text = re.sub(r"\b(w?string)\s*<\s*\d+\s*>", r"\1", text)
-    if re.search(r"[()+*/%^|&~-]|<[^<>]*<", text):
-        raise ValueError("expressions or nested sequences")
-    return text
 
 
 def _needed(top: str, types: Typesdict) -> Typesdict:

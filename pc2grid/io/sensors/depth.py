@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F32, F64
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
 from pc2grid.io.messages.types import Bytes, CameraInfo, CompressedImage, Image
-from pc2grid.io.sensors import rvl
 from pc2grid.io.sensors.camera import pixel_rays
 from pc2grid.io.sensors.png_header import MAGIC, read_header
 from pc2grid.io.sensors.pointcloud2 import Points
@@ -28,8 +27,8 @@ T_BODY_OPTICAL: F64 = np.array(
 )
 _METRE_M, _MILLIMETRE_M = 1.0, 1e-3
 _LAYOUTS = {"16UC1": "u2", "mono16": "u2", "32FC1": "f4"}
+_NOT_READ = ("jpeg", "rvl")  # how image_transport compresses, too
 _CONFIG_HEADER = struct.Struct("<iff")  # compressed_depth_image_transport: format, depth_param a and b
-_RVL_SIZE = struct.Struct("<II")  # the same: columns, rows
 
 
 class _Depths(NamedTuple):
@@ -129,16 +128,17 @@ def _compressed_depth(image: CompressedImage, max_points: int, stride: int) -> _
     encoding, _, transport = (part.strip() for part in image.format.partition(";"))
     data = memoryview(image.data)
     start = _png_start(data)
-    readable = encoding in _LAYOUTS and "jpeg" not in transport
+    readable = encoding in _LAYOUTS and not any(other in transport for other in _NOT_READ)
     if not readable and bytes(data[start : start + len(MAGIC)]) != MAGIC:
         raise UnsupportedSchema(
             f"a compressed image of format {image.format!r:.60} is not read",
-            hint="supported: a png of 16 bits, and compressedDepth (png or rvl) of 16UC1 or 32FC1",
+            hint="read are a png of 16 bits, and compressedDepth png of 16UC1 or 32FC1; of others, "
+            "`image_transport republish` makes an Image",
         )
     if len(data) < start:
         raise PointCloudError("a compressedDepth image is shorter than its header")
     a, b = _CONFIG_HEADER.unpack_from(data)[1:] if start else (0.0, 0.0)
-    values = (_rvl_pixels if "rvl" in transport else _pixels)(data[start:], max_points)
+    values = _pixels(data[start:], max_points)
     kept = values[::stride, ::stride]
     if encoding == "32FC1" or (encoding not in _LAYOUTS and a > 0):
         return _Depths(_dequantised(kept, a, b), _METRE_M, values.shape)
@@ -166,18 +166,6 @@ def _pixels(data: memoryview, max_points: int) -> NDArray[np.uint16]:
     if values is None or values.shape != (found.height, found.width) or values.dtype != np.uint16:
         raise PointCloudError("the png of a depth image is damaged")
     return values.astype(np.uint16, copy=False)
-
-
-def _rvl_pixels(data: memoryview, max_points: int) -> NDArray[np.uint16]:
-    """(H, W) the values of an rvl of image_transport, which begins with the size."""
-    if len(data) < _RVL_SIZE.size:
-        raise PointCloudError("the rvl of a depth image is damaged: it is cut off")
-    width, height = _RVL_SIZE.unpack_from(data)
-    _check_size(height, width, max_points)
-    try:
-        return rvl.decode(data[_RVL_SIZE.size :], height * width).reshape(height, width)
-    except ValueError as error:
-        raise PointCloudError(f"the rvl of a depth image is damaged: {error}") from error
 
 
 def _dequantised(values: NDArray[np.uint16], a: float, b: float) -> F32:

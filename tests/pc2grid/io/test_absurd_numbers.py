@@ -13,13 +13,12 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mcap.writer import CompressionType, Writer
+from mcap.writer import Writer
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     FrameError,
     LimitExceeded,
-    LogCorrupt,
     LogNotFound,
     MapFileError,
     PointCloudError,
@@ -48,7 +47,6 @@ from tests.helpers.recordings import (
     ros,
     write_bag,
     write_mcap,
-    write_rosbag2,
 )
 
 INFO, DEPTH = "/camera/depth/camera_info", "/camera/depth/image_raw"
@@ -185,26 +183,6 @@ def test_colour_and_transparency(tmp_path: Path) -> None:
         load_map(map_with(tmp_path, bytes(cv2.imencode(".png", image)[1])))
 
 
-@pytest.mark.parametrize(
-    ("keys", "words"),
-    [
-        (
-            {"resolution": "1e-300"},
-            "resolution: input should be greater than or equal to 0.001",
-        ),
-        ({"resolution": 0.0009}, "resolution"),
-        ({"resolution": "1e300"}, "resolution"),
-        ({"resolution": -0.05}, "resolution"),
-        ({"origin": "[1e300, 0, 0]"}, "origin: input should be less than or equal to"),
-        ({"origin": "[0, -2e8, 0]"}, "origin"),
-    ],
-)
-def test_maps_of_absurd_sizes(tmp_path: Path, keys: dict[str, object], words: str) -> None:
-    with pytest.raises(MapFileError, match=words) as caught:
-        load_map(map_with(tmp_path, b"P5 2 2 255\n" + bytes(4), "pgm", **keys))
-    assert "m.yaml" in caught.value.message
-
-
 # --- depth images -------------------------------------------------------------------------------------
 
 
@@ -226,15 +204,6 @@ def test_depth_images_that_unpack_without_end(tmp_path: Path, image: bytes, word
     with peak_memory() as peak, pytest.raises(PointCloudError, match=words):
         seen_by(ros().camera(INFO, T0, 6, 4, 100.0), message, tmp_path, ReadConfig(max_points=50_000))
     assert peak.grown_bytes() < 64 * MIB
-
-
-@pytest.mark.parametrize("focal", [1e-300, 1e-30, 1e-3, float("nan"), float("inf"), -5.0])
-def test_cameras_with_absurd_focal_lengths(tmp_path: Path, focal: float) -> None:
-    image = ros().image(DEPTH, T0, np.full((4, 6), 1000, np.uint16), "16UC1")
-    with pytest.raises(
-        PointCloudError, match=f"{INFO}: (a camera without focal length|fx .* is of no camera)"
-    ):
-        seen_by(ros().camera(INFO, T0, 6, 4, focal), image, tmp_path)
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, 1e300])
@@ -274,13 +243,17 @@ def moved(message: Message, old: float, new: float) -> Message:
 ABSURD = [1e300, -1e300, 1e39, 1.1e8, float("nan"), float("inf")]
 
 
+NOWHERE = [*((0.25, value) for value in ABSURD), *((1.0, w) for w in (0.0, 1e-200, 1e200, float("nan")))]
+
+
 @pytest.mark.parametrize("topic", ["/tf_static", "/tf"])
-@pytest.mark.parametrize("value", ABSURD)
-def test_a_mount_that_is_nowhere_on_earth_is_refused_by_name(
-    tmp_path: Path, value: float, topic: str
+@pytest.mark.parametrize(("old", "new"), NOWHERE)
+def test_a_mount_that_is_nowhere_or_turned_nowhere_is_refused_by_name(
+    tmp_path: Path, old: float, new: float, topic: str
 ) -> None:
+    """x of a transform, or w of its quaternion."""
     to = ros()
-    mount = moved(to.tf(T0, "base_link", "lidar", 0.25, topic=topic), 0.25, value)
+    mount = moved(to.tf(T0, "base_link", "lidar", 0.25, topic=topic), old, new)
     path = write_mcap(tmp_path / "a.mcap", [mount, to.cloud("/points", T0, [[1, 2, 3]])])
     with pytest.raises(FrameError, match=r"a transform base_link -> lidar of the log makes no sense"):
         read(path)
@@ -305,15 +278,6 @@ def test_a_chain_of_very_many_frames() -> None:
     tree.add(Transform(Header(T0, "f9000"), "f1", links[0].pose), static=True)
     with pytest.raises(FrameError, match=r"tf goes in a circle: .* -> f1 -> f9000$"):
         tree.chain("f10000")
-
-
-@pytest.mark.parametrize("length", [0.0, 1e-200, 1e200, float("nan")])
-def test_a_quaternion_without_direction_is_refused_by_name(tmp_path: Path, length: float) -> None:
-    to = ros()
-    mount = moved(to.tf(T0, "base_link", "lidar", 0.25, topic="/tf_static"), 1.0, length)
-    path = write_mcap(tmp_path / "a.mcap", [mount, to.cloud("/points", T0, [[1, 2, 3]])])
-    with pytest.raises(FrameError, match="base_link -> lidar"):
-        read(path)
 
 
 def test_an_unreadable_tf_message_is_not_taken_for_no_tf(tmp_path: Path) -> None:
@@ -445,16 +409,11 @@ HEADER = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 30000\nHEIGHT 1\nDATA "
     ("content", "words"),
     [
         (HEADER + b"ascii\n" + b"1 2 3\n" * 29_999 + b"1 2", "not a line of numbers"),
-        (HEADER + b"binary_compressed\n" + struct.pack("<II", 9, 360_000) + bytes(9), "expand to 360000"),
-        (
-            HEADER.replace(b"30000", b"30000000") + b"binary_compressed\n"
-            + struct.pack("<II", 4_100_000, 360_000_000) + bytes(4_100_000),
-            "would expand to 360000000",
-        ),
+        (HEADER + b"binary_compressed\n" + struct.pack("<II", 9, 360_000) + bytes(9), "is not read"),
     ],
-)  # fmt: skip
+)
 def test_clouds_that_swell(content: bytes, words: str) -> None:
-    with peak_memory() as peak, pytest.raises(PointCloudError, match=words):
+    with peak_memory() as peak, pytest.raises((PointCloudError, UnsupportedSchema), match=words):
         cloud_files.parser("pcd")(content, Header(1, "lidar"))
     assert peak.grown_bytes() < 64 * MIB
 
@@ -469,59 +428,48 @@ def nested(levels: int, width: int, leaf: str = "int32 a\n") -> str:
 
 
 @pytest.mark.parametrize(
-    ("encoding", "text"),
+    "text",
     [
-        ("ros2msg", nested(14, 12)),
-        ("ros2msg", nested(14, 12, leaf="")),
-        ("ros2msg", nested(2, 5000)),
-        ("ros2msg", "sensor_msgs/PointCloud2 again\n"),
-        ("ros2msg", "int32 a\n" * 200_000),
-        ("ros2idl", "typedef " + " " * 30_000 + "x"),
-        ("ros2idl", "typedef " + "a " * 30_000 + "[3]"),
-        ("ros2idl", '"' + '\\"' * 100_000),
-        ("ros2idl", "/* " * 100_000),
-        ("ros2idl", "@a(" * 100_000),
-        ("ros2idl", "struct a {" * 50_000),
+        nested(14, 12),
+        nested(14, 12, leaf=""),
+        nested(2, 5000),
+        "sensor_msgs/PointCloud2 again\n",
+        "int32 a\n" * 200_000,
     ],
 )
-def test_definitions_that_swell_or_take_for_ever(tmp_path: Path, encoding: str, text: str) -> None:
+def test_definitions_that_swell_or_take_for_ever(tmp_path: Path, text: str) -> None:
     cloud = ros().cloud("/points", T0, [[1, 2, 3]])
     path = raw_log(
-        tmp_path / "a.mcap", [("/points", "sensor_msgs/msg/PointCloud2", encoding, text.encode(), cloud.data)]
+        tmp_path / "a.mcap",
+        [("/points", "sensor_msgs/msg/PointCloud2", "ros2msg", text.encode(), cloud.data)],
     )
     with peak_memory() as peak, pytest.raises(UnsupportedSchema, match="/points"):
         read(path, ReadConfig(assume_identity=True))
     assert peak.grown_bytes() < 64 * MIB
 
 
-def test_a_chunk_above_the_limit_is_not_read_by_the_index_either(tmp_path: Path) -> None:
-    cloud = ros().cloud("/points", T0, np.ones((900, 3)))
-    path = write_mcap(tmp_path / "a.mcap", [cloud], compression=CompressionType.NONE)
-    with pytest.raises(LimitExceeded, match=r"chunk at byte \d+: a record has \d+ bytes; the limit is 3000"):
-        read(path, ReadConfig(assume_identity=True, max_record_bytes=3000))
-
-
 def test_small_messages_do_not_keep_large_chunks_in_memory(tmp_path: Path) -> None:
-    """16 chunks of 24 MB that overlap in time, each with one scan among images that are not read."""
-    image = Message("/other", "sensor_msgs/Image", T0, bytes(24 * MIB))
+    """16 chunks of 8 MB that overlap in time, each with one scan among images that are not read."""
+    image = Message("/other", "sensor_msgs/Image", T0, bytes(8 * MIB))
     messages = []
     for i in range(16):
         messages += [image, ros().cloud("/points", T0 + i * STEP, [[1, 2, 3]])]
-    path = write_mcap(tmp_path / "a.mcap", messages, chunk_size=23 * MIB)
+    path = write_mcap(tmp_path / "a.mcap", messages, chunk_size=7 * MIB)
     assert path.stat().st_size < MIB
     with peak_memory() as peak:
         assert len(read(path, ReadConfig(assume_identity=True))[0]) == 16
-    assert peak.grown_bytes() < 200 * MIB
+    assert peak.grown_bytes() < 66 * MIB
 
 
 @pytest.mark.parametrize("encoding", ["json", "protobuf"])
-def test_a_laser_of_millions_of_beams(tmp_path: Path, encoding: str) -> None:
+def test_a_laser_of_too_many_beams(tmp_path: Path, encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pc2grid.io.messages.foxglove.MOST_BEAMS", 1000)
     fields = foxglove.stamped(
         T0, frame_id="laser", pose=foxglove.IDENTITY, start_angle=0.0, end_angle=6.0,
-        ranges=[0.0] * 1_000_001, intensities=[],
+        ranges=[0.0] * 1001, intensities=[],
     )  # fmt: skip
     path = foxglove.write(tmp_path / "a.mcap", [("/scan", "LaserScan", T0, fields)], encoding)
-    with pytest.raises(LimitExceeded, match="a scan of 1000001 beams; the limit is 1000000"):
+    with pytest.raises(LimitExceeded, match="a scan of 1001 beams; the limit is 1000"):
         read(path, ReadConfig(assume_identity=True))
 
 
@@ -565,12 +513,3 @@ def test_a_bag_whose_records_are_too_large(tmp_path: Path) -> None:
     with peak_memory() as peak, pytest.raises(LimitExceeded, match="2147483648 bytes"):
         read(path)
     assert peak.grown_bytes() < 16 * MIB
-
-
-def test_metadata_of_very_many_items(tmp_path: Path) -> None:
-    folder = write_rosbag2(tmp_path / "log", drive())
-    known = (folder / "metadata.yaml").read_text()
-    for more in ("more: [" + "1," * 250_000 + "]", "\n".join(["#"] * 250_000)):
-        (folder / "metadata.yaml").write_text(known + more)
-        with pytest.raises(LogCorrupt, match=r"metadata\.yaml: not the metadata .*reindex"):
-            read(folder)

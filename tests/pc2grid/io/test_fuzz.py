@@ -52,7 +52,7 @@ MCAP = {
 CHECKED = [*MCAP, "mcap ros1", "rosbag2 mcap"]
 UNCHECKED = [
     "bag", "bag bz2", "bag lz4", "db3", "rosbag2 db3",
-    "pcd ascii", "pcd binary", "pcd compressed", "ply ascii", "ply binary", "bin",
+    "pcd ascii", "pcd binary", "ply ascii", "ply binary", "bin",
 ]  # fmt: skip
 KINDS = [*CHECKED, *UNCHECKED]
 # With fewer scans, a single lost one would exceed the tenth that a reader accepts; where every chunk has a

@@ -64,9 +64,6 @@ def test_stamps_and_poses_of_a_tum_file(tmp_path: Path) -> None:
     found = np.array([s.T_odom_base for s in scans])
     np.testing.assert_allclose(found, expected.T_session_base, atol=1e-8)
     assert all(s.T_odom_base is None for s in read(folder, ReadConfig(odometry="none"))[0])
-    write_tum(folder / "poses.tum", trajectory(7))
-    with pytest.raises(TrajectoryFileError, match="7 poses for 12 clouds"):
-        read(folder)
 
 
 @pytest.mark.parametrize("names", ["{s}.{ns:09d}", "{all}", "{us}"])
@@ -98,12 +95,6 @@ def test_times_as_kitti_has_them(tmp_path: Path) -> None:
     scans, report = read(folder)
     assert np.diff([s.stamp_ns for s in scans]).tolist() == [STEP] * 11
     assert not any("assumed" in w for w in report.warnings)
-    (sequence / "times.txt").write_text("0.0\n0.1\n")
-    with pytest.raises(TrajectoryFileError, match="2 times for 12 clouds"):
-        read(folder)
-    (sequence / "times.txt").write_text("a\n" * 12)
-    with pytest.raises(TrajectoryFileError, match=r"times\.txt: not seconds"):
-        read(folder)
 
 
 def test_per_point_times_of_a_pcd(tmp_path: Path) -> None:
@@ -150,9 +141,7 @@ HEAD = b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 2
         ("1.pcd", HEAD.replace(b"WIDTH 2", WIDE) + b"DATA ascii\n", PointCloudError, "declared"),
         ("1.pcd", HEAD.replace(b"WIDTH 2", WIDE) + b"DATA binary\n", PointCloudError, "max_points"),
         ("1.pcd", HEAD.replace(b" z", b" w") + b"DATA binary\n" + bytes(24), PointCloudError, "field z"),
-        ("1.pcd", HEAD + b"DATA binary_compressed\n" + struct.pack("<II", 2, 24) + b"\xe0\xff",
-         PointCloudError, "compressed data of a PCD is damaged"),
-        ("1.pcd", HEAD + b"DATA binary_compressed\n" + bytes([9, 0]), PointCloudError, "declared"),
+        ("1.pcd", HEAD + b"DATA binary_compressed\n" + bytes(8), UnsupportedSchema, "compressed' is not"),
         ("1.ply", b"plx", PointCloudError, "without a header"),
         ("1.ply", b"ply\nformat ascii 1.0\nend_header\n", PointCloudError, "without points"),
         ("1.ply", b"ply\nformat ascii 1.0\nelement vertex 1\nproperty list int int x\nend_header\n",
@@ -182,9 +171,9 @@ def test_an_empty_cloud_is_kept(tmp_path: Path) -> None:
     (folder / "scan_1.bin").write_bytes(b"")
     empty = HEAD.replace(b"WIDTH 2", b"WIDTH 0")
     assert [len(s.points_m) for s in read(folder)[0]] == [100, 0, 102]
-    for kind in (b"ascii\n", b"binary\n", b"binary_compressed\n" + bytes(8)):
+    for kind in (b"ascii\n", b"binary\n"):
         with pytest.raises(NoScans, match="none of 1 scans holds a return"):
-            read(bare(tmp_path / kind[:12].decode().strip() / "1.pcd", empty + b"DATA " + kind))
+            read(bare(tmp_path / kind.decode().strip() / "1.pcd", empty + b"DATA " + kind))
 
 
 def test_folders_and_files_that_are_none(tmp_path: Path) -> None:

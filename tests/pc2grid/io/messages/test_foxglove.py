@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +12,7 @@ import pytest
 from mcap.writer import Writer
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogCorrupt, NoScans, PointCloudError, TopicError, UnsupportedSchema
+from pc2grid.errors import PointCloudError, TopicError, UnsupportedSchema
 from pc2grid.io import open_log
 from tests.helpers.foxglove_messages import (
     IDENTITY,
@@ -21,8 +20,6 @@ from tests.helpers.foxglove_messages import (
     cloud,
     descriptors,
     edge,
-    fill,
-    jsonable,
     stamped,
     write,
 )
@@ -207,33 +204,3 @@ def test_a_descriptor_that_is_broken(tmp_path: Path, change: Callable[[bytes], b
         UnsupportedSchema, match=r"/points: the schema of foxglove\.PointCloud is not readable"
     ):
         read(path)
-
-
-@both
-def test_damaged_messages_are_skipped_or_refused_and_nothing_else(tmp_path: Path, encoding: str) -> None:
-    rng = np.random.default_rng(2)
-    schema, message = descriptors("PointCloud")
-    fields = cloud(T0, np.ones((5, 3)))[3]
-    good = (
-        fill(message(), fields).SerializeToString()
-        if encoding == "protobuf"
-        else json.dumps(jsonable(fields)).encode()
-    )
-    for _ in range(150):
-        content = bytearray(good)
-        for _ in range(3):
-            content[int(rng.integers(len(content)))] = int(rng.integers(256))
-        path = tmp_path / "a.mcap"
-        with path.open("wb") as stream:
-            writer = Writer(stream)
-            writer.start()
-            key = writer.register_schema("foxglove.PointCloud", encoding, schema)
-            channel = writer.register_channel("/points", encoding, key)
-            writer.add_message(channel, T0, bytes(content), T0)
-            writer.finish()
-        try:
-            read(path)
-        except LogCorrupt as error:
-            raise AssertionError(f"a foreign exception: {error}") from error
-        except (PointCloudError, UnsupportedSchema, NoScans):
-            continue

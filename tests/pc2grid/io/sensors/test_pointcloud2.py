@@ -51,7 +51,7 @@ def clouds(draw: st.DrawFn) -> tuple[PointCloud2, list[list[float]]]:
     return message, [p for r in rows for p in r]
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(clouds())
 def test_round_trip_against_the_oracle(case: tuple[PointCloud2, list[list[float]]]) -> None:
     message, points = case
