@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -43,26 +42,8 @@ def last_map_pose(source: MessageSource, topic: str, base_frame: str, end_ns: in
     return poses.newest(end_ns)
 
 
-class MapPoses(Protocol):
-    """The newest pose of the base in the map, message by message. topics : whose messages it takes."""
-
-    @property
-    def topics(self) -> frozenset[str]:
-        """See above."""
-        ...
-
-    def take(self, message: RawMessage) -> None:
-        """Take in a message; of other topics it is left out."""
-        ...
-
-    def newest(self, now_ns: int) -> MapPose:
-        """The pose. now_ns : its time if all transforms are static. Raises FrameError, or NoScans if there is
-        none yet."""
-        ...
-
-
-def map_poses(known: Sequence[TopicInfo], topic: str, base_frame: str) -> MapPoses:
-    """For a topic of a pose, an odometry or tf among those that are known.
+def map_poses(known: Sequence[TopicInfo], topic: str, base_frame: str) -> _TopicPoses | _TfPoses:
+    """What follows the poses on a topic of a pose, an odometry or tf among those that are known.
 
     Raises TopicError, UnsupportedSchema.
     """
@@ -82,7 +63,7 @@ class BelievedPose:
         self.problem: FrameError | None = None
         self.topics: frozenset[str] = frozenset()
         self._topic = topic
-        self._poses: MapPoses | None = None
+        self._poses: _TopicPoses | _TfPoses | None = None
 
     def find(self, known: Sequence[TopicInfo], base_frame: str) -> None:
         """Look for the topic. Raises TopicError, UnsupportedSchema."""
@@ -104,7 +85,7 @@ class BelievedPose:
 
 
 class _TopicPoses:
-    """The poses of one topic."""
+    """The poses of one topic. topics : whose messages are taken."""
 
     def __init__(self, channel: TopicInfo) -> None:
         self._topic, self._type = channel.topic, channel.type
@@ -113,7 +94,7 @@ class _TopicPoses:
         self._last: tuple[Odometry | PoseStamped, int] | None = None
 
     def take(self, message: RawMessage) -> None:
-        """See MapPoses."""
+        """Take in a message; of other topics it is left out."""
         if (message.channel.topic, message.channel.type) != (self._topic, self._type):
             return
         found = tolerant(self._decode, message.data, None)
@@ -121,7 +102,7 @@ class _TopicPoses:
             self._last = found, message.log_time_ns
 
     def newest(self, now_ns: int) -> MapPose:
-        """See MapPoses."""
+        """The newest pose. now_ns : see `_TfPoses`. Raises FrameError, or NoScans if there is none yet."""
         if self._last is None:
             raise NoScans(f"{self._topic}: no pose in the part asked for")
         found, log_time_ns = self._last
@@ -140,6 +121,8 @@ class _TopicPoses:
 class _TfPoses:
     """map -> base at the newest time that all transforms between them are known for.
 
+    topics : whose messages are taken.
+
     The transform map -> odom is published ahead of time or rarely, so each one holds until the next.
     """
 
@@ -151,7 +134,7 @@ class _TfPoses:
         self.topics = frozenset(topic for topic, _ in self._decoders)
 
     def take(self, message: RawMessage) -> None:
-        """See MapPoses."""
+        """Take in a message; of other topics it is left out."""
         decode = self._decoders.get((message.channel.topic, message.channel.type))
         if decode is None:
             return
@@ -162,7 +145,10 @@ class _TfPoses:
                 self._newest_ns[edge.child] = edge.header.stamp_ns or message.log_time_ns
 
     def newest(self, now_ns: int) -> MapPose:
-        """See MapPoses."""
+        """The newest pose. now_ns : its time if all transforms are static.
+
+        Raises FrameError, or NoScans if there is none yet.
+        """
         tree, base_frame = self._tree, self._base_frame
         above = tree.chain(base_frame) if base_frame in tree else [base_frame]
         map_frame = next((frame for frame in above[1:] if _is_map(frame)), None)

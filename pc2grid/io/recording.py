@@ -19,7 +19,7 @@ from pc2grid.io.containers.detect import open_source
 from pc2grid.io.error_translation import guarded, guarded_stream
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.map_pose import MapPose, last_map_pose
-from pc2grid.io.message_source import GAP_NS, Choice, LogInfo, MessageSource, RawMessage
+from pc2grid.io.message_source import Choice, LogInfo, MessageSource, RawMessage
 from pc2grid.io.read_plan import Plan, make_plan
 from pc2grid.io.scan_stream import Part, Stream
 from pc2grid.model import ReadReport, Scan
@@ -169,41 +169,17 @@ def _with_scan_times(source: MessageSource, wanted: str | None) -> LogInfo:
 
     Other messages may lie far from the scans: odometry that was started first, a transform of a wrong clock.
 
-    wanted : the topics of the scans; None: of all that hold scans. Messages far from the scans are among the
-    warnings. Without scans, the times are those of all messages.
+    wanted : the topics of the scans; None: of all that hold scans. Without scans, the times are those of all
+    messages.
 
     Raises LogError if damage is reached.
     """
     info = source.info
     names = {t.topic for t in topics.usable(info.topics, wanted) if t.message_count != 0}
-    first_ns = _first_ns(source, names)
+    first_ns = next((message.log_time_ns for message in source.messages(names)), None)
     if first_ns is None:
         return info
-    last_ns = _last_ns(source, names, first_ns)
-    of_scans = replace(info, start_ns=first_ns, end_ns=last_ns)
-    if max(first_ns - info.start_ns, info.end_ns - last_ns) <= GAP_NS:
-        return of_scans
-    others = [t.topic for t in info.topics if t.topic not in names and t.message_count != 0]
-    return replace(of_scans, warnings=(*info.warnings, *_strays(source, of_scans, others)))
-
-
-def _strays(source: MessageSource, scans: LogInfo, names: Collection[str]) -> list[str]:
-    """A sentence for each topic with messages far from the scans."""
-    told = []
-    for name in names:
-        first_ns = _first_ns(source, {name})
-        if first_ns is None:
-            continue
-        before_ns, after_ns = scans.start_ns - first_ns, _last_ns(source, {name}, first_ns) - scans.end_ns
-        where = [f"{before_ns * 1e-9:.1f} s before the first scan"] if before_ns > GAP_NS else []
-        where += [f"{after_ns * 1e-9:.1f} s after the last scan"] if after_ns > GAP_NS else []
-        if where:
-            told.append(f"{name}: a message {' and one '.join(where)}; times are those of the scans")
-    return told
-
-
-def _first_ns(source: MessageSource, names: Collection[str]) -> int | None:
-    return next((message.log_time_ns for message in source.messages(names)), None)
+    return replace(info, start_ns=first_ns, end_ns=_last_ns(source, names, first_ns))
 
 
 def _last_ns(source: MessageSource, names: Collection[str], first_ns: int) -> int:

@@ -88,11 +88,8 @@ class McapSource:
         size = self._path.stat().st_size
         if found.damage is not None:
             where = f"{self._path}: at byte {found.at} of {size}"
-            behind = (
-                f"; {sum(found.index.counts.values())} messages ({found.scans_s():.1f} s of scans) before it "
-                "are readable"
-            )
-            error = named(found.damage, where, behind)
+            count = sum(found.index.counts.values())
+            error = named(found.damage, where, f"; {count} messages before it are readable")
             if not recover:
                 raise error from found.damage
             self.tally.warn(f"{error.message}; the rest was left out")

@@ -18,7 +18,6 @@ from mcap.records import Channel, Chunk, ChunkIndex, DataEnd, McapRecord, Messag
 from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogError, LogTruncated, UnsupportedSchema
-from pc2grid.io import topics
 from pc2grid.io.containers.bounds import BoundedFile, expand
 from pc2grid.io.error_translation import RECOVER_HINT
 from pc2grid.io.message_source import TopicInfo
@@ -188,7 +187,6 @@ class Survey:
         self.missing = 0
         self.at = 0
         self._most_bytes = most_chunk_bytes
-        self._spans: dict[int, tuple[int, int]] = {}  # first and last log time, by channel
         size = stream.seek(0, io.SEEK_END)
         stream.seek(0)
         try:
@@ -197,11 +195,9 @@ class Survey:
             raise
         except Exception as error:  # behind the end of the data, only the summary can be wrong
             self.damage = error if self.at < size and not self.closed else None
-        index, spans = self.index, self._spans.values()
-        kinds = {type(chunk) for chunk in index.chunks}
-        index.checked |= kinds == {ChunkIndex}  # chunks have their own
-        index.start_ns = min((first for first, _ in spans), default=0)
-        index.end_ns = max((last for _, last in spans), default=0)
+        self.index.checked |= {type(chunk) for chunk in self.index.chunks} == {
+            ChunkIndex
+        }  # they have their own
 
     def _read(self, stream: BoundedFile) -> None:
         for record in records_of(stream, whole_file=True):
@@ -248,16 +244,9 @@ class Survey:
         elif isinstance(item, Message):
             if item.channel_id not in index.channels:
                 raise LogCorrupt(f"a message of channel {item.channel_id}, which is missing")
-            first, last = self._spans.get(item.channel_id, (item.log_time, item.log_time))
-            self._spans[item.channel_id] = min(first, item.log_time), max(last, item.log_time)
+            index.start_ns = min(index.start_ns, item.log_time) if index.counts else item.log_time
+            index.end_ns = max(index.end_ns, item.log_time)
             index.counts[item.channel_id] = index.counts.get(item.channel_id, 0) + 1
-
-    def scans_s(self) -> float:
-        """The time from the first to the last message on topics of scans, in seconds."""
-        scans = {key for key, c in self.index.channels.items() if self.index.topic(c).type in topics.SENSORS}
-        spans = [span for key, span in self._spans.items() if key in scans]
-        times = [time_ns for span in spans for time_ns in span]
-        return (max(times) - min(times)) * 1e-9 if times else 0.0
 
 
 def _indexed(chunk: Chunk, end: int, channels: set[int]) -> ChunkIndex:
