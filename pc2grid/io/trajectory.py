@@ -6,7 +6,7 @@ KITTI: the first three rows of the pose, 12 numbers per line, no time.
 
 from __future__ import annotations
 
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import Literal
 
@@ -27,18 +27,13 @@ def stamp_ns_from_text(text: str) -> int:
 
     Raises ValueError if it is not a finite decimal number that fits.
     """
-    mantissa, e, _ = text.strip().lower().partition("e")
-    if e:  # as numpy.savetxt writes: 1.283e+09
+    try:
         seconds = Decimal(text)
-        if seconds.adjusted() > 10:  # the integer of 1e999000 would take minutes
-            raise ValueError(f"not a time: {text!r:.60}")
-        stamp = int((seconds * 1_000_000_000).to_integral_value())
-    else:
-        sign = -1 if mantissa.startswith("-") else 1
-        whole, _, fraction = mantissa[mantissa[:1] in ("+", "-") :].partition(".")
-        if not (whole + fraction).isdecimal():
-            raise ValueError(f"not a time: {text!r}")
-        stamp = sign * (int(whole or "0") * 1_000_000_000 + round(int((fraction + "0" * 10)[:10]) / 10))
+    except InvalidOperation as error:
+        raise ValueError(f"not a time: {text!r:.60}") from error
+    if not seconds.is_finite() or seconds.adjusted() > 10:  # the integer of 1e999000 would take minutes
+        raise ValueError(f"not a time: {text!r:.60}")
+    stamp = int((seconds * 1_000_000_000).to_integral_value())
     if not -(2**63) <= stamp < 2**63:
         raise ValueError(f"not a time: {text!r}")
     return stamp
