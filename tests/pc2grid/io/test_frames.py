@@ -174,7 +174,7 @@ def where(samples: dict[int, float], lasting: bool, at: int) -> float | None:
     return samples[near[0]] if near else None
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(
     samples=st.dictionaries(st.integers(0, 80), st.integers(-9, 9).map(float), max_size=6),
     lasting=st.booleans(),

@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated, NotALog, Pc2GridError
+from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated, NotALog
 from pc2grid.io import open_log
 from pc2grid_cli.main import main
 from tests.helpers.recordings import STEP, T0, check_drive, drive, read, ros, write_rosbag2
@@ -139,16 +139,6 @@ def test_a_message_above_the_limit_is_refused(tmp_path: Path) -> None:
         read(path, ReadConfig(assume_identity=True, max_record_bytes=5000))
 
 
-def test_a_header_that_is_damaged(tmp_path: Path) -> None:
-    path = db3(tmp_path)
-    with path.open("r+b") as file:
-        file.seek(16)
-        file.write(b"\x00\x03")
-    for recover in (False, True):
-        with pytest.raises(LogCorrupt, match=r"log\.db3: a damaged \.db3"):
-            read(path, CONFIG, recover=recover)
-
-
 # --- recorders that were killed -----------------------------------------------------------------------
 
 
@@ -165,13 +155,6 @@ def test_what_the_recorder_left_in_the_log_is_not_passed_over(tmp_path: Path) ->
         db.execute("PRAGMA wal_checkpoint(TRUNCATE)")
         with open_log(path) as log:
             assert log.info.message_count == 5
-
-
-def test_junk_behind_the_magic_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "x.db3"
-    path.write_bytes(b"SQLite format 3\0" + bytes(range(1, 256)) * 40)
-    with pytest.raises(Pc2GridError, match=r"x\.db3"):
-        read(path, recover=True)
 
 
 def test_a_file_of_another_application_is_no_recording(tmp_path: Path) -> None:
