@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -175,10 +174,7 @@ def _channel(known: Sequence[TopicInfo], topic: str) -> TopicInfo:
             if channel not in usable:
                 raise TopicError(f"{topic}: is of type {channel.type or 'unknown'}, which holds no pose")
             return channel
-    close = difflib.get_close_matches(topic, [t.topic for t in usable], n=1)
-    guess = f"; did you mean {close[0]}?" if close else ""
-    there = ", ".join(f"{t.topic} ({t.type})" for t in usable[:12])
-    raise TopicError(f"no topic {topic} in the log{guess}", hint=f"topics with poses: {there or 'none'}")
+    raise topics.missing(usable, topic, f"topics with poses: {topics.listed(usable) or 'none'}")
 
 
 def _is_map(frame: str) -> bool:

@@ -76,7 +76,7 @@ def several(found: Sequence[TopicInfo], measured: Sequence[TopicInfo]) -> TopicE
     alike = [t.topic for t in measured if t.type == measured[0].type]
     both = f", or one of each sensor: --topic {','.join(alike[:4])}" if len(alike) > 1 else ""
     return TopicError(
-        f"several topics hold scans: {_listed(found)}", hint=f"choose one, e.g. --topic {alike[0]}{both}"
+        f"several topics hold scans: {listed(found)}", hint=f"choose one, e.g. --topic {alike[0]}{both}"
     )
 
 
@@ -87,10 +87,10 @@ def is_fixed(frame: str) -> bool:
 
 def _no_scans(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo]) -> NoScans:
     if fitting:
-        return NoScans(f"{_listed(fitting)}: no message in the log")
+        return NoScans(f"{listed(fitting)}: no message in the log")
     if image := next((t for t in topics if _is_depth_image(t)), None):
         return _no_camera_info(image)
-    there = _listed(topics) if topics else "the log has no topics at all"
+    there = listed(topics) if topics else "the log has no topics at all"
     return NoScans(f"no topic with scans; there is: {there}", hint=_advice_on(topics))
 
 
@@ -193,7 +193,7 @@ def _named_of(
     for topic in topics:
         if topic.topic == wanted and topic.type in (*types, *also):
             return topic
-    there = _listed([t for t in topics if t.type in types])
+    there = listed([t for t in topics if t.type in types])
     raise TopicError(
         f"no {what} topic {wanted}; there is: {there or 'none'}", hint=f"--{what} none goes without"
     )
@@ -229,11 +229,8 @@ def depth_unit_topic(topics: Sequence[TopicInfo]) -> TopicInfo | None:
 def _named(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo], wanted: str) -> TopicInfo:
     same = [t for t in topics if t.topic == wanted]
     if not same:
-        names = [t.topic for t in topics]
-        close = difflib.get_close_matches(wanted, names, n=1, cutoff=0.5)
-        guess = f"; did you mean {close[0]}?" if close else ""
-        there = _listed(fitting) if fitting else f"none with scans, but {_listed(topics)}"
-        raise TopicError(f"no topic {wanted} in the log{guess}", hint=f"topics with scans: {there}")
+        there = listed(fitting) if fitting else f"none with scans, but {listed(topics)}"
+        raise missing(topics, wanted, f"topics with scans: {there}")
     usable = [t for t in same if t.type in SENSORS]
     if not usable:
         raise UnsupportedSchema(
@@ -245,7 +242,15 @@ def _named(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo], wanted: st
     return usable[0]
 
 
-def _listed(topics: Sequence[TopicInfo]) -> str:
+def missing(topics: Sequence[TopicInfo], wanted: str, hint: str) -> TopicError:
+    """The error for a topic that is not there; it proposes the one with the most similar name."""
+    close = difflib.get_close_matches(wanted, [t.topic for t in topics], n=1, cutoff=0.5)
+    guess = f"; did you mean {close[0]}?" if close else ""
+    return TopicError(f"no topic {wanted} in the log{guess}", hint=hint)
+
+
+def listed(topics: Sequence[TopicInfo]) -> str:
+    """Topics and their types, of many the first ones."""
     shown = [f"{t.topic} ({t.type or 'no type'})" for t in topics[:20]]
     return ", ".join(shown) + (f" and {len(topics) - 20} more" if len(topics) > 20 else "")
 

@@ -97,10 +97,7 @@ def _open_folder(path: Path, config: ReadConfig, recover: bool) -> MessageSource
     names = sorted(entry.name for entry in path.iterdir() if entry.is_file())
     if rosbag2_folder.METADATA in names or any(name.endswith(rosbag2_folder.SUFFIXES) for name in names):
         return rosbag2_folder.open_folder(
-            path,
-            lambda file: open_source(file, config, recover=recover),
-            recover=recover,
-            max_chunk_bytes=config.max_chunk_bytes,
+            path, lambda file: open_source(file, config, recover=recover), recover=recover
         )
     if any(name.lower().endswith(cloud_folder.SUFFIXES) for name in names):
         return cloud_folder.CloudFolder(path, config)

@@ -2,6 +2,7 @@
 
 By the index in its summary, a part of a long log costs what that part costs. A file whose recorder was
 killed, or whose summary is damaged, is read once up to its end or its first damage, and indexed meanwhile.
+Messages that rosbag2 compressed one by one are decompressed.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from mcap.records import Chunk, ChunkIndex, McapRecord, Message
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogCorrupt, LogError
-from pc2grid.io.containers.bounds import BoundedFile
+from pc2grid.io.containers.bounds import BoundedFile, plain_message
 from pc2grid.io.containers.mcap_index import (
     McapIndex,
     Run,
@@ -142,7 +143,8 @@ class McapSource:
         def fitting(messages: Iterable[Message]) -> Iterator[RawMessage]:
             for m in messages:
                 if m.channel_id in wanted and low_ns <= m.log_time < high_ns:
-                    yield RawMessage(self._topic_of[m.channel_id], m.log_time, m.data)
+                    data = plain_message(m.data, self._config.max_chunk_bytes)
+                    yield RawMessage(self._topic_of[m.channel_id], m.log_time, data)
 
         pending: list[RawMessage] = []  # of chunks that overlap in time
         for chunk in _wanted(self._index.chunks, wanted, low_ns, high_ns):

@@ -9,7 +9,6 @@ from pathlib import Path, PurePosixPath
 import yaml
 
 from pc2grid.errors import LogCorrupt, LogNotFound
-from pc2grid.io.containers.bounds import plain_message
 from pc2grid.io.message_source import LogInfo, MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.model import MISSING_FILES
 
@@ -19,9 +18,7 @@ SUFFIXES = (".mcap", ".db3")
 _MAX_YAML_BYTES, _MAX_YAML_ITEMS = 8 << 20, 200_000
 
 
-def open_folder(
-    folder: Path, open_file: Callable[[Path], MessageSource], *, recover: bool, max_chunk_bytes: int
-) -> SplitSource:
+def open_folder(folder: Path, open_file: Callable[[Path], MessageSource], *, recover: bool) -> SplitSource:
     """Open all files of a recording, in the order of metadata.yaml; without it, the only one there is.
 
     open_file : opens one of them. recover : go on without files that are missing, with a warning.
@@ -48,7 +45,7 @@ def open_folder(
         tally.skip(MISSING_FILES)
     if not there:
         raise LogNotFound(f"{folder}: none of the files of the recording is there")
-    return SplitSource(folder, [open_file(path) for path in there], tally, max_chunk_bytes)
+    return SplitSource(folder, [open_file(path) for path in there], tally)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -84,16 +81,13 @@ def _listed(metadata: Path) -> list[str]:
 class SplitSource:
     """The parts of a recording in the order in which they were recorded; they share one tally."""
 
-    def __init__(
-        self, path: Path, parts: Sequence[MessageSource], tally: Tally, max_chunk_bytes: int
-    ) -> None:
+    def __init__(self, path: Path, parts: Sequence[MessageSource], tally: Tally) -> None:
         self._parts = parts
         self.files: tuple[Path, ...] = tuple(file for part in parts for file in part.files)
         self.tally = tally
         for part in parts:
             tally.take_over(part.tally)
             part.tally = tally
-        self._max_chunk_bytes = max_chunk_bytes
         self.info = _info(path, [part.info for part in parts], tally)
 
     def close(self) -> None:
@@ -110,8 +104,7 @@ class SplitSource:
                 continue
             if end_ns is not None and part.info.start_ns >= end_ns:
                 continue
-            for channel, log_time_ns, data in part.messages(topics, start_ns, end_ns):
-                yield RawMessage(channel, log_time_ns, plain_message(data, self._max_chunk_bytes))
+            yield from part.messages(topics, start_ns, end_ns)
 
 
 def _info(path: Path, infos: Sequence[LogInfo], tally: Tally) -> LogInfo:

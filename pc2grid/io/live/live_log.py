@@ -150,8 +150,7 @@ class FirstMessages:
             return f"{silent}: no message yet (is the sensor's driver running? does its QoS fit?)"
         if scans:
             return f"{', '.join(t.topic for t in scans)}: too few messages so far"
-        listed = ", ".join(f"{t.topic} ({t.type})" for t in there[:12])
-        return f"{name}: no topic with scans yet; there is: {listed or 'no topic'}"
+        return f"{name}: no topic with scans yet; there is: {topics.listed(there) or 'no topic'}"
 
 
 class LiveLog:
