@@ -484,16 +484,6 @@ def test_json_that_would_become_millions_of_objects(data: bytes) -> None:
     assert peak.grown_bytes() < 80 * MIB
 
 
-@pytest.mark.parametrize("number", [-1, -8, 9, 77])
-def test_numbers_that_name_no_type_of_a_field(tmp_path: Path, number: int) -> None:
-    def change(fields: dict[str, Any]) -> None:
-        fields["fields"][0]["type"] = number
-
-    scans, report = read(json_clouds(tmp_path / "a.mcap", change))
-    assert len(scans) == 19
-    assert report.lossy
-
-
 @pytest.mark.parametrize("name", ["9999999999.5", "9999999999999999999"])
 def test_names_past_all_calendars_are_no_times(tmp_path: Path, name: str) -> None:
     (tmp_path / f"{name}.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())

@@ -33,7 +33,7 @@ from pc2grid.io.sensors import laserscan
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
 from pc2grid.model import OccupancyGrid
 from tests.helpers.cloud_folders import folder_of
-from tests.helpers.recordings import STEP, T0, check_drive, drive, read, ros, write_mcap, write_rosbag2
+from tests.helpers.recordings import STEP, T0, Message, check_drive, drive, read, ros, write_mcap
 
 INFO, DEPTH = "/camera/depth/camera_info", "/camera/depth/image_raw"
 
@@ -86,27 +86,6 @@ def test_names_in_a_file_break_no_line(tmp_path: Path) -> None:
 
 
 # --- parts, times, odometry ---------------------------------------------------------------------------
-
-
-def split(folder: Path) -> Path:
-    """Two files of ten clouds each, a second apart."""
-    for part in range(2):
-        stamps = [T0 + (10 * part + i) * STEP for i in range(10)]
-        write_rosbag2(folder / f"{part}", [ros().cloud("/points", t, [[1, 2, 3]]) for t in stamps])
-        (folder / f"{part}/{part}.db3").rename(folder / f"all_{part}.db3")
-        (folder / f"{part}/metadata.yaml").unlink()
-        (folder / f"{part}").rmdir()
-    listed = "rosbag2_bagfile_information: {relative_file_paths: [all_0.db3, all_1.db3]}"
-    (folder / "metadata.yaml").write_text(listed)
-    return folder
-
-
-@pytest.mark.parametrize(("start_s", "duration_s", "found"), [(1.2, None, 8), (0.0, 0.5, 5), (0.8, 0.4, 4)])
-def test_parts_of_a_split_recording(tmp_path: Path, start_s: float, duration_s: float, found: int) -> None:
-    with open_log(split(tmp_path)) as log:
-        stamps = [scan.stamp_ns - T0 for scan in log.scans(start_s, duration_s)]
-    first = round(start_s * 10)
-    assert stamps == [(first + i) * STEP for i in range(found)]
 
 
 @pytest.mark.parametrize("part", [(-1.0, None), (math.nan, None), (0.0, 0.0), (0.0, -1.0), (0.0, math.nan)])
@@ -238,16 +217,10 @@ def test_angles_may_be_off_by_two_beams_or_two_percent(count: int, slack: int) -
 # --- cameras with lenses ------------------------------------------------------------------------------
 
 
-def camera(model: str, d: list[float]) -> bytes:
+def camera(model: str, d: list[float]) -> Message:
     """A CameraInfo of 64 x 48 pixels, its axis in the middle."""
-    to = ros()
-    k = np.array([40.0, 0, 32, 0, 40, 24, 0, 0, 1])
-    p = np.array([40.0, 0, 32, 0, 0, 40, 24, 0, 0, 0, 1, 0])
-    content = to.make(
-        "sensor_msgs/CameraInfo", to.header(T0, "camera_optical"), 48, 64, model, np.array(d), k,
-        np.eye(3).reshape(-1), p, 0, 0, to.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False),
-    )  # fmt: skip
-    return to.message(INFO, T0, content)
+    k, p = [40.0, 0, 32, 0, 40, 24, 0, 0, 1], [40.0, 0, 32, 0, 0, 40, 24, 0, 0, 0, 1, 0]
+    return ros().camera(INFO, T0, 64, 48, 40.0, d=np.array(d), k=np.array(k), p=np.array(p), model=model)
 
 
 @pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])

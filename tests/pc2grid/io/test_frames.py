@@ -79,34 +79,6 @@ def test_a_moving_tf_that_ends_early_costs_the_scans_behind_it(tmp_path: Path) -
         read(write_mcap(tmp_path / "b.mcap", by_time(clouds(25), lift)))
 
 
-def test_two_parents_are_named_and_the_latest_counts(tmp_path: Path) -> None:
-    to = ros()
-    edges = [
-        to.tf(T0, "base_link", "lidar", 0.2, topic="/tf_static"),
-        to.tf(T0, "mast", "lidar", 0.0, topic="/tf_static"),
-        to.tf(T0, "base_link", "mast", 0.7, topic="/tf_static"),
-    ]
-    scans, report = read(write_mcap(tmp_path / "a.mcap", [*edges, *clouds(3)]))
-    assert [s.T_base_sensor[0, 3] for s in scans] == [0.7] * 3
-    assert any("lidar has two parents, base_link and mast" in w for w in report.warnings)
-
-
-def test_a_loop_among_moving_frames_ends_in_an_error(tmp_path: Path) -> None:
-    to = ros()
-    edges = [to.tf(T0, "base_link", "lidar", 0.2), to.tf(T0, "lidar", "base_link", 0.2)]
-    with pytest.raises(FrameError, match="goes in a circle"):
-        read(write_mcap(tmp_path / "a.mcap", by_time(edges, clouds(3))))
-
-
-def test_disconnected_and_empty_frames(tmp_path: Path) -> None:
-    static = ros().tf(T0, "base_link", "lidar_top", 0.2, topic="/tf_static")
-    other = ros().tf(T0, "arm", "gripper", 0.2, topic="/tf_static")
-    with pytest.raises(FrameError, match=r"frame gripper to base_link; .*frames in the log: arm, base_link"):
-        read(write_mcap(tmp_path / "a.mcap", [static, other, *clouds(3, "gripper")]))
-    with pytest.raises(FrameError, match=r"frame \(empty\) to base_link"):
-        read(write_mcap(tmp_path / "b.mcap", [static, *clouds(3, "")]))
-
-
 def test_a_frame_that_changes_within_the_log(tmp_path: Path) -> None:
     static = ros().tf(T0, "base_link", "lidar", 0.2, topic="/tf_static")
     last = ros().cloud("/points", T0 + 9 * STEP, POINT, "lidar_2")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.config import ReadConfig
-from pc2grid.errors import LogCorrupt, NoScans, PointCloudError
+from pc2grid.errors import NoScans
 from pc2grid.io import open_log, scan_stream
 from tests.helpers.recordings import (
     STEP,
@@ -58,14 +58,6 @@ def test_a_laser_of_both_dialects(tmp_path: Path, dialect: str) -> None:
 # --- stamps (33) and gaps (34) ------------------------------------------------------------------------
 
 
-def test_zero_stamps_give_way_to_the_time_of_recording(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", [cloud(0, T0 + i * STEP) for i in range(5)])
-    scans, report = read(path)
-    assert [s.stamp_ns for s in scans] == [T0 + i * STEP for i in range(5)]
-    assert any("time of recording" in w for w in report.warnings)
-    assert not report.lossy
-
-
 @pytest.mark.parametrize(
     ("bad", "stamp_ns", "reason"),
     [
@@ -83,13 +75,6 @@ def test_one_wrong_stamp_among_good_ones_is_skipped_and_counted(
     assert [s.stamp_ns for s in scans] == [T0 + i * STEP for i in range(20) if i != bad]
     assert report.scans_skipped == {reason: 1}
     assert report.lossy
-
-
-def test_duplicated_stamps_are_dropped_and_counted(tmp_path: Path) -> None:
-    messages = [cloud(T0 + i * STEP, T0 + i * STEP + k) for i in range(20) for k in range(2 if i == 4 else 1)]
-    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
-    assert [s.stamp_ns for s in scans] == [T0 + i * STEP for i in range(20)]
-    assert report.scans_skipped == {"stamp is a duplicate": 1}
 
 
 def test_small_disorder_is_sorted_without_loss(tmp_path: Path) -> None:
@@ -144,46 +129,6 @@ def test_a_gap_is_reported_and_not_bridged_by_odometry(tmp_path: Path) -> None:
         pose = scans[i].T_odom_base
         assert pose is not None
         assert pose[0, 3] == pytest.approx(0.8 if i == 9 else 1.1)
-
-
-# --- contents (20, 27, 29) ----------------------------------------------------------------------------
-
-
-def test_a_few_short_messages_are_counted_and_more_than_a_tenth_refused(tmp_path: Path) -> None:
-    def log(bad: int) -> Path:
-        messages = [cloud(T0 + i * STEP) for i in range(20)]
-        for i in range(bad):
-            messages[3 + i] = messages[3 + i]._replace(data=messages[3 + i].data[:-15])
-        return write_mcap(tmp_path / f"{bad}.mcap", messages)
-
-    scans, report = read(log(2))
-    assert len(scans) == 18
-    assert report.scans_skipped == {"the message is no whole sensor_msgs/PointCloud2": 2}
-    assert report.lossy
-    with pytest.raises(LogCorrupt, match=r"/points: 3 of 20 scans are unreadable: .*no whole"):
-        read(log(3))
-
-
-def test_an_empty_scan_is_kept(tmp_path: Path) -> None:
-    messages = [
-        ros().cloud("/points", T0 + i * STEP, np.zeros((0, 3)) if i == 2 else POINT) for i in range(5)
-    ]
-    scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
-    assert [len(s.points_m) for s in scans] == [1, 1, 0, 1, 1]
-    assert any("no returns at all" in w for w in report.warnings)
-    assert not report.lossy
-
-
-def test_one_outlier_is_dropped_and_a_global_frame_refused(tmp_path: Path) -> None:
-    far = ros().cloud("/points", T0, [[1, 2, 3]] * 3 + [[1e30, 0, 0], [0, -1e7, 0], [0, 900, 0]])
-    (scan,), report = read(write_mcap(tmp_path / "a.mcap", [far]))
-    np.testing.assert_array_equal(scan.points_m, np.float32([[1, 2, 3]] * 3 + [[0, 900, 0]]))
-    assert scan.dropped == report.points_dropped == 2
-    utm = [ros().cloud("/points", T0 + i * STEP, [[4.5e5, 5.4e6, 100]]) for i in range(3)]
-    with pytest.raises(PointCloudError, match=r"farther than 1000 m .*UTM"):
-        read(write_mcap(tmp_path / "b.mcap", utm))
-    (scan,), _ = read(tmp_path / "a.mcap", ReadConfig(max_range_m=2e7))
-    assert len(scan.points_m) == 5
 
 
 # --- schemas (17, 19) and checksums (8) ---------------------------------------------------------------

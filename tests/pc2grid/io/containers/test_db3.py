@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sqlite3
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -15,7 +14,6 @@ import pytest
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated, NotALog
 from pc2grid.io import open_log
-from pc2grid_cli.main import main
 from tests.helpers.recordings import STEP, T0, check_drive, drive, read, ros, write_rosbag2
 
 PAGE = 4096
@@ -78,23 +76,6 @@ def test_a_db3_that_ends_too_early(tmp_path: Path) -> None:
         for recover in (False, True):
             with pytest.raises(LogCorrupt, match=rf"log\.db3: a damaged \.db3: .*{MENDS}"):
                 read(path, CONFIG, recover=recover)
-
-
-@pytest.mark.fault(5)
-def test_the_command_says_what_mends_a_db3(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
-    path = write_rosbag2(tmp_path / "log", drive(scans=60)) / "log.db3"
-    content = path.read_bytes()
-    path.write_bytes(content[: 2 * len(content) // 3])
-    database = tmp_path / "x.submaps"
-    for more in ([], ["--recover"]):
-        monkeypatch.setattr(sys, "argv", ["pc2grid", "convert", str(path), "-o", str(database), *more])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        assert ended.value.code == 1
-        assert "sqlite3 log.db3 .recover" in capfd.readouterr().err
-        assert not database.exists()
 
 
 def test_messages_that_were_deleted_are_no_damage(tmp_path: Path) -> None:

@@ -140,35 +140,9 @@ def test_no_times_or_all_the_same_is_no_offsets() -> None:
     assert decode(PointCloud2(Header(STAMP, ""), 1, 3, XYZ, False, 16, 48, data)).offsets_s is None
 
 
-@pytest.mark.parametrize(
-    ("fields", "data", "words"),
-    [
-        (XYZ[:2], bytes(12), "field z: missing"),
-        ((*XYZ, XYZ[0]), bytes(12), "field x: defined twice"),
-        ((("x", 10, 7, 1), *XYZ[1:]), bytes(12), "field x: ends at byte 14 of a 12-byte point"),
-        ((("x", 0, 7, 3), *XYZ[1:]), bytes(12), "field x: 3 values"),
-        ((("x", 0, 42, 1), *XYZ[1:]), bytes(12), "field x: unknown datatype 42"),
-        (XYZ, bytes(11), "11 bytes of data where 12 are declared"),
-    ],
-)
-def test_contradictions_are_named(
-    fields: tuple[tuple[str, int, int, int], ...], data: bytes, words: str
-) -> None:
-    with pytest.raises(PointCloudError, match=words):
-        decode(PointCloud2(Header(STAMP, ""), 1, 1, fields, False, 12, 12, data))
-
-
 def test_an_absurd_size_is_refused_before_anything_is_allocated() -> None:
     with pytest.raises(LimitExceeded, match="max_points"):
         decode(PointCloud2(Header(STAMP, ""), 2**31, 2**31, XYZ, False, 12, 12, b""))
-
-
-def test_times_that_fit_no_unit_are_refused_with_the_key_to_set() -> None:
-    data = b"".join(struct.pack("<4f", 1, 2, 3, v) for v in (0.0, 1e-7))
-    message = PointCloud2(Header(STAMP, ""), 1, 2, (*XYZ, ("t", 12, 7, 1)), False, 16, 32, data)
-    with pytest.raises(PointCloudError, match=r"read={'point_time': "):
-        decode(message)
-    assert decode(message, unit="none").offsets_s is None
 
 
 @pytest.mark.parametrize(
