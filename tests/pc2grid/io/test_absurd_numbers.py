@@ -13,7 +13,6 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import (
@@ -323,19 +322,10 @@ def test_stamps_past_all_calendars_are_skipped(tmp_path: Path, seconds: int) -> 
 
 def json_clouds(path: Path, change: Callable[[dict[str, Any]], None]) -> Path:
     """20 clouds in JSON, of which the eleventh is changed."""
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start(profile="")
-        channel = writer.register_channel(
-            "/points", "json", writer.register_schema("foxglove.PointCloud", "jsonschema", b"{}")
-        )
-        for i in range(20):
-            fields = foxglove.jsonable(foxglove.cloud(T0 + i * STEP, [[1, 2, 3]])[3])
-            if i == 10:
-                change(fields)
-            writer.add_message(channel, T0 + i * STEP, json.dumps(fields).encode(), T0 + i * STEP)
-        writer.finish()
-    return path
+    clouds = [foxglove.jsonable(foxglove.cloud(T0 + i * STEP, [[1, 2, 3]])[3]) for i in range(20)]
+    change(clouds[10])
+    points = "/points", "foxglove.PointCloud", "jsonschema", b"{}"
+    return raw_log(path, [(*points, json.dumps(fields).encode()) for fields in clouds], "json")
 
 
 @pytest.mark.parametrize("late", [1 << 63, (1 << 64) - 1])

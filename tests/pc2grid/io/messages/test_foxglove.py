@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from mcap.writer import Writer
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import PointCloudError, TopicError, UnsupportedSchema
@@ -23,7 +21,7 @@ from tests.helpers.foxglove_messages import (
     stamped,
     write,
 )
-from tests.helpers.recordings import STEP, T0, read
+from tests.helpers.recordings import STEP, T0, raw_log, read
 
 STAMPED = b'{"timestamp": {"sec": 1, "nsec": 0}, "frame_id": "a", '
 both = pytest.mark.parametrize("encoding", ["protobuf", "json"])
@@ -154,7 +152,7 @@ def test_odometry(tmp_path: Path, encoding: str, kind: str) -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        b"", b"{", b"[]", b"null", b"7", b"\xff\xfe", b"{}", b'{"timestamp": 3}', b"[" * 100_000,
+        b" ", b"{", b"[]", b"null", b"7", b"\xff\xfe", b"{}", b'{"timestamp": 3}', b"[" * 100_000,
         STAMPED + b'"point_stride": 0, "fields": [], "data": ""}',
         STAMPED + b'"point_stride": 12, "fields": [], "data": "%%"}',
         STAMPED + b'"point_stride": 12, "fields": 3, "data": ""}',
@@ -164,42 +162,18 @@ def test_odometry(tmp_path: Path, encoding: str, kind: str) -> None:
     ],
 )  # fmt: skip
 def test_json_that_is_no_cloud(tmp_path: Path, content: bytes) -> None:
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        channel = writer.register_channel(
-            "/points", "json", writer.register_schema("foxglove.PointCloud", "jsonschema", b"{}")
-        )
-        writer.add_message(channel, T0, content, T0)
-        writer.finish()
+    record = "/points", "foxglove.PointCloud", "jsonschema", b"{}", content
     with pytest.raises(PointCloudError, match="1 of 1 scans are unreadable"):
-        read(path)
+        read(raw_log(tmp_path / "a.mcap", [record], "json"))
 
 
-def broken_schema(schema: bytes) -> bytes:
-    return schema[: len(schema) // 2]
-
-
-def other_type(schema: bytes) -> bytes:
-    return descriptors("Pose")[0]
-
-
-def no_type(schema: bytes) -> bytes:
-    return b""
-
-
-@pytest.mark.parametrize("change", [broken_schema, other_type, no_type])
-def test_a_descriptor_that_is_broken(tmp_path: Path, change: Callable[[bytes], bytes]) -> None:
-    path = tmp_path / "a.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start()
-        schema = writer.register_schema(
-            "foxglove.PointCloud", "protobuf", change(descriptors("PointCloud")[0])
-        )
-        writer.add_message(writer.register_channel("/points", "protobuf", schema), T0, b"", T0)
-        writer.finish()
+@pytest.mark.parametrize("kind", ["half of it", "of another type", "nothing"])
+def test_a_descriptor_that_is_broken(tmp_path: Path, kind: str) -> None:
+    whole = descriptors("PointCloud")[0]
+    schema = {"half of it": whole[: len(whole) // 2], "nothing": b""}.get(kind, descriptors("Pose")[0])
+    path = raw_log(
+        tmp_path / "a.mcap", [("/points", "foxglove.PointCloud", "protobuf", schema, b"\0")], "protobuf"
+    )
     with pytest.raises(
         UnsupportedSchema, match=r"/points: the schema of foxglove\.PointCloud is not readable"
     ):
