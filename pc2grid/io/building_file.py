@@ -25,7 +25,7 @@ from pc2grid.arrays import F64, I64
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LogError, MapFileError
 from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
-from pc2grid.io.messages.cloud_files import parser
+from pc2grid.io.messages.cloud_files import HEADER_BYTES, parser
 from pc2grid.io.messages.types import Header
 from pc2grid.io.sensors.pointcloud2 import decode
 
@@ -36,7 +36,6 @@ _BLOCK_POINTS = 1_000_000  # 24 MB
 _SPACING_SAMPLE = 2000
 """Points of a cloud of which the distance to the nearest neighbour is measured."""
 _SAMPLES_PER_M2 = 1600.0  # of the surface of a mesh: one every 2.5 cm
-_HEADER_BYTES = 1 << 16
 _DIGEST_BYTES = 1 << 20
 _LOCAL_MAPS = Path("local_maps", "plys")
 # Rotations of the axis that points up to z; the two others keep their order.
@@ -182,7 +181,7 @@ def _opened(path: Path) -> Iterator[Any]:
 def _header(path: Path) -> bytes:
     """The beginning of a file; of a .ply its header."""
     with _opened(path) as content:
-        head: bytes = content.read(_HEADER_BYTES)
+        head: bytes = content.read(HEADER_BYTES)
     return head.partition(b"end_header")[0]
 
 

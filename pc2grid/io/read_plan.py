@@ -118,11 +118,10 @@ def _delay_ns(first: Sequence[_First]) -> int:
 
 
 class _Motion(NamedTuple):
-    """Where odometry comes from: a topic, or the transform from a frame in tf; and the topic to name."""
+    """Where odometry comes from: a topic; of tf, the transform from a frame in it. None if there is none."""
 
     topic: TopicInfo | None
     frame: str | None
-    named: TopicInfo | None
     reason: str
 
 
@@ -148,7 +147,7 @@ class _Planner:
         odometry, why, in_tf = self._odometry_topic()
         base = self._base(in_tf)
         self._check_further(base)
-        motion = self._motion_in_tf(base, why) if in_tf else _Motion(odometry, None, odometry, why)
+        motion = self._motion_in_tf(base, why) if in_tf else _Motion(odometry, None, why)
         motion = self._of_one_clock(motion)
         imu, gravity = self._imu(base, motion)
         stamps_ns = [scan.content.header.stamp_ns for scan in self._scans]
@@ -156,14 +155,14 @@ class _Planner:
             choice=Choice(
                 topic=self._sensors[0].topic.topic,
                 sensor=self._sensors[0].kind,
-                odometry_topic=motion.named.topic if motion.named else None,
+                odometry_topic=motion.topic.topic if motion.topic else None,
                 base_frame=base or self._frame or self._config.base_frame or "sensor",
                 sensor_frame=self._frame or None,
                 reason="; ".join(filter(None, (self._reason, motion.reason, gravity))),
                 imu_topic=imu.topic if imu else None,
             ),
             sensors=self._sensors,
-            odometry=motion.topic,
+            odometry=motion.topic if motion.frame is None else None,
             odometry_frame=motion.frame,
             imu=imu,
             tf_moves=motion.frame is not None or self._sensor_moves(base),
@@ -384,22 +383,22 @@ class _Planner:
         """The odometry that tf holds, if it does."""
         frame = self._odometry_frame(base)
         if frame is None or not self._moving:
-            return _Motion(None, None, None, why)
-        return _Motion(None, frame, self._moving[0], f"odometry from tf, {frame} -> {base}")
+            return _Motion(None, None, why)
+        return _Motion(self._moving[0], frame, f"odometry from tf, {frame} -> {base}")
 
     def _of_one_clock(self, motion: _Motion) -> _Motion:
         """The odometry, unless its stamps are of another clock than the scans' and nobody asked for it."""
         apart_ns = abs(_delay_ns(self._scans) - _delay_ns(self._readings or self._edges))
-        if motion.named is None or apart_ns <= GAP_NS:
+        if motion.topic is None or apart_ns <= GAP_NS:
             return motion
-        name = motion.named.topic
+        name = motion.topic.topic
         self._source.tally.warn(
             f"the clocks of the scans and of the odometry from {name} are {apart_ns * 1e-9:,.0f} s apart and "
             "never meet: that odometry says nothing of the scans; record both by one clock"
         )
         if self._config.odometry is not None:
             return motion
-        return _Motion(None, None, None, f"odometry from {name} is of another clock")
+        return _Motion(None, None, f"odometry from {name} is of another clock")
 
     def _odometry_frame(self, base: str | None) -> str | None:
         """The frame above the base in which tf holds its odometry."""
@@ -414,7 +413,7 @@ class _Planner:
         wanted = self._config.imu
         imu = topics.imu_topic(self._topics, wanted)
         if imu is None or (
-            wanted is None and (SENSOR_MODELS[self._sensors[0].kind].planar or motion.named is not None)
+            wanted is None and (SENSOR_MODELS[self._sensors[0].kind].planar or motion.topic is not None)
         ):
             return None, ""
         try:

@@ -31,8 +31,8 @@ from pc2grid.io.messages.types import Bytes, Header, PointCloud2
 Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count
 Columns = list[tuple[str, int, int]]  # name, datatype, count
 
-# Limits the search for the end of a header.
-_MAX_HEADER_BYTES = 1 << 16
+HEADER_BYTES = 1 << 16
+"""No header of a cloud is longer."""
 _SIZES = (0, 1, 1, 2, 2, 4, 4, 4, 8, 8, 8)  # bytes of the datatypes of sensor_msgs/PointField; 0: a list
 _PCD_TYPES = {"I1": 1, "U1": 2, "I2": 3, "U2": 4, "I4": 5, "U4": 6, "F4": 7, "F8": 8, "I8": 9, "U8": 10}
 _PLY_TYPES = {
@@ -58,7 +58,7 @@ def _kitti(data: Bytes, header: Header) -> PointCloud2:
 
 
 def _pcd(data: Bytes, header: Header) -> PointCloud2:
-    match = re.search(rb"^DATA +(\w+)[ \r]*\n", data[:_MAX_HEADER_BYTES], re.MULTILINE)
+    match = re.search(rb"^DATA +(\w+)[ \r]*\n", data[:HEADER_BYTES], re.MULTILINE)
     if match is None:
         raise PointCloudError("a PCD without a DATA line")
     kind, body = match.group(1).decode(), memoryview(data)[match.end() :]
@@ -92,7 +92,7 @@ def _pcd_columns(head: str) -> tuple[Columns, int]:
 
 
 def _ply(data: Bytes, header: Header) -> PointCloud2:
-    end = re.search(rb"^end_header[ \r]*\n", data[:_MAX_HEADER_BYTES], re.MULTILINE)
+    end = re.search(rb"^end_header[ \r]*\n", data[:HEADER_BYTES], re.MULTILINE)
     if bytes(data[:3]) != b"ply" or end is None:
         raise PointCloudError("a PLY without a header")
     kind, elements = _ply_elements(bytes(data[: end.start()]).decode("ascii", "replace"))
