@@ -147,8 +147,7 @@ class _Planner:
         odometry, why, in_tf = self._odometry_topic()
         base = self._base(in_tf)
         self._check_further(base)
-        motion = self._motion_in_tf(base, why) if in_tf else _Motion(odometry, None, why)
-        motion = self._of_one_clock(motion)
+        motion = self._of_one_clock(self._motion(odometry, why, base, in_tf))
         imu, gravity = self._imu(base, motion)
         stamps_ns = [scan.content.header.stamp_ns for scan in self._scans]
         return Plan(
@@ -379,11 +378,11 @@ class _Planner:
 
     # --- motion ---------------------------------------------------------------------------------------
 
-    def _motion_in_tf(self, base: str | None, why: str) -> _Motion:
-        """The odometry that tf holds, if it does."""
-        frame = self._odometry_frame(base)
+    def _motion(self, odometry: TopicInfo | None, why: str, base: str | None, in_tf: bool) -> _Motion:
+        """The odometry of a topic, or that which tf holds, if it does."""
+        frame = self._odometry_frame(base) if in_tf else None
         if frame is None or not self._moving:
-            return _Motion(None, None, why)
+            return _Motion(odometry, None, why)
         return _Motion(self._moving[0], frame, f"odometry from tf, {frame} -> {base}")
 
     def _of_one_clock(self, motion: _Motion) -> _Motion:
