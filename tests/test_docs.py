@@ -126,7 +126,7 @@ def test_importing_a_package_loads_no_library(package: str) -> None:
 # --- README and what stands beside it ---------------------------------------------------------------------
 
 EXAMPLES = sorted(f"examples/{path.name}" for path in ROOT.glob("examples/*.md"))
-GUIDES = ("docs/method.md", "docs/outputs.md", "docs/words.md")
+GUIDES = ("docs/method.md", "docs/outputs.md", "docs/robustness.md")
 DOCUMENTS = ("README.md", "CONTRIBUTING.md", *GUIDES, *EXAMPLES)
 ON_OWN_FILES = ("examples/nav2.md", "examples/recordings.md", "examples/buildings.md", "docs/outputs.md")
 """Their commands are run in a folder with the files that they name; those of README make their own."""

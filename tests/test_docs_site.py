@@ -116,7 +116,7 @@ def test_the_site_can_be_searched_without_a_server(site: Path, tmp_path: Path) -
         capture_output=True, text=True, check=True, timeout=120,
     )  # fmt: skip
     found = re.findall(r'<a href="([^"]*)" class="md-search-result__link"', done.stdout)
-    assert any("examples/peers.html" in link for link in found), found
+    assert any("examples/comparisons.html" in link for link in found), found
 
 
 def test_every_page_is_in_the_navigation() -> None:

@@ -74,7 +74,7 @@ def test_robots_that_are_carried_away_are_those_of_the_page() -> None:
     assert said in FLAT
 
 
-MEASURED = ("map-quality", "paper", "peers", "real", "sensors")
+MEASURED = ("comparisons", "paper", "real")
 
 
 @pytest.mark.parametrize("page", MEASURED)

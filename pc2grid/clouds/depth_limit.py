@@ -3,7 +3,7 @@
 The noise of a depth grows with its square, and a camera reports nothing beyond its farthest depth. Of a wall
 at this depth only those pixels are seen whose noise makes them nearer: their mean is several centimetres too
 short, and stays so while the camera approaches. Matched with the scans before, such hits say that the robot
-has moved less than it has (`examples/map-quality.md`).
+has moved less than it has (`docs/method.md`).
 """
 
 from __future__ import annotations

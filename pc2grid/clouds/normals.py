@@ -5,7 +5,7 @@ centimetres apart. Scan matching that takes them for one surface has an error of
 every door, so every hit carries the direction of its surface.
 
 The normals are estimated from the hits and not from the cloud: those of the cloud change more from scan to
-scan where no surface is clear (`examples/map-quality.md`).
+scan where no surface is clear (`docs/method.md`).
 """
 
 from __future__ import annotations

@@ -29,7 +29,7 @@ class AxesParameters:
     """Numbers of the constraint. They follow from what walls look like, and were not fitted.
 
     robust_rad : deviation from the axes at which a local map has a quarter of its weight: two to seven times
-        that of real walls (`examples/map-quality.md`).
+        that of real walls (`docs/method.md`).
     sigma_rad : standard deviation of the direction of one local map whose walls are all parallel to the axes.
         Local maps 4 m apart show the same walls up to 12 m ahead and behind: six of them are about one
         observation with 3 degrees, so that each alone counts as one with sqrt(6) times as much.

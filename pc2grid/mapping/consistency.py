@@ -50,7 +50,7 @@ class ConsistencyParameters:
 
     `window_m`, `contradicted_from` and `bent_from` were chosen on real logs and simulated drives, whose poses
     were the true ones, those with loops closed, those without loops, and true poses bent on purpose
-    (`examples/map-quality.md`).
+    (`examples/recordings.md`).
     """
 
     reach_m: float = 12.0

@@ -52,7 +52,7 @@ class LocalMapParameters:
 LOCAL_MAPS = LocalMapParameters()
 CAMERA_LOCAL_MAPS = LocalMapParameters(cell_m=0.05, radii_cells=(6, 4, 4, 2, 2, 2, 2, 2))
 """For a depth camera: cells as in `CAMERA_MATCHING`, for the same reason, neighbourhoods as wide in metres.
-Chosen on simulated drives (`examples/map-quality.md`)."""
+Chosen on simulated drives (`docs/method.md`)."""
 
 _FREE, _HIT = 1, 2  # what a local map observed in a cell; 0: nothing
 

@@ -28,7 +28,7 @@ class CandidateParameters:
     """Numbers of the acceptance. Chosen on aces and csail, unless noted.
 
     The drift that tracking may have over a travel, in standard deviations, generous because a slip of the
-    wheels counts too (`examples/map-quality.md`):
+    wheels counts too (`docs/method.md`):
 
     drift_m, drift_per_m : of position, constant and per metre of travel.
     drift_rad, drift_rad_per_m : of yaw.

@@ -37,7 +37,7 @@ class LoopParameters:
         correlated.
     tracking_sigma_m, tracking_sigma_per_m : standard deviation of a tracked step, constant and per metre.
     tracking_sigma_rad, tracking_sigma_rad_per_m : the same of its yaw: 0.45 degrees over 4 m, chosen on
-        killian (`examples/map-quality.md`).
+        killian (`docs/method.md`).
     lost_sigma_m, lost_sigma_rad : the same where tracking was lost in between.
 
     Place recognition:
@@ -97,5 +97,5 @@ EXACT_TRACKING = LoopParameters(
 
 Two local maps of a camera often show a place from two sides, so that its loops are less exact than its
 tracking. So are those of a sensor in the hand, whose local maps are drawn in cells of 5 cm. About twice the
-errors of tracking by a camera in simulated csail (`examples/map-quality.md`); checked on lidar/hall.
+errors of tracking by a camera in simulated csail (`docs/method.md`); checked on lidar/hall.
 """

@@ -3,7 +3,7 @@
 The manifold Gauss-Newton of Grisetti et al., "A tutorial on graph-based SLAM" (2010), section IV, with
 Cauchy weights on the edges that may be wrong. In the plane it needs 3 numbers a pose where Open3D's
 optimiser has 6, uses each edge's information as it was measured, and needs no Open3D for a 2D laser.
-It was measured against Open3D's `global_optimization` (`examples/map-quality.md`).
+It was measured against Open3D's `global_optimization` (`docs/method.md`).
 """
 
 from __future__ import annotations
