@@ -10,7 +10,6 @@ import os
 import queue
 import random
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -36,6 +35,7 @@ from pc2grid_cli.view_events import Events
 from pc2grid_cli.view_server import Options, ViewServer, safe_name
 from signature.config import Config
 from signature.database import open_database
+from tests.helpers.browser import DESK, PHONE, Browser
 from tests.helpers.interruptible import interruptible
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import office
@@ -538,47 +538,58 @@ def test_the_command_prints_its_address_and_stops_with_ctrl_c(desk: Path, tmp_pa
         view.wait()
 
 
-@pytest.mark.timeout(600)  # some seconds of work; on a busy machine many times as long
-@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+BEGUN = {
+    "begin": {"source": "run.mcap"},
+    "scans": [[0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0]],
+    "moment": {
+        "path_m": 2.0, "status": "located", "session": "office", "confidence": 0.97,
+        "pose": [5.0, 7.0, 0.0], "base": [2.0, 0.0, 0.0],
+    },
+}  # fmt: skip
+
+
 @pytest.mark.parametrize("end", [None, "located", "ambiguous", "error"])
 def test_a_browser_shows_what_happens(
-    desk: Path, serve: Callable[..., Served], tmp_path: Path, end: str | None
+    desk: Path, serve: Callable[..., Served], browser: Browser, end: str | None
+) -> None:
+    unsure = end in ("ambiguous", "error")
+    with open_database(desk / "office.submaps") as database:
+        events = Events()
+        served = serve(events=events)
+        served.server.pages[""] = live_page(database)
+        for kind, told in BEGUN.items():
+            changed = {"status": "ambiguous"} if kind == "moment" and unsure else {}
+            events.publish(kind, {**told, **changed} if isinstance(told, dict) else told)
+        if end == "error":
+            events.publish("end", {"source": "run.mcap", "error": "stopped", "hint": None})
+        elif end:
+            events.publish("end", {"source": "run.mcap", "status": end, "confidence": 0.97})
+        browser.show(served.url)
+        said = {None: "after 2.0 m", "error": "stopped"}.get(end, f"run.mcap: {end}")
+        browser.wait(f"$('told').textContent.startsWith('{said}')")
+        if unsure:
+            browser.evaluate("new Promise(seen => setTimeout(seen, 100))")
+            assert browser.evaluate("$('trace')") is None, "an arrow at a place that is no answer"
+            return
+        if end is None:
+            words = "after 2.0 m: located, confidence 0.97; best place: office, x 5.00 m, y 7.00 m"
+            assert browser.evaluate("$('told').textContent") == words
+        browser.wait("!!$('trace')")
+        # The path of the query, laid on the map: it began 2 m to the left of where the robot is.
+        assert "M3 7 4 7 5 7" in browser.evaluate("$('trace').outerHTML")
+
+
+@pytest.mark.parametrize(("size", "dark"), [(DESK, False), (DESK, True), (PHONE, False), (PHONE, True)])
+def test_the_page_is_whole_in_light_in_dark_and_on_a_phone(
+    desk: Path, serve: Callable[..., Served], browser: Browser, size: tuple[int, int], dark: bool
 ) -> None:
     with open_database(desk / "office.submaps") as database:
         events = Events()
         served = serve(events=events)
         served.server.pages[""] = live_page(database)
-        events.publish("begin", {"source": "run.mcap"})
-        events.publish("scans", [[0, 0, 0, 0], [1, 0, 0, 0], [2, 0, 0, 0]])
-        events.publish(
-            "moment",
-            {
-                "path_m": 2.0,
-                "status": "ambiguous" if end in ("ambiguous", "error") else "located",
-                "session": "office",
-                "confidence": 0.97,
-                "pose": [5.0, 7.0, 0.0],
-                "base": [2.0, 0.0, 0.0],
-            },
-        )
-        if end == "error":
-            events.publish("end", {"source": "run.mcap", "error": "stopped", "hint": None})
-        elif end:
-            events.publish("end", {"source": "run.mcap", "status": end, "confidence": 0.97})
-        browser = [
-            *("chromium", "--headless", "--no-sandbox", "--disable-gpu"),
-            *(f"--user-data-dir={tmp_path / 'browser'}", "--virtual-time-budget=1000", "--dump-dom"),
-            served.url,
-        ]
-        with subprocess.Popen(browser, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as run:
-            wait_until(lambda: events.looking_on > 0)
-            events.close()  # the virtual time of the browser stands still while a request is going on
-            page, _ = run.communicate(timeout=500)
-    if end in ("ambiguous", "error"):
-        assert 'id="trace"' not in page, "an arrow at a place that is no answer"
-        return
-    if end is None:
-        assert "after 2.0 m: located, confidence 0.97; best place: office, x 5.00 m, y 7.00 m" in page
-    # The path of the query, laid on the map: it began 2 m to the left of where the robot is.
-    trace = re.search(r'<g id="trace".*?</g></g>', page, re.S)
-    assert trace is not None and re.search(r"M3 7 4 7 5 7", trace[0]), trace
+        for kind, told in BEGUN.items():
+            events.publish(kind, told)
+        browser.show(served.url, size, dark=dark)
+        browser.wait("!!$('trace')")
+        assert browser.evaluate("innerWidth") == size[0]
+        assert browser.faults() == [] and browser.complaints == []

@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from signature.localization.shown.report import Found
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
-YELLOW = "#F0E442"
 GREY = "#777777"
 SUPPORT_COLOURS = {"FITS": GREEN, "CONTRADICTED": VERMILLION, "UNKNOWN": BLUE}
 """Of the query's wall points, by the name of their `pc2grid.matching.agreement.Support`."""
@@ -126,22 +125,28 @@ def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
 
 
 def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid, BuildingFrame]]) -> None:
-    """The walls of the sessions of a building over each other, each with where it lies.
+    """The walls of the sessions of a building over each other: as they were stored, and as they are joined.
 
     name : of the building's frame.
     """
-    walls = {
-        session: at.apply(grid.to_point(np.argwhere(grid.occupied))) for session, (grid, at) in maps.items()
-    }
-    boxes = [_Box.around(points_m, _CLOSE_MARGIN_M) for points_m in walls.values() if len(points_m)]
-    whole = reduce(_Box.united, boxes or [_Box(0.0, 1.0, 0.0, 1.0)])
-    figure, (axes,) = _panels(whole)
-    axes.set_facecolor(_grey("free"))
-    colours = itertools.cycle((BLUE, VERMILLION, GREEN, PURPLE, ORANGE, GREY, YELLOW))
-    for (session, points_m), colour in zip(walls.items(), colours, strict=False):
-        axes.plot(*points_m.T, ".", color=colour, ms=2.5, mew=0, alpha=0.7, label=session)
-    axes.set_title(f"walls of the sessions in the frame of {name}", loc="left")
-    write_figure(_with_legend(figure, axes), path)
+    before = {session: grid.to_point(np.argwhere(grid.occupied)) for session, (grid, _) in maps.items()}
+    after = {session: at.apply(before[session]) for session, (_, at) in maps.items()}
+    figure, panels = _panels(*(_around_walls(walls.values()) for walls in (before, after)))
+    for axes, walls in zip(panels, (before, after), strict=True):
+        axes.set_facecolor(_grey("free"))
+        colours = itertools.cycle((BLUE, ORANGE, GREEN, VERMILLION, PURPLE, GREY))
+        # Each thinner than the one below it, so that both colours are visible where walls coincide.
+        for k, ((session, points_m), colour) in enumerate(zip(walls.items(), colours, strict=False)):
+            axes.plot(*points_m.T, "s", color=colour, ms=max(3.4 - 2.0 * k, 1.4), mew=0, label=session)
+    panels[0].set_title("before: each map in its own frame", loc="left", fontsize=10)
+    panels[1].set_title(f"after: joined in the frame of {name}", loc="left", fontsize=10)
+    write_figure(_with_legend(figure, panels[0]), path)
+
+
+def _around_walls(walls: Iterable[F64]) -> _Box:
+    """The box of all walls; of none a square metre."""
+    boxes = [_Box.around(points_m, _CLOSE_MARGIN_M) for points_m in walls if len(points_m)]
+    return reduce(_Box.united, boxes or [_Box(0.0, 1.0, 0.0, 1.0)])
 
 
 def draw_answer(
@@ -413,7 +418,7 @@ def _with_legend(figure: Any, axes: Any) -> Any:
             fontsize=9,
         )
         for handle in legend.legend_handles:
-            if handle.get_marker() in (".", "x"):  # the dots of the figure are too small to tell colours
+            if handle.get_marker() in (".", "s", "x"):  # as small as in the figure, colours look alike
                 handle.set_markersize(9 if handle.get_marker() == "." else 6)
     return figure
 

@@ -265,6 +265,7 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
         "deviation": None if pose is None else _short(_deviation(answer, database), 4),
         "confidence": round(answer.confidence, 4),
         "accept": accept,
+        "space": document["in_space"],
         "query": {**found.about, "is_map": found.about["sensor"] == "map"},
         "walls": _short(np.ravel(walls_m), 2),
         "hypotheses": [

@@ -10,11 +10,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import OccupancyGrid
 from pc2grid_cli.locate import find_map
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
+from signature.database.protocol import BuildingFrame
 from signature.localization.shown.picture import (
     BLUE,
     GREEN,
@@ -22,10 +24,12 @@ from signature.localization.shown.picture import (
     PURPLE,
     VERMILLION,
     draw_answer,
+    draw_building,
     draw_session,
 )
 from signature.localization.shown.report import Found
 from signature.sessions import add_sessions, provenance
+from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
 from tests.helpers.session_maps import session, way
 from tests.helpers.simulated_drives import cut, office, plan
 
@@ -125,6 +129,30 @@ def test_a_small_query_is_also_shown_from_near(database: SubmapDatabase, tmp_pat
         draw_answer(tmp_path / f"{name}.png", database, found.answer, found.poses)
     near, far = (cv2.imread(str(tmp_path / f"{name}.png")).shape for name in ("near", "far"))
     assert near[0] * near[1] > 1.3 * far[0] * far[1]
+
+
+def test_joined_maps_have_two_colours_that_lie_on_each_other_only_once_they_are_joined(
+    tmp_path: Path,
+) -> None:
+    def frame(T_building_session: SE2) -> BuildingFrame:
+        variances = ((1e-4, 0.0, 0.0), (0.0, 1e-4, 0.0), (0.0, 0.0, 1e-6))
+        return BuildingFrame(name="west", T_building_session=T_building_session, covariance=variances)
+
+    west, east = part(WEST), in_frame(part(EAST), T_OFFICE_EAST)
+    joined = {"west": (west, frame(SE2(0.0, 0.0, 0.0))), "east": (east, frame(T_OFFICE_EAST))}
+    draw_building(tmp_path / "joined.png", "west", joined)
+    image = cv2.imread(str(tmp_path / "joined.png")).astype(int)
+    shares = []
+    for half in (image[:, : image.shape[1] // 2], image[:, image.shape[1] // 2 :]):
+        blue, orange = (
+            np.abs(half - [int(colour[k : k + 2], 16) for k in (5, 3, 1)]).max(axis=-1) < 12
+            for colour in (BLUE, ORANGE)
+        )
+        assert blue.sum() > 1000 and orange.sum() > 1000
+        near_blue = cv2.dilate(blue.astype(np.uint8), np.ones((9, 9), np.uint8)) > 0
+        shares.append((orange & near_blue).sum() / orange.sum())
+    before, after = shares
+    assert before < 0.25 < 0.4 < after, "half of the walls of the east are also in the west"
 
 
 @pytest.mark.parametrize("name", ["session", "answer"])

@@ -6,8 +6,6 @@ import base64
 import json
 import math
 import re
-import shutil
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -25,9 +23,11 @@ from signature.config import Config
 from signature.database import SubmapDatabase, open_database
 from signature.describe import Signature
 from signature.freespace import freespace_histogram, shortest_paths
+from signature.localization.answer import PoseInSpace
 from signature.localization.shown.report import Found, contents, write_report
 from signature.sessions import add_sessions, provenance
 from signature.similarity import distances
+from tests.helpers.browser import DESK, PHONE, Browser
 from tests.helpers.session_maps import LOOPS, session, way
 from tests.helpers.simulated_drives import cut, office, plan
 
@@ -69,7 +69,7 @@ def test_the_page_is_whole_and_fetches_nothing(
     outside = re.findall(r"(?:https?:)?//[a-z][^\s\"'`)]*", page.replace("http://www.w3.org/2000/svg", ""))
     assert [u for u in outside if u.startswith(("http", "//www"))] == []
     assert "default-src 'none'" in page
-    assert not re.search(r"<(?:script|link|img|iframe)[^>]*(?:src|href)=", page)
+    assert not re.search(r"<(?:script|link|img|iframe)[^>]*(?:src|href)=(?!.data:)", page)
     # A session's name cannot end the script: only the template's own end tag is there.
     assert page.count("</script>") == 1
     assert embedded(page) == contents(database, found=found)
@@ -296,95 +296,146 @@ def test_a_map_of_nothing_still_has_a_page(tmp_path: Path) -> None:
     assert only["submaps"] == [] and only["path"] == [] and only["graph"] == {"nodes": [], "edges": []}
 
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-
-
-needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium to look at the page with")
-
-
-def looked_at(page: Path, tmp_path: Path, size: str = "1280,900", act: str = "") -> str:
+def looked_at(
+    browser: Browser, page: Path, size: tuple[int, int] = DESK, *, dark: bool = False, act: str = ""
+) -> str:
     """The document after the script ran and a reader acted; fails on any message of the console."""
-    if act:
-        page.write_text(page.read_text("utf-8").replace("</script>", f"\n{act}\n</script>"), "utf-8")
-    assert CHROMIUM is not None
-    done = subprocess.run(
-        [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
-         "--enable-logging=stderr", "--virtual-time-budget=3000", f"--window-size={size}", "--dump-dom",
-         f"file://{page}"],
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
-    assert [line for line in done.stderr.splitlines() if "CONSOLE" in line] == []
-    shown = re.sub(r"<script>.*?</script>", "", done.stdout, flags=re.S)
+    browser.show(page.as_uri(), size, dark=dark)
+    browser.evaluate(act)
+    assert browser.complaints == []
+    shown = re.sub(
+        r"<script>.*?</script>", "", browser.evaluate("document.documentElement.outerHTML"), flags=re.S
+    )
     assert "NaN" not in shown and "Infinity" not in shown and "undefined" not in shown
     return shown
 
 
-@needs_chromium
-@pytest.mark.parametrize("size", ["1280,900", "390,844"])
+LOOKS = pytest.mark.parametrize(
+    ("size", "dark"), [(DESK, False), (DESK, True), (PHONE, False), (PHONE, True)]
+)
+
+
+def in_space(found: Found) -> Found:
+    """The answer with a pose of six degrees of freedom."""
+    T = np.eye(4)
+    T[:3, 3] = 4.01, 3.02, 0.03
+    variances = np.array([0.01, 0.01, 0.02, 0.003, 0.003, 0.003]) ** 2
+    pose = PoseInSpace(
+        status="agrees", T_map_base=T, covariance=np.diag(variances), rmse_m=0.02,
+        rays=512, on=0.73, through=0.2, before=0.07,
+    )  # fmt: skip
+    return replace(found, answer=replace(found.answer, in_space=pose))
+
+
+@LOOKS
 def test_a_browser_has_nothing_to_complain_about(
-    database: SubmapDatabase, found: Found, tmp_path: Path, size: str
+    database: SubmapDatabase,
+    found: Found,
+    tmp_path: Path,
+    browser: Browser,
+    size: tuple[int, int],
+    dark: bool,
 ) -> None:
-    write_report(tmp_path / "page.html", database, found=found)
-    shown = looked_at(tmp_path / "page.html", tmp_path, size)
-    for words in ("part.yaml in two.submaps", "submap centres", "query's wall: fits the map", ">Submaps<"):
-        assert words in shown
-    assert "of the query's walls 100" in shown
-    # Of the three loops that the first session came back by, off until they are wanted.
-    assert re.search(r"<label><input type=\"checkbox\">.*?2 loops closed</label>", shown)
-    assert "1 loop doubted</label>" in shown
-
-
-@needs_chromium
-@pytest.mark.parametrize("size", ["1280,900", "390,844"])
-def test_nothing_is_cut_at_the_side(
-    database: SubmapDatabase, found: Found, tmp_path: Path, size: str
-) -> None:
-    """A table that is wider than its section can be scrolled, but nobody sees that there is more of it."""
-    write_report(tmp_path / "page.html", database, found=found)
-    act = (
-        'document.body.dataset.cut = [document.documentElement, ...document.querySelectorAll(".scroll")]'
-        ".filter(e => e.scrollWidth > e.clientWidth).map(e => e.innerHTML).join();"
-        'document.body.dataset.sessions = document.querySelectorAll("#sessions tr").length - 1;'
+    write_report(tmp_path / "page.html", database, found=in_space(found))
+    shown = looked_at(
+        browser, tmp_path / "page.html", size, dark=dark, act="$('words').open = true; step(1);"
     )
-    shown = looked_at(tmp_path / "page.html", tmp_path, size, act)
-    assert 'data-cut=""' in shown and 'data-sessions="2"' in shown
-    assert ">overlap<" in shown and "complete" in shown
+    assert browser.evaluate("innerWidth") == size[0]
+    for words in ("part.yaml in two.submaps", "submap centres", "query's wall: fits the map", ">overlap<"):
+        assert words in shown
+    assert "of the query's walls 100" in shown and "Of 512 rays of the query 73" in shown
+    assert shown.count("<figcaption>") >= 6 and browser.evaluate("$('sessions').rows.length") == 3
+    # Of the three loops that the first session came back by, off until they are wanted.
+    for label in ("2 loops closed", "1 loop doubted"):
+        assert re.search(rf'<label><input type="checkbox">(?:(?!<label>).)*?>{label}</span></label>', shown)
+    assert browser.faults() == []
 
 
-@needs_chromium
-def test_the_place_under_the_pointer_is_named(database: SubmapDatabase, tmp_path: Path) -> None:
+def test_the_page_is_dark_where_the_reader_wants_it(
+    database: SubmapDatabase, tmp_path: Path, browser: Browser
+) -> None:
+    write_report(tmp_path / "page.html", database)
+    pages = []
+    for dark in (False, True):
+        looked_at(browser, tmp_path / "page.html", dark=dark)
+        pages.append(browser.evaluate("getComputedStyle(document.body).backgroundColor"))
+    assert pages == ["rgb(255, 255, 255)", "rgb(20, 23, 26)"]
+
+
+def test_every_label_is_explained_under_the_pointer_and_in_the_list(
+    database: SubmapDatabase, found: Found, tmp_path: Path, browser: Browser
+) -> None:
+    write_report(tmp_path / "page.html", database, found=found)
+    looked_at(browser, tmp_path / "page.html", act="$('next').click();")
+    titles = browser.evaluate("[...document.querySelectorAll('#legend label span')].map(e => e.title)")
+    told = browser.evaluate("[...document.querySelectorAll('#words dd')].map(e => e.textContent)")
+    assert len(titles) > 5 and all(titles) and set(titles) <= set(told)
+    heads = browser.evaluate(
+        "[...document.querySelectorAll('#hypotheses th, #similar th')].map(e => e.title)"
+    )
+    assert {text for text in heads if text} <= set(told) and sum(map(bool, heads)) == 3
+    # The words of layers that this page has not got are explained, too.
+    layers = "[...Object.values(HEALTH).map(h => h[3]), ...SUPPORT.map(s => s[2])]"
+    assert browser.evaluate(f"{layers}.length == 7 && {layers}.every(label => WORDS[label])")
+
+
+def test_what_is_cut_small_or_faint_is_found(tmp_path: Path, browser: Browser) -> None:
+    (tmp_path / "page.html").write_text(
+        '<meta name="viewport" content="width=device-width"><p style="color: #aaa">faint</p>'
+        '<div style="width: 400px">cut</div><svg class="chart" width="50" viewBox="0 0 100 9">'
+        '<text y="9" style="font-size: 12px">small</text></svg>'
+    )
+    looked_at(browser, tmp_path / "page.html", PHONE)
+    faults = browser.faults()
+    assert {fault.split()[-1] for fault in faults} >= {"small", "faint"}
+    assert any(fault.startswith("cut: <div") for fault in faults)
+
+
+def test_the_pose_in_space_is_shown_with_all_that_the_terminal_says(
+    database: SubmapDatabase, found: Found, tmp_path: Path, browser: Browser
+) -> None:
+    write_report(tmp_path / "page.html", database, found=in_space(found))
+    looked_at(browser, tmp_path / "page.html")
+    rows = browser.evaluate("[...$('six').rows].slice(1).map(r => [...r.cells].map(c => c.textContent))")
+    assert [row[0] for row in rows] == ["x", "y", "z", "roll", "pitch", "yaw"]
+    assert rows[2] == ["z", "0.030 m", "0.020 m"] and rows[3] == ["roll", "0.00°", "0.17°"]
+    write_report(tmp_path / "page.html", database, found=found)
+    looked_at(browser, tmp_path / "page.html")
+    assert browser.evaluate("$('space').hidden")
+
+
+def test_the_place_under_the_pointer_is_named(
+    database: SubmapDatabase, tmp_path: Path, browser: Browser
+) -> None:
     write_report(tmp_path / "page.html", database)
     place = contents(database)["sessions"][0]["submaps"][3]["xy"]
     act = (
-        "addEventListener('load', () => setTimeout(() => {"
-        f" const at = new DOMPoint({place[0]}, -({place[1]}))"
-        ".matrixTransform($('map').getScreenCTM()); $('map').dispatchEvent(new PointerEvent('pointermove',"
-        " { clientX: at.x, clientY: at.y, pointerId: 1 })); }, 200));"
+        f"const there = new DOMPoint({place[0]}, -({place[1]})).matrixTransform($('map').getScreenCTM());"
+        " $('map').dispatchEvent(new PointerEvent('pointermove',"
+        " { clientX: there.x, clientY: there.y, pointerId: 1 }));"
     )
-    shown = looked_at(tmp_path / "page.html", tmp_path, act=act)
+    shown = looked_at(browser, tmp_path / "page.html", act=act)
     x, y = (float(v) for v in re.findall(r'id="pointed"[^>]*>x (-?[\d.]+) m, y (-?[\d.]+) m<', shown)[0])
     assert math.hypot(x - place[0], y - place[1]) < 0.05
 
 
-@needs_chromium
 def test_an_answer_is_shown_without_a_submap_until_the_reader_chooses_one(
-    database: SubmapDatabase, found: Found, tmp_path: Path
+    database: SubmapDatabase, found: Found, tmp_path: Path, browser: Browser
 ) -> None:
     write_report(tmp_path / "page.html", database, found=found)
-    assert '<g id="mark"></g>' in looked_at(tmp_path / "page.html", tmp_path)
-    shown = looked_at(tmp_path / "page.html", tmp_path, act="$('next').click();")
+    assert '<g id="mark"></g>' in looked_at(browser, tmp_path / "page.html")
+    shown = looked_at(browser, tmp_path / "page.html", act="$('next').click();")
     assert '<g id="mark"><circle' in shown and ">Submap 0<" in shown
 
 
-@needs_chromium
-def test_each_warning_is_a_line_of_its_own(tmp_path: Path) -> None:
+def test_each_warning_is_a_line_of_its_own(tmp_path: Path, browser: Browser) -> None:
     made = session("office", office(), way())
     warned = replace(made, report=replace(made.report, warnings=("first <warning>", "second")))
     row = (warned, provenance(Path("office.mcap"), "a" * 64, Config()))
     add_sessions(tmp_path / "warned.submaps", [row], Config(), keep=False)
     with open_database(tmp_path / "warned.submaps") as database:
         write_report(tmp_path / "page.html", database)
-    shown = looked_at(tmp_path / "page.html", tmp_path)
+    shown = looked_at(browser, tmp_path / "page.html")
     assert "<li>office: first &lt;warning&gt;</li><li>office: second</li>" in shown
 
 
@@ -392,8 +443,9 @@ def points_drawn(shown: str) -> int:
     return sum(int(n) for n in re.findall(r'class="evidence" data-points="(\d+)"', shown))
 
 
-@needs_chromium
-def test_the_place_that_a_reader_chooses_is_the_one_weighed(database: SubmapDatabase, tmp_path: Path) -> None:
+def test_the_place_that_a_reader_chooses_is_the_one_weighed(
+    database: SubmapDatabase, tmp_path: Path, browser: Browser
+) -> None:
     """A query of a symmetric room fits it in both headings."""
     save_map(cut(plan(8, 5, []), 0.0, 0.0, 8.0, 5.0), tmp_path / "room")
     found = find_map(tmp_path / "room.yaml", database, Config())
@@ -401,15 +453,14 @@ def test_the_place_that_a_reader_chooses_is_the_one_weighed(database: SubmapData
     write_report(tmp_path / "page.html", database, found=found)
     data = contents(database, found=found)["answer"]
     act = 'document.querySelectorAll("#hypotheses tr")[2].click();'
-    shown = looked_at(tmp_path / "page.html", tmp_path, act=act)
+    shown = looked_at(browser, tmp_path / "page.html", act=act)
     assert "Place 2: of the query's walls" in shown
     second = data["hypotheses"][1]
     assert points_drawn(shown) == len(second["support"]) + len(second["missed"]) // 2
 
 
-@needs_chromium
 def test_the_submap_that_a_reader_chooses_is_explained_with_its_loops(
-    database: SubmapDatabase, tmp_path: Path
+    database: SubmapDatabase, tmp_path: Path, browser: Browser
 ) -> None:
     write_report(tmp_path / "page.html", database)
     first = contents(database)["sessions"][0]
@@ -419,7 +470,7 @@ def test_the_submap_that_a_reader_chooses_is_explained_with_its_loops(
     chosen = int(nearest[0, 0])
     own = int((nearest == chosen).any(axis=1).sum())
     act = f"pick(S.submaps.at({chosen} - 1)); $('next').click();"
-    shown = looked_at(tmp_path / "page.html", tmp_path, act=act)
+    shown = looked_at(browser, tmp_path / "page.html", act=act)
     submap = first["submaps"][chosen]
     assert f">Submap {submap['id']}<" in shown
     assert f"{own} loop{'s' if own > 1 else ''} from here" in shown and own < len(ends_m)

@@ -1,0 +1,19 @@
+"""What tests of several folders are given."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from tests.helpers.browser import CHROMIUM, Browser, browser_in
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """One browser for all pages; on a server of tests its absence is a failure."""
+    if CHROMIUM is None:
+        (pytest.fail if os.environ.get("CI") else pytest.skip)("chromium is not installed")
+    with browser_in(tmp_path_factory.mktemp("browser")) as opened:
+        yield opened
