@@ -10,7 +10,7 @@ ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 BYTE_CODE = PYTHONDONTWRITEBYTECODE=
 PYTEST_ARGS ?=
 
-.PHONY: help demo test nightly check real fuzz picture docs clean
+.PHONY: help demo test nightly check real fuzz pictures modules docs clean
 .DEFAULT_GOAL = help
 
 help:
@@ -20,7 +20,8 @@ help:
 	@echo 'make check   lint, format, types, import order'
 	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
-	@echo 'make picture list the modules by what they import, in CONTRIBUTING.md'
+	@echo 'make pictures draw all pictures of README and the pages again (an hour, of it 2 minutes without paper.png)'
+	@echo 'make modules list the modules by what they import, in CONTRIBUTING.md'
 	@echo 'make docs    the documentation site: site/index.html'
 	@echo 'make clean   remove .venv and everything that was made'
 	@echo 'All of them work from a fresh clone. PYTHON=/path/to/python3 chooses the interpreter for .venv.'
@@ -62,7 +63,17 @@ fuzz: $(READY)
 	$(FUZZ) tests/signature/database/test_faults.py tests/signature/database/test_durability.py \
 		tests/pc2grid_cli/test_view.py -k fuzz
 
-picture: $(READY)
+# Every picture of README and the pages, by the program as it is. paper.png needs the maps of the paper.
+pictures: demo
+	cp demo_out/answer.png examples/demo.png
+	$(BIN)/python examples/how_it_works.py demo_out/lidar.mcap demo_out/depth.mcap --out examples/how_it_works.png
+	$(BIN)/pc2grid export demo_out/office.submaps --map demo_out/office --force
+	$(BIN)/python examples/signature_of_a_submap.py demo_out/office.yaml --out docs/signatures.png
+	$(BIN)/pc2grid compare paper --maps $(REAL_DATA)/maps --offset 1.0 --queries 200 --methods proposed \
+		--methods shape_context --methods boundary_centres --methods shape_context_centres --out results/paper
+	cp results/paper/figure-9-offset-1.png examples/paper.png
+
+modules: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py CONTRIBUTING.md
 
 docs: $(READY)

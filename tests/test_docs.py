@@ -281,6 +281,19 @@ def test_links_lead_somewhere(name: str) -> None:
         assert (ROOT / target).exists(), target
 
 
+def test_every_picture_is_drawn_by_make_pictures() -> None:
+    """And none is in the repository that no page shows."""
+    shown = {
+        ((ROOT / name).parent / target).resolve().relative_to(ROOT).as_posix()
+        for name in DOCUMENTS
+        for target in re.findall(r"\]\(([^)#:]+\.png)\)", (ROOT / name).read_text())
+    }
+    kept = (path for folder in ("docs", "examples") for path in (ROOT / folder).rglob("*.png"))
+    assert shown == {path.relative_to(ROOT).as_posix() for path in kept}
+    recipe = (ROOT / "Makefile").read_text().partition("\npictures:")[2].partition("\n\n")[0]
+    assert {word for word in recipe.split() if re.fullmatch(r"(?:docs|examples)/\w+\.png", word)} == shown
+
+
 def test_the_first_screen_says_what_this_is() -> None:
     """A command in the first lines, a picture, the paper and its three signatures; all of README is short."""
     text = (ROOT / "README.md").read_text()

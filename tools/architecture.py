@@ -22,7 +22,7 @@ ABOUT = {
     "signature": "submaps to signatures, database, localization",
     "pc2grid": "recordings to clouds, trajectories, maps, submaps",
 }
-BEGIN, END = "<!-- modules: made by `make picture` -->\n", "<!-- end of modules -->"
+BEGIN, END = "<!-- modules: made by `make modules` -->\n", "<!-- end of modules -->"
 
 
 def imports(code: grimp.ImportGraph, package: str) -> tuple[nx.DiGraph, dict[str, list[str]]]:
