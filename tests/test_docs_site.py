@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 import pc2grid
 import signature
 from pc2grid_cli.main import app
+from tests.helpers.browser import DESK, PHONE, Browser
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -117,6 +118,18 @@ def test_the_site_can_be_searched_without_a_server(site: Path, tmp_path: Path) -
     )  # fmt: skip
     found = re.findall(r'<a href="([^"]*)" class="md-search-result__link"', done.stdout)
     assert any("examples/comparisons.html" in link for link in found), found
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("page", ["index", "examples/recordings", "reference/pc2grid"])
+def test_pages_can_be_read_in_light_in_dark_and_on_a_phone(site: Path, browser: Browser, page: str) -> None:
+    behind = []
+    for size, dark in ((DESK, False), (DESK, True), (PHONE, False)):
+        browser.show((site / f"{page}.html").as_uri(), size, dark=dark)
+        behind.append(browser.evaluate("getComputedStyle(document.body).backgroundColor"))
+        assert browser.evaluate("document.documentElement.scrollWidth") == size[0]
+        assert browser.complaints == []
+    assert behind[0] == behind[2] != behind[1]
 
 
 def test_every_page_is_in_the_navigation() -> None:
