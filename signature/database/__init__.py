@@ -8,10 +8,11 @@ from __future__ import annotations
 
 from pc2grid.errors import OutputError
 from signature.database.database import SubmapDatabase
-from signature.database.postgres.database import PostgresDatabase
+from signature.database.postgres.rows import PostgresRows
 from signature.database.postgres.server import is_url, location
 from signature.database.protocol import Label, Place, Problem, Provenance, SessionInfo
-from signature.database.sqlite.database import SqliteDatabase
+from signature.database.rows import Rows
+from signature.database.sqlite.rows import SqliteRows
 
 __all__ = [
     "Label",
@@ -35,7 +36,7 @@ def open_database(path_or_url: Place, *, writable: bool = False) -> SubmapDataba
     ...     session, database.grid(session).resolution_m, len(database.signatures()) > 10
     ('monday', 0.05, True)
     """
-    return engine_of(path_or_url).open(path_or_url, writable=writable)
+    return SubmapDatabase(engine_of(path_or_url).open(path_or_url), writable=writable)
 
 
 def create_database(path_or_url: Place, *, overwrite: bool = False) -> SubmapDatabase:
@@ -60,9 +61,6 @@ def refuse_existing(place: Place, overwrite: bool) -> None:
         raise OutputError(f"{where}: exists already", hint="--force replaces it")
 
 
-def engine_of(place: Place) -> type[SubmapDatabase]:
+def engine_of(place: Place) -> type[Rows]:
     """The engine of a path or URL."""
-    if is_url(place):
-        return PostgresDatabase
-
-    return SqliteDatabase
+    return PostgresRows if is_url(place) else SqliteRows

@@ -61,24 +61,17 @@ def pack(document: Any, arrays: Mapping[str, Array], *, compress: bool = True) -
 
 
 def unpack(data: bytes) -> tuple[Any, dict[str, Array]]:
-    """What was packed, the arrays read-only. Raises ValueError, BadZipFile and others for other bytes."""
+    """What was packed. Raises ValueError, BadZipFile and others for other bytes."""
     with zipfile.ZipFile(io.BytesIO(data)) as file:
         size = sum(member.file_size for member in file.infolist())
-        if size > MOST_BYTES:
-            raise ValueError(f"{size} bytes, more than {MOST_BYTES}")
-        arrays = {name.removesuffix(".npy"): _array(name, file.read(name)) for name in file.namelist()}
+    if size > MOST_BYTES:
+        raise ValueError(f"{size} bytes, more than {MOST_BYTES}")
+    with np.load(io.BytesIO(data)) as members:
+        arrays = dict(members)
+    for name, array in arrays.items():
+        if array.dtype.kind == "f" and not np.isfinite(array).all():
+            raise ValueError(f"{name}: a number that is not finite")
     return json.loads(arrays.pop(_DOCUMENT).tobytes()), arrays
-
-
-def _array(name: str, data: bytes) -> Array:
-    """The array of an `.npy`: nothing is allocated for what it claims and does not hold."""
-    stream = io.BytesIO(data)
-    np.lib.format.read_magic(stream)
-    shape, by_column, dtype = np.lib.format.read_array_header_1_0(stream)
-    array = np.frombuffer(data, dtype, offset=stream.tell()).reshape(shape, order="F" if by_column else "C")
-    if dtype.kind == "f" and not np.isfinite(array).all():
-        raise ValueError(f"{name}: a number that is not finite")
-    return array
 
 
 def row_crc(values: Iterable[Any]) -> int:

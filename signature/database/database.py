@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import fields
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
@@ -19,14 +18,7 @@ from signature.config import Config
 from signature.database import document, validation
 from signature.database.arrays import DatabaseDamage, explained
 from signature.database.document import PARTS, StoredSession, SubmapArrays, stored_session
-from signature.database.protocol import (
-    BuildingFrame,
-    Place,
-    Problem,
-    Provenance,
-    SessionInfo,
-    none_there,
-)
+from signature.database.protocol import BuildingFrame, Label, Problem, Provenance, SessionInfo
 from signature.database.rows import Rows, SessionRow, no_session
 from signature.similarity import SignatureTable
 
@@ -38,56 +30,20 @@ if TYPE_CHECKING:
     from signature.seen_places import SeenPlaces
 
 
-class SubmapDatabase(ABC):
+class SubmapDatabase:
     """Sessions and their submaps. Reading never changes it; `add` changes all or nothing.
+
+    A handle sees the database as it was when it was opened; `add` lets its own handle see the new state. (A
+    server keeps deleted rows for it, so services should open a new handle now and then.)
 
     Every read raises DatabaseCorrupt where a row does not match its checksum, or says what cannot be.
     """
 
-    def __init__(self, place: Place, rows: Rows, *, writable: bool, damaged: bool) -> None:
-        self._place, self._rows, self._writable, self._damaged = place, rows, writable, damaged
+    def __init__(self, rows: Rows, *, writable: bool = False, damaged: bool = False) -> None:
+        """damaged : know only the sessions whose own row can be read."""
+        self._rows, self._writable, self._damaged = rows, writable, damaged
         self._left_out: set[int] = set()
-
-    # --- what an engine does in its own way -----------------------------------------------------------
-
-    @classmethod
-    @abstractmethod
-    def open(cls, place: Place, *, writable: bool = False, damaged: bool = False) -> Self:
-        """Open what is there; see `signature.database.open_database`.
-
-        damaged : open it in whatever state it is, and know only the sessions whose own row can be read.
-        """
-
-    @classmethod
-    @abstractmethod
-    def change(
-        cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
-    ) -> None:
-        """Change a database in one transaction, all or nothing.
-
-        action : may be called again if another writer comes in between. keep : start from what is there;
-        otherwise from nothing. create : make the database if there is none.
-
-        Raises what `action` raises, as `open`, OutputError if it cannot be written, and DatabaseBusy.
-        """
-
-    @classmethod
-    @abstractmethod
-    def exists(cls, place: Place) -> bool:
-        """Whether there is anything that a change without `keep` would replace."""
-
-    @classmethod
-    @abstractmethod
-    def problems_of(cls, place: Place) -> tuple[Problem, ...]:
-        """All damage of what is there. Raises NotADatabase or DatabaseVersion if it is no database."""
-
-    @abstractmethod
-    def _renew(self) -> None:
-        """See the database as it is now."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Close the file or connection."""
+        self._labelled: dict[str, str] = {}
 
     # --- what is in it --------------------------------------------------------------------------------
 
@@ -96,6 +52,10 @@ class SubmapDatabase(ABC):
 
     def __exit__(self, *_: Any) -> None:
         self.close()
+
+    def close(self) -> None:
+        """Close the file or connection."""
+        self._rows.close()
 
     def __repr__(self) -> str:
         # Without its sessions: the database may be closed, damaged, or on a server that is away.
@@ -128,6 +88,10 @@ class SubmapDatabase(ABC):
         marks = ", ".join("?" * len(names)) or "NULL"
         return tuple(map(self._rows.info, self._known(f"name IN ({marks})", *names)))
 
+    def session(self, name: str) -> SessionInfo:
+        """The session of a name. Raises DatabaseError if there is none."""
+        return self._rows.info(self._row(name))
+
     def config(self) -> Config:
         """The configuration of the first session, whose signature and partition settings all sessions share.
 
@@ -146,7 +110,7 @@ class SubmapDatabase(ABC):
             if not len(part):
                 continue
             with explained(self.location, f"submaps of session {row.name!r}"):
-                validation.check_bins(part.boundary.shape[1], part.freespace.shape[1], config)
+                validation.check_bins(part, config)
             columns = {field.name: getattr(part, field.name) for field in fields(SubmapArrays)}
             tables.append(SignatureTable(session_index=np.full(len(part), index, np.int32), **columns))
         if session is not None and not tables:
@@ -155,18 +119,15 @@ class SubmapDatabase(ABC):
 
     def grid(self, session: str) -> OccupancyGrid:
         """Whole occupancy grid of a session."""
-        grid: OccupancyGrid = self._parts(session, "grid")["grid"]
-        return grid
+        return cast("OccupancyGrid", self._parts(session, "grid")["grid"])
 
     def trajectory(self, session: str) -> Trajectory:
         """Poses of the base in the session's map frame; empty for an imported map."""
-        trajectory: Trajectory = self._parts(session, "trajectory")["trajectory"]
-        return trajectory
+        return cast("Trajectory", self._parts(session, "trajectory")["trajectory"])
 
     def loops(self, session: str) -> tuple[Loop, ...]:
         """The loops of a session; their `older` and `newer` are indices of poses of its trajectory."""
-        loops: tuple[Loop, ...] = self._parts(session, "loops")["loops"]
-        return loops
+        return cast("tuple[Loop, ...]", self._parts(session, "loops")["loops"])
 
     def graph(self, session: str) -> nx.Graph:
         """The junction graph of a session's free space (`pc2grid.submaps.junction_graph`)."""
@@ -174,18 +135,15 @@ class SubmapDatabase(ABC):
 
     def points(self, session: str) -> PointMap | None:
         """The points of a session in space; None if none were stored."""
-        points: PointMap | None = self._parts(session, "points")["points"]
-        return points
+        return cast("PointMap | None", self._parts(session, "points")["points"])
 
     def seen_places(self, session: str) -> SeenPlaces:
         """What is seen from the centre of each submap of a session, by id."""
-        seen: SeenPlaces = self._parts(session, "seen")["seen"]
-        return seen
+        return cast("SeenPlaces", self._parts(session, "seen")["seen"])
 
     def frame(self, session: str) -> BuildingFrame | None:
         """Where a session lies in the frame of its building; None if it was not joined with another one."""
-        frame: BuildingFrame | None = self._parts(session, "frame")["frame"]
-        return frame
+        return cast("BuildingFrame | None", self._parts(session, "frame")["frame"])
 
     def frames(self) -> dict[str, BuildingFrame]:
         """The same of all sessions that were joined, by name."""
@@ -235,28 +193,38 @@ class SubmapDatabase(ABC):
             raise DatabaseError(f"{self.location}: opened for reading only")
         session = stored_session((session_map, signatures, provenance))
         try:
-            self.change(self._place, lambda rows: rows.store([session], overwrite=overwrite))
+            self._rows.change(self._rows.source, lambda rows: rows.store([session], overwrite=overwrite))
         finally:
-            self._renew()
+            self._rows.renew()
 
     def check(self) -> tuple[Problem, ...]:
-        """All damage; empty if there is none."""
-        return self.problems_of(self._place)
+        """All damage of what is there now; empty if there is none."""
+        problems: list[Problem] = []
+        with SubmapDatabase(self._rows.open(self._rows.source, damaged=True)) as whole:
+            try:
+                problems += whole._rows.damaged_structure()
+                for row in whole._rows.sessions():
+                    problems += whole._rows.problems(row)
+                problems += whole._rows.orphans()
+            except DatabaseDamage as error:
+                problems.append(error.problem)
+        return tuple(dict.fromkeys(problems))
 
     def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
-        """From now on, know only the sessions of this building and floor; None: any.
+        """From now on, know only the sessions of this building and floor; None: any, "": not labelled.
 
         Raises DatabaseError if there are none.
         """
-        labels, others = [], set()
-        for row in self._known():
-            with contextlib.suppress(DatabaseCorrupt):  # it stays, so that leave_out_damaged() reports it
-                label = self._rows.info(row).provenance.label
-                labels.append(label)
-                others |= set() if label.fits(building, floor) else {row.id}
-        if len(others) == len(labels):
-            raise none_there(self.location, building, floor, labels)
-        self._left_out |= others
+        wanted = {"building": building, "floor": floor}
+        self._labelled = {column: word for column, word in wanted.items() if word is not None}
+        if next(self._known(), None) is None:
+            self._labelled = {}
+            found = self._rows.select("SELECT DISTINCT building, floor FROM session ORDER BY 1, 2 LIMIT 20")
+            labels = "; ".join(str(Label(building=b or None, floor=f or None)) for b, f in found)
+            raise DatabaseError(
+                f"{self.location}: no session of {Label(building=building, floor=floor)}",
+                hint=f"there are: {labels or 'no session'}",
+            )
 
     def leave_out_damaged(self) -> tuple[Problem, ...]:
         """From now on, leave out the sessions that cannot be searched because they are damaged.
@@ -278,20 +246,12 @@ class SubmapDatabase(ABC):
 
     # --- rows and parts -------------------------------------------------------------------------------
 
-    def _damaged_rows(self) -> Iterator[Problem]:
-        """What is wrong with the rows of all sessions."""
-        for row in self._all():
-            yield from self._rows.problems(row)
-        yield from self._rows.orphans()
-
-    def _all(self, condition: str = "true", *values: Any) -> Iterator[SessionRow]:
-        """The rows of all sessions."""
-        return self._rows.sessions(condition, *values)
-
     def _known(self, condition: str = "true", *values: Any) -> Iterator[SessionRow]:
-        """The rows of the sessions that are known."""
+        """The rows of the sessions that are known. A fleet has too many to look at those of all buildings."""
+        for column, word in self._labelled.items():
+            condition, values = f"{condition} AND {column} = ?", (*values, word)
         with contextlib.suppress(*[DatabaseCorrupt] if self._damaged else []):
-            for row in self._all(condition, *values):
+            for row in self._rows.sessions(condition, *values):
                 unreadable = self._damaged and next(self._rows.problems(row, ()), None) is not None
                 if row.id not in self._left_out and not unreadable:
                     yield row

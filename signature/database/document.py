@@ -7,7 +7,7 @@ values and back, by the types of their fields. A field of one of its types is st
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Optional, get_type_hints
 
@@ -17,9 +17,8 @@ from pydantic import ConfigDict, TypeAdapter
 from pc2grid.arrays import F32, F64, freeze
 from pc2grid.errors import DatabaseError
 from pc2grid.model import Loop, OccupancyGrid, PointMap, Trajectory
-from pc2grid.submaps.junction_graph import GraphArrays, graph_from_arrays, graph_to_arrays, junction_graph
+from pc2grid.submaps.junction_graph import GraphArrays, graph_to_arrays, junction_graph
 from pc2grid.submaps.partition import divide
-from signature.database import validation
 from signature.database.arrays import clean, pack, to_json, unpack
 from signature.database.protocol import BuildingFrame, Entry, SessionInfo
 from signature.describe import describe
@@ -126,7 +125,7 @@ def stored_session(entry: Entry) -> StoredSession:
     session_map, signatures, provenance = entry
     grid, config, graph = session_map.grid, provenance.config, session_map.graph
     submaps = SubmapArrays.of(session_map.submaps, signatures, config)
-    session = StoredSession(
+    return StoredSession(
         info=SessionInfo(
             name=stored_name(session_map.session),
             sensor=session_map.sensor,
@@ -151,8 +150,6 @@ def stored_session(entry: Entry) -> StoredSession:
         submaps=submaps,
         seen=seen_from(submaps, grid, config),
     )
-    _check_submaps(submaps, session.info, grid)
-    return session
 
 
 def completed(parts: Mapping[str, Any]) -> StoredSession:
@@ -215,66 +212,10 @@ def encode(part: str, value: Any) -> bytes:
     return pack(content, arrays, compress=part not in _UNCOMPRESSED)
 
 
-def decode(part: str, data: bytes, others: Mapping[str, Any]) -> Any:
-    """The inverse of `encode`. Raises ValueError for implausible content, and others for damaged content.
-
-    others : the parts that it is compared with: always the info, and the grid if that is known.
-    """
+def decode(part: str, data: bytes) -> Any:
+    """The inverse of `encode`. Raises ValueError and others for damaged content."""
     content, arrays = unpack(data)
     value = _ADAPTERS[part].validate_python({**content, **arrays} if isinstance(content, dict) else content)
     if value is None and part not in ("points", "frame"):
         raise ValueError("is not there")
-    if part in _CHECKS:
-        _CHECKS[part](value, others["info"], others.get("grid"))
     return value
-
-
-def _check_grid(grid: OccupancyGrid, info: SessionInfo, _: object) -> None:
-    validation.check_grid(grid)
-    if grid.resolution_m != info.resolution_m:
-        raise ValueError(f"resolution_m is {grid.resolution_m} where {info.resolution_m} was stored")
-
-
-def _check_trajectory(trajectory: Trajectory, info: SessionInfo, _: object) -> None:
-    validation.check_trajectory(trajectory)
-    _expect(len(trajectory), info.scans, "poses")
-
-
-def _check_points(points: PointMap | None, info: SessionInfo, _: object) -> None:
-    validation.check_points(points)
-    _expect(0 if points is None else len(points), info.points, "points")
-
-
-def _check_graph(graph: GraphArrays, _: SessionInfo, grid: OccupancyGrid | None) -> None:
-    graph_from_arrays(graph)
-    if grid is not None:
-        validation.check_on_map(graph.center_m, grid, "node")
-
-
-def _check_submaps(submaps: SubmapArrays, info: SessionInfo, grid: OccupancyGrid | None) -> None:
-    _expect(len(submaps), info.submaps, "submaps")
-    validation.check_ids(submaps.submap_id)
-    if grid is not None:
-        validation.check_on_map(submaps.center_m, grid, "submap")
-    if len(submaps):
-        bins = submaps.boundary.shape[1], submaps.freespace.shape[1]
-        validation.check_bins(*bins, info.provenance.config)
-    for name in ("boundary", "freespace"):
-        validation.check_histograms(getattr(submaps, name), name)
-
-
-def _expect(found: int, stored: int, what: str) -> None:
-    if found != stored:
-        raise ValueError(f"{found} {what} where {stored} were stored")
-
-
-_CHECKS: dict[str, Callable[[Any, SessionInfo, OccupancyGrid | None], None]] = {
-    "grid": _check_grid,
-    "trajectory": _check_trajectory,
-    "loops": lambda loops, info, grid: validation.check_loops(loops, info.scans),
-    "graph": _check_graph,
-    "points": _check_points,
-    "submaps": _check_submaps,
-    "seen": lambda seen, info, grid: validation.check_seen(seen, info.submaps),
-}
-"""What must be true of a part, beside the types of its fields."""

@@ -8,16 +8,12 @@ from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
 from pc2grid.io.containers.detect import first_bytes, is_submap_database
-from pc2grid.model import is_part_of, part_name
-from signature.database import engine_of, open_database, refuse_existing
+from signature.database import SubmapDatabase, engine_of, open_database, refuse_existing
 from signature.database.arrays import DatabaseDamage, clean
 from signature.database.document import StoredSession, stored_session
 from signature.database.postgres.server import is_url, location
 from signature.database.protocol import BuildingFrame, Entry, Place, Problem, SessionInfo
-from signature.database.rows import Rows, no_session, refuse_other_settings
-
-_MOST_PARTS = 100
-"""Parts of one recording that are looked for; a recording of 1.9 km without loops falls into 9."""
+from signature.database.rows import Rows, refuse_other_settings
 
 
 def store(target: Place, entries: Iterable[Entry], *, keep: bool, overwrite: bool = False) -> None:
@@ -30,26 +26,13 @@ def store(target: Place, entries: Iterable[Entry], *, keep: bool, overwrite: boo
 
     Raises as `SubmapDatabase.add`.
     """
-    names = [clean(session_map.session) for session_map, _, _ in entries] if keep and overwrite else []
-    drop = _other_parts(target, names) if names and exists(target) else []
+    names = [clean(session_map.session) for session_map, _, _ in entries] if overwrite else []
 
     def write(rows: Rows) -> None:
-        rows.remove([name for name in drop if rows.find(name) is not None])
+        rows.remove([part for name in names for part in rows.other_parts(name)])
         rows.store(map(stored_session, entries), overwrite=overwrite)
 
     engine_of(target).change(target, write, keep=keep, create=True)
-
-
-def _other_parts(target: Place, names: Collection[str]) -> list[str]:
-    """The stored sessions that are other parts of the recordings which these sessions were made from."""
-    with open_database(target) as database:
-        parts = [part_name(name, k) for name in names for k in range(_MOST_PARTS)]
-        known = {info.name: info.provenance.digest for info in database.sessions(parts)}
-    return [
-        part
-        for part, digest in known.items()
-        if any(is_part_of(part, name) and digest == known.get(name) for name in names)
-    ]
 
 
 def remove(target: Place, names: Sequence[str]) -> None:
@@ -103,7 +86,8 @@ def check(source: Place) -> tuple[Problem, ...]:
 
     Raises NotADatabase or DatabaseVersion if `source` is no database of the format that this version reads.
     """
-    return engine_of(source).problems_of(source)
+    with SubmapDatabase(engine_of(source).open(source, damaged=True)) as database:
+        return database.check()
 
 
 def copy(
@@ -159,16 +143,13 @@ def split(source: Place, names: Sequence[str], target: Place, *, overwrite: bool
     refuse_existing(target, overwrite)
     _refuse_repeated([source, target])
     with open_database(source) as database:
-        known = [info.name for info in database.sessions(names)]
-        for name in names:
-            if name not in known:
-                raise no_session(name, (i.name for i in database.sessions()), shown(source))
+        known = [database.session(name).name for name in dict.fromkeys(names)]
     _write(target, [(source, known)])
     return len(known)
 
 
 def _write(
-    target: Place, sources: Sequence[tuple[Place, Sequence[str] | None]], *, recover: bool = False
+    target: Place, sources: Sequence[tuple[Place, Collection[str] | None]], *, recover: bool = False
 ) -> None:
     """Write sessions of databases, all or none, as the whole content of one.
 
@@ -178,7 +159,7 @@ def _write(
 
     def sessions() -> Iterator[StoredSession]:
         for source, names in sources:
-            with engine_of(source).open(source, damaged=recover) as database:
+            with SubmapDatabase(engine_of(source).open(source, damaged=recover), damaged=recover) as database:
                 for info in database.sessions(names):
                     with contextlib.suppress(*([DatabaseCorrupt] if recover else [])):
                         yield database.stored(info.name, recover=recover)

@@ -45,10 +45,6 @@ class Label:
     def __str__(self) -> str:
         return ", ".join(word for word in (self.building, self.floor) if word) or "no label"
 
-    def fits(self, building: str | None, floor: str | None) -> bool:
-        """Whether it is this building and floor; None: any, "": those that were not given."""
-        return building in (None, self.building or "") and floor in (None, self.floor or "")
-
     def contradicts(self, other: Label) -> bool:
         """Whether the two name different buildings, or different floors; None differs from nothing."""
         pairs = ((self.building, other.building), (self.floor, other.floor))
@@ -181,17 +177,13 @@ class SessionInfo:
         return self.report.lossy
 
 
-def refused_version(location: object, version: int) -> DatabaseError:
-    """The error for a database of another format."""
-    if version < FORMAT:
-        return DatabaseVersion(
-            f"{location}: of an older format, which this pc2grid does not read",
-            hint="convert the recordings again, with `pc2grid convert`",
+def refuse_other_format(location: object, version: int) -> None:
+    """Raises DatabaseVersion for a database of another format."""
+    if version != FORMAT:
+        raise DatabaseVersion(
+            f"{location}: database format {version}; this pc2grid reads format {FORMAT}",
+            hint="use a newer pc2grid" if version > FORMAT else "convert the recordings again",
         )
-    return DatabaseVersion(
-        f"{location}: database format {version}; this pc2grid reads format {FORMAT}",
-        hint="use a newer pc2grid",
-    )
 
 
 def no_utf8(location: str) -> DatabaseError:
@@ -199,13 +191,6 @@ def no_utf8(location: str) -> DatabaseError:
     return DatabaseError(
         f"{location}: holds UTF-8 only, and a name is none", hint="rename the recording, or use --name"
     )
-
-
-def none_there(where: str, building: str | None, floor: str | None, labels: Sequence[Label]) -> DatabaseError:
-    """The error for a building or floor that no session of a database has."""
-    wanted = Label(building=building, floor=floor)
-    there = "; ".join(sorted({str(label) for label in labels})[:20]) or "no session"
-    return DatabaseError(f"{where}: no session of {wanted}", hint=f"there are: {there}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -220,10 +205,6 @@ FORMAT = 1
 """The format that is written and read."""
 APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
 """Marks a file, and the lock of a server, as pc2grid's."""
-OLDER_ID = int.from_bytes(b"pc2g", "big")
-"""Marks files that were written before the first format was fixed."""
-OLDER_TABLE = "array"
-"""A table that only databases of older formats have."""
 BUSY_TIMEOUT_S = 30.0
 """How long a writer waits for another one; chosen by hand."""
 Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pydantic import ValidationError
 
 from pc2grid.errors import DatabaseError, DatabaseVersion
-from signature.database import document
+from pc2grid.model import is_part_of
+from signature.database import document, validation
 from signature.database.arrays import DatabaseDamage, explained, row_crc
 from signature.database.document import PARTS, StoredSession
-from signature.database.protocol import BuildingFrame, Problem, SessionInfo
+from signature.database.protocol import BuildingFrame, Place, Problem, SessionInfo
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
 
 SESSION_COLUMNS = ("building", "id", "floor", "name", "document")
 PART_COLUMNS = ("building", "session_id", "name", "data")
@@ -58,14 +62,44 @@ class SessionRow(NamedTuple):
 
 
 class Rows(ABC):
-    """The rows of a database through one connection."""
+    """The rows of a database through one connection.
+
+    source : its path or URL. location : the same for messages, never with a password.
+    """
 
     for_update = ""
     """Ends a query whose rows nobody else may change until the transaction ends."""
 
-    def __init__(self, location: str) -> None:
-        """location : path or URL, for messages; never with a password."""
-        self.location = location
+    def __init__(self, source: Place, location: str, connection: Any) -> None:
+        self.source, self.location, self.connection = source, location, connection
+
+    # --- what an engine does in its own way -----------------------------------------------------------
+
+    @classmethod
+    @abstractmethod
+    def open(cls, place: Place, *, damaged: bool = False) -> Self:
+        """The rows of what is there, to be read. damaged : in whatever state it is.
+
+        Raises NotADatabase, DatabaseVersion, DatabaseCorrupt, DatabaseUnreachable.
+        """
+
+    @classmethod
+    @abstractmethod
+    def change(
+        cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
+    ) -> None:
+        """Change a database in one transaction, all or nothing.
+
+        action : may be called again if another writer comes in between. keep : start from what is there;
+        otherwise from nothing. create : make the database if there is none.
+
+        Raises what `action` raises, as `open`, OutputError if it cannot be written, and DatabaseBusy.
+        """
+
+    @classmethod
+    @abstractmethod
+    def exists(cls, place: Place) -> bool:
+        """Whether there is anything that a change without `keep` would replace."""
 
     @abstractmethod
     def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
@@ -79,12 +113,33 @@ class Rows(ABC):
     def new_id(self) -> int:
         """A number for a further session, larger than all others."""
 
+    @abstractmethod
+    def renew(self) -> None:
+        """See the database as it is now."""
+
+    def close(self) -> None:
+        """Close the file or connection."""
+        self.connection.close()
+
+    def damaged_structure(self) -> Iterator[Problem]:
+        """What is wrong with the database itself."""
+        return iter(())
+
     # --- reading --------------------------------------------------------------------------------------
 
     def sessions(self, condition: str = "true", *values: Any, tail: str = "") -> Iterator[SessionRow]:
-        """Rows of sessions in the order they were added. tail : what follows that in the statement."""
-        for *row, crc in self.select(f"{_SESSIONS} WHERE {condition} ORDER BY id{tail}", *values):
-            yield SessionRow._make((*row, row_crc(row) == crc))
+        """Rows of sessions in the order they were added. tail : what follows that in the statement.
+
+        Raises DatabaseCorrupt where the order ends: a page of a file that refers back to earlier pages gives
+        the same rows again and again, more than memory holds.
+        """
+        last = None
+        for *values_, crc in self.select(f"{_SESSIONS} WHERE {condition} ORDER BY id{tail}", *values):
+            row = SessionRow._make((*values_, row_crc(values_) == crc))
+            if last is not None and row.id <= last:
+                raise DatabaseDamage(self.location, f"session {row.id}", "comes twice")
+            last = row.id
+            yield row
 
     def info(self, row: SessionRow) -> SessionInfo:
         """What the row of a session says.
@@ -119,7 +174,9 @@ class Rows(ABC):
             *values, crc = found
             if row_crc(values) != crc:
                 raise ValueError("wrong checksum")
-            return document.decode(part, values[-1], others)
+            value = document.decode(part, values[-1])
+            validation.check(part, value, others)
+            return value
 
     def problems(self, row: SessionRow, parts: Sequence[str] = PARTS) -> Iterator[Problem]:
         """What is wrong with a session and these parts of it."""
@@ -161,6 +218,7 @@ class Rows(ABC):
         compared with those of the other sessions.
         """
         for session in sessions:
+            validation.check("submaps", session.submaps, {"info": session.info, "grid": session.grid})
             text = document.encode_info(session.info)
             info = document.decode_info(text)
             other = self.other(info)
@@ -183,7 +241,16 @@ class Rows(ABC):
                 data = document.encode(part, getattr(session, part))
                 self._insert("part", PART_COLUMNS, (building, number, part, data))
 
-    def remove(self, names: Sequence[str]) -> None:
+    def other_parts(self, name: str) -> list[str]:
+        """The further sessions of the recording that a session was made from, which fell into parts."""
+        first = self.find(name)
+        if first is None:
+            return []
+        digest = self.info(first).digest
+        rows = self.sessions("substr(name, 1, ?) = ?", len(name) + 1, f"{name}#")
+        return [row.name for row in rows if is_part_of(row.name, name) and self.info(row).digest == digest]
+
+    def remove(self, names: Iterable[str]) -> None:
         """Remove sessions. Raises DatabaseError for a name that no session has."""
         for row in [self._found(name) for name in dict.fromkeys(names)]:
             self.delete(row)

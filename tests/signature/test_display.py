@@ -94,4 +94,4 @@ def test_signatures_and_databases_are_one_short_line(tmp_path: Path) -> None:
             assert "\n" not in text
     assert repr(table) == f"SignatureTable({len(table)} submaps of 2 sessions)"
     assert "monday" in page and "&lt;b&gt;" in page and "building.submaps" in page
-    assert "SqliteDatabase(" in repr(database), "also when it is closed"
+    assert "SubmapDatabase(" in repr(database), "also when it is closed"

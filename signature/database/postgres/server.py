@@ -21,14 +21,7 @@ from pc2grid.errors import (
     OutputError,
     Pc2GridError,
 )
-from signature.database.protocol import (
-    APPLICATION_ID,
-    BUSY_TIMEOUT_S,
-    FORMAT,
-    OLDER_TABLE,
-    no_utf8,
-    refused_version,
-)
+from signature.database.protocol import APPLICATION_ID, BUSY_TIMEOUT_S, FORMAT, no_utf8, refuse_other_format
 from signature.database.rows import definitions
 
 if TYPE_CHECKING:
@@ -118,13 +111,7 @@ def inspect(connection: Connection[Any], where: str) -> None:
         found = connection.execute("SELECT format FROM pc2grid.about").fetchall()
         if len(found) != 1:
             raise DatabaseCorrupt(f"{where}: damaged: pc2grid.about has {len(found)} rows instead of one")
-        version = int(found[0][0])
-        if _has(connection, f"pc2grid.{OLDER_TABLE}"):
-            raise refused_version(where, 0)
-        if version < 1:
-            raise DatabaseCorrupt(f"{where}: damaged: database format {version} never existed")
-        if version != FORMAT:
-            raise refused_version(where, version)
+        refuse_other_format(where, int(found[0][0]))
 
 
 def initialise(connection: Connection[Any], where: str) -> None:
@@ -146,11 +133,7 @@ def initialise(connection: Connection[Any], where: str) -> None:
 
 
 def _exists(connection: Connection[Any]) -> bool:
-    return _has(connection, "pc2grid.about")
-
-
-def _has(connection: Connection[Any], table: str) -> bool:
-    row = connection.execute("SELECT to_regclass(%s) IS NOT NULL", [table]).fetchone()
+    row = connection.execute("SELECT to_regclass('pc2grid.about') IS NOT NULL").fetchone()
     return bool(row and row[0])
 
 

@@ -23,12 +23,8 @@ from pc2grid.io.atomic import is_at, replace_file
 from signature.database.arrays import DatabaseDamage
 from signature.database.protocol import BUSY_TIMEOUT_S
 from signature.database.sqlite import schema
-from signature.database.sqlite.connection import BoundedConnection
 
 _POLL_S = 0.05
-# SQLite's primary result codes (https://www.sqlite.org/rescode.html) for a medium that does not take writes.
-_READONLY, _IOERR, _FULL, _CANTOPEN = 8, 10, 13, 14
-_CANNOT_WRITE = {_READONLY: "readonly", _IOERR: "disk I/O", _FULL: "is full", _CANTOPEN: "unable to open"}
 
 
 @contextlib.contextmanager
@@ -47,41 +43,31 @@ def rewrite(path: Path, *, keep: bool) -> Iterator[sqlite3.Connection]:
         if kept:
             schema.inspect_header(target)
             shutil.copyfile(target, copy)
-        connection = sqlite3.connect(copy, isolation_level=None, factory=BoundedConnection)
-        try:
+        with contextlib.closing(sqlite3.connect(copy, isolation_level=None)) as connection, _explained(path):
+            if kept:
+                schema.inspect_tables(connection, path)
             # Journal and fsync are off: the temporary copy is renamed only when it is complete.
             connection.execute("PRAGMA journal_mode = OFF")
             connection.execute("PRAGMA synchronous = OFF")
             connection.execute("PRAGMA trusted_schema = OFF")
-            if kept:
-                schema.inspect_tables(connection, path)
-            else:
+            if not kept:
                 schema.initialise(connection)
             connection.execute("BEGIN")
             yield connection
             connection.execute("COMMIT")
-        except schema.DAMAGE as error:
-            raise _explained(error, path, kept) from error
-        finally:
-            connection.close()
 
 
-def _explained(error: Exception, path: Path, kept: bool) -> Exception:
-    """An error of SQLite as one of our own: about the medium, or about the content that was to be kept."""
-    if isinstance(error, sqlite3.OperationalError) and (not kept or _cannot_write(error)):
-        return OutputError(f"{path}: cannot write: {error}", hint="free some space, or write to another disk")
-    if kept:
-        return DatabaseDamage(path, "file", str(error))
-    return error  # what this process wrote itself is not damaged: an error of the program
-
-
-def _cannot_write(error: sqlite3.OperationalError) -> bool:
-    """Whether the medium refused to be written to."""
-    code = getattr(error, "sqlite_errorcode", None)
-    if code is not None:
-        return code & 0xFF in _CANNOT_WRITE
-    # Python 3.10 has no error codes: recognise SQLite's fixed messages.
-    return any(words in str(error) for words in _CANNOT_WRITE.values())
+@contextlib.contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Turn errors of SQLite into our own: about the medium, or about the content that was to be kept."""
+    try:
+        yield
+    except sqlite3.OperationalError as error:
+        raise OutputError(
+            f"{path}: cannot write: {error}", hint="free some space, or write to another disk"
+        ) from error
+    except schema.DAMAGE as error:
+        raise DatabaseDamage(path, "file", str(error)) from error
 
 
 @contextlib.contextmanager

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, NotADatabase
 from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
-from signature.database.arrays import SALVAGE
-from signature.database.protocol import APPLICATION_ID, FORMAT, OLDER_ID, OLDER_TABLE, refused_version
+from signature.database.arrays import SALVAGE, DatabaseDamage
+from signature.database.protocol import APPLICATION_ID, FORMAT, refuse_other_format
 from signature.database.rows import definitions
 
 _CONVERTED = (".mcap", ".bag", ".db3", ".yaml", ".yml", ".pcd", ".ply", ".obj", ".stl")
@@ -75,35 +75,31 @@ def _header(path: Path) -> tuple[bytes, int]:
 
 
 def _check_format(path: Path, application_id: int, version: int) -> None:
-    """Raises NotADatabase, DatabaseVersion or DatabaseCorrupt unless both are those of this format."""
-    if application_id == OLDER_ID:
-        raise refused_version(path, 0)
+    """Raises NotADatabase or DatabaseVersion unless both are those of this format."""
     if application_id != APPLICATION_ID:
         raise NotADatabase(
             f"{path}: not a pc2grid database, but another program's SQLite file (application id"
             f" {application_id:#x})",
             hint=CONVERT,
         )
-    if version < 1:
-        raise DatabaseCorrupt(f"{path}: database format {version} never existed", hint=SALVAGE)
-    if version != FORMAT:
-        raise refused_version(path, version)
+    refuse_other_format(path, version)
 
 
 def inspect_tables(connection: sqlite3.Connection, path: Path) -> None:
     """Compare the tables with those of the format: no views or triggers of others, no damage.
 
-    Raises DatabaseVersion, DatabaseCorrupt.
+    Raises DatabaseCorrupt.
     """
-    found = {
-        str(name): str(sql)
-        for name, sql in connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL")
-    }
-    if OLDER_TABLE in found:
-        raise refused_version(path, 0)
+    try:
+        found = {
+            str(name): str(sql)
+            for name, sql in connection.execute("SELECT name, sql FROM sqlite_master WHERE sql IS NOT NULL")
+        }
+    except DAMAGE as error:
+        raise DatabaseDamage(path, "file", f"{type(error).__name__}: {error}") from error
     if found != TABLES:
         odd = sorted(name for name in found.keys() | TABLES if found.get(name) != TABLES.get(name))
         raise DatabaseCorrupt(
             f"{path}: its tables are not those of format {FORMAT} ({', '.join(map(repr, odd))})",
-            hint=SALVAGE,
+            hint=f"convert the recordings again, with `pc2grid convert`; {SALVAGE}",
         )

@@ -9,7 +9,6 @@ import pytest
 
 from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from signature.database import maintenance, open_database
-from signature.database.sqlite.database import SqliteRows
 from tests.helpers.databases import MONDAY, TUESDAY, assert_holds, everything, make_entry
 
 
@@ -67,6 +66,8 @@ def test_what_is_refused_changes_nothing(place: str | Path, tmp_path: Path) -> N
         maintenance.rename(place, "monday", "tuesday")
     with pytest.raises(DatabaseError, match="the name of a session is empty"):
         maintenance.rename(place, "monday", " ")
+    with pytest.raises(DatabaseError, match="named twice"):
+        maintenance.split(place, ["monday"], place, overwrite=True)
     for act in (
         lambda: maintenance.rename(place, "friday", "sunday"),
         lambda: maintenance.remove(place, ["monday", "friday"]),
@@ -77,24 +78,6 @@ def test_what_is_refused_changes_nothing(place: str | Path, tmp_path: Path) -> N
         assert caught.value.hint == "there are: 'monday', 'tuesday'"
     assert everything(place) == before
     assert not (tmp_path / "no.submaps").exists()
-
-
-def test_a_file_is_changed_as_a_whole_or_not_at_all(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before = path.read_bytes()
-    with pytest.raises(DatabaseError, match="named twice"):
-        maintenance.split(path, ["monday"], path, overwrite=True)
-
-    def killed(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(SqliteRows, "execute", killed)
-    for act in (
-        lambda: maintenance.rename(path, "monday", "friday"),
-        lambda: maintenance.remove(path, ["monday"]),
-    ):
-        with pytest.raises(KeyboardInterrupt):
-            act()
-    assert [(file.name, file.read_bytes()) for file in path.parent.iterdir()] == [(path.name, before)]
 
 
 def test_what_is_no_database_is_not_changed(tmp_path: Path) -> None:

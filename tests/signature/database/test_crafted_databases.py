@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -164,7 +165,8 @@ def test_rounding_is_no_lie() -> None:
     turned = np.tile(np.eye(4), (3, 1, 1))
     turned[0, :3, :3] = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     turned[0, :3, :3] *= np.sign(np.linalg.det(turned[0, :3, :3])) * (1 + 1e-6)
-    validation.check_trajectory(Trajectory(stamps_ns=np.array([5, 5, 6]), T_session_base=turned))
+    three: Any = SimpleNamespace(scans=3)
+    validation.check_trajectory(Trajectory(stamps_ns=np.array([5, 5, 6]), T_session_base=turned), three)
     histograms = rng.dirichlet(np.ones(80), 1000).astype(np.float32)
     histograms[7] = 0
     validation.check_histograms(histograms, "boundary")

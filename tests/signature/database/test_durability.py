@@ -68,7 +68,7 @@ SERVER.set_forkserver_preload(
         "pc2grid.io.containers.mcap",
         "signature.sessions",
         "signature.describe",
-        "signature.database.sqlite.database",
+        "signature.database.sqlite.rows",
         "signature.database.maintenance",
         "pydantic",
         "kiss_icp.kiss_icp",
@@ -563,7 +563,7 @@ def test_symbolic_link_is_followed(tmp_path: Path) -> None:
     [
         ("drive.mcap", "made from the same input with the same settings"),
         ("drive.mcap --set partition.radius_m=3.5", "made with partition.radius_m = 5.0, not 3.5"),
-        ("drive.mcap --start 0.5", "another part of the recording"),
+        ("drive.mcap --start 0.5", "made with start = 0.0, not 0.5"),
         ("house.yaml", "holds 'drive' instead of 'house'"),
         ("house.yaml --name drive", "made from a file 'drive.mcap' with other content"),
     ],

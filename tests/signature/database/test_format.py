@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import sqlite3
 from pathlib import Path
 from typing import Any
 
@@ -104,19 +103,3 @@ def test_settings_of_the_future_are_refused_by_name_and_left_alone(tmp_path: Pat
     assert path.read_bytes() == before
     (problem,) = check(path)
     assert "partition.fractal" in problem.what
-
-
-@pytest.mark.fault(44)
-def test_the_format_of_before_is_refused_with_what_to_do(tmp_path: Path) -> None:
-    """It had the number 1 too, and an array a row."""
-    path = tmp_path / "x.submaps"
-    store(path, [make_entry("monday", 0)], keep=False)
-    with sqlite3.connect(path) as connection:
-        connection.execute('ALTER TABLE part RENAME TO "array"')
-    connection.close()
-    before = path.read_bytes()
-    for use in (open_database, check, lambda file: store(file, [make_entry()], keep=True)):
-        with pytest.raises(DatabaseVersion, match="of an older format") as caught:
-            use(path)
-        assert "pc2grid convert" in str(caught.value)
-    assert path.read_bytes() == before

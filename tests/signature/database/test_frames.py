@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from pc2grid.errors import DatabaseCorrupt, DatabaseError, OutputError
+from pc2grid.errors import DatabaseCorrupt, DatabaseError
 from pc2grid.geometry import SE2
 from signature.database import maintenance, open_database
 from signature.database.protocol import BuildingFrame
-from signature.database.sqlite.database import SqliteRows
 from tests.helpers.databases import MONDAY, TUESDAY, assert_holds, make_entry, sql
 
 HERE = BuildingFrame(name="monday", T_building_session=SE2(), covariance=((0.0,) * 3,) * 3)  # type: ignore[arg-type]
@@ -74,21 +72,6 @@ def test_a_name_that_is_not_there_changes_nothing(joined: str | Path) -> None:
     with pytest.raises(DatabaseError, match="no session 'friday'"):
         maintenance.place(joined, {"monday": THERE, "friday": HERE})
     assert frames(joined) == FRAMES
-
-
-def test_a_writer_that_fails_leaves_what_was_there(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    before, execute, calls = path.read_bytes(), SqliteRows.execute, list[str]()
-
-    def fails_late(rows: SqliteRows, statement: str, *values: Any) -> None:
-        execute(rows, statement, *values)
-        calls.append(statement)
-        if len(calls) == 3:
-            raise OSError("no space left")
-
-    monkeypatch.setattr(SqliteRows, "execute", fails_late)
-    with pytest.raises(OutputError, match="no space"):
-        maintenance.place(path, FRAMES)
-    assert path.read_bytes() == before
 
 
 def test_damage_is_found_and_can_be_left_out(joined: str | Path, tmp_path: Path) -> None:

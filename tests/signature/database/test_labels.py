@@ -5,27 +5,19 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 from pc2grid.io.nav2_map import save_map
-from pc2grid.model import SessionMap, Trajectory
 from pc2grid_cli.main import app
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import Label, open_database
 from signature.localization.answering import locate_map
 from signature.localization.map_index import MapIndex
-from signature.sessions import add_session, provenance
 from tests.helpers.simulated_drives import plan
 
 ROOM = plan(6, 4, [(2, 0, 2, 2), (4, 2, 6, 2)])
-
-
-def room(name: str) -> SessionMap:
-    nowhere = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
-    return SessionMap(session=name, sensor="map", grid=ROOM, submaps=(), trajectory=nowhere)
 
 
 @pytest.mark.parametrize(
@@ -41,14 +33,6 @@ def room(name: str) -> SessionMap:
 )
 def test_what_was_not_said_contradicts_nothing(a: Label, b: Label, contradict: bool) -> None:
     assert a.contradicts(b) is b.contradicts(a) is contradict
-
-
-def test_labels_survive_the_database_and_reach_the_building(tmp_path: Path) -> None:
-    file, config = tmp_path / "d.submaps", Config()
-    for name, label in (("a", Label(building="hall", floor="2")), ("b", None)):
-        add_session(file, room(name), config, provenance(Path(name), "0" * 64, config, label=label))
-    with open_database(file) as database:
-        assert MapIndex.of(database, config).labels == (Label(building="hall", floor="2"), Label())
 
 
 def test_convert_takes_labels_and_relocalize_names_them(tmp_path: Path) -> None:
