@@ -24,6 +24,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from pc2grid.errors import LogNotFound, MapFileError, NotADatabase, OutputError
 from pc2grid.io import open_log
@@ -32,6 +33,7 @@ from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.io.trajectory import write_kitti, write_tum
 from pc2grid.model import Trajectory
 from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid_cli.main import app
 from signature.database import open_database
 from signature.database.maintenance import store
 from tests.helpers.databases import MONDAY, assert_holds, make_entry
@@ -569,14 +571,13 @@ def test_symbolic_link_is_followed(tmp_path: Path) -> None:
     ],
 )
 def test_another_run_onto_the_same_file_is_refused_with_the_difference(
-    inputs: Path, arguments: str, words: str
+    inputs: Path, arguments: str, words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before, folder = (inputs / "drive.submaps").read_bytes(), sorted(inputs.iterdir())
-    process = Convert(*arguments.split(), "-o", "drive.submaps", cwd=inputs)
-    code, said = process.wait(), process.said()
-    assert code == 1, said
-    assert said.startswith("pc2grid: error: drive.submaps: exists already")
-    assert words in said
-    assert "--force" in said.splitlines()[1]
+    monkeypatch.chdir(inputs)
+    error = CliRunner().invoke(app, ["convert", *arguments.split(), "-o", "drive.submaps"]).exception
+    assert isinstance(error, OutputError), error
+    assert error.message.startswith("drive.submaps: exists already") and words in error.message
+    assert error.hint is not None and "--force" in error.hint
     assert (inputs / "drive.submaps").read_bytes() == before
     assert sorted(inputs.iterdir()) == folder

@@ -9,8 +9,6 @@ import multiprocessing
 import os
 import sqlite3
 import struct
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -20,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from pc2grid.errors import (
     DatabaseBusy,
@@ -33,6 +32,7 @@ from pc2grid.errors import (
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import ReadReport, SessionMap, Trajectory
 from pc2grid.submaps.partition import divide
+from pc2grid_cli.main import app
 from signature.config import Config
 from signature.database import Label, Provenance, maintenance, open_database
 from signature.database.document import PARTS
@@ -49,19 +49,7 @@ from tests.helpers.databases import MONDAY, READ_PART, TUESDAY, assert_holds, ev
 from tests.helpers.memory import bounded_memory
 from tests.helpers.rooms import small_house
 
-ROOT = Path(__file__).resolve().parents[3]
 FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
-
-
-def pc2grid(*arguments: object, cwd: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *map(str, arguments)],
-        cwd=cwd, capture_output=True, text=True, timeout=120,
-        env={
-            **os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", "PC2GRID_CONFIG": "",
-            "PC2GRID_DEBUG": "", "OMP_NUM_THREADS": "1",
-        },
-    )  # fmt: skip
 
 
 def set_header(offset: int, value: int) -> Callable[[bytes], bytes]:
@@ -248,7 +236,9 @@ def test_a_wholly_damaged_database_is_refused(place: maintenance.Place) -> None:
 
 
 @pytest.mark.fault(43)
-def test_relocalize_leaves_a_damaged_session_out_with_a_warning(tmp_path: Path) -> None:
+def test_relocalize_leaves_a_damaged_session_out_with_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A map is looked for in a database of itself and of a damaged neighbour."""
     from signature.sessions import build_session
 
@@ -260,10 +250,11 @@ def test_relocalize_leaves_a_damaged_session_out_with_a_warning(tmp_path: Path) 
         add_session(database, session, config, provenance(yaml, origin.digest, config))
     flip(database, "submaps", 0.3, 5, session=1)
     damaged = database.read_bytes()
-    done = pc2grid("relocalize", "house.yaml", "--database", "x.submaps", "--json", cwd=tmp_path)
+    monkeypatch.chdir(tmp_path)
+    done = CliRunner().invoke(app, ["relocalize", "house.yaml", "--database", "x.submaps", "--json"])
     answer = json.loads(done.stdout)
     assert answer["status"] == "located", answer
-    assert done.returncode == 3, done.stderr
+    assert done.exit_code == 3, done.stderr
     assert answer["database"]["left_out"] == ["submaps of session 'cellar': wrong checksum"]
     assert (
         "warning: x.submaps: damaged and left out: submaps of session 'cellar': wrong checksum" in done.stderr
