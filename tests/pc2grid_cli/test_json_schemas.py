@@ -15,25 +15,20 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from pc2grid.io.nav2_map import save_map
 from pc2grid.settings import dump_settings
 from pc2grid_cli.console import print_result
 from pc2grid_cli.json_schemas import DOCUMENTS, schema
 from pc2grid_cli.main import app
 from signature.config import Config
 from tests.helpers.json_schema import closed, keys
-from tests.helpers.simulated_drives import cut, office
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """office.yaml with its database b.submaps, part.yaml of it, and a laser's metre in the office."""
-    folder = tmp_path_factory.mktemp("documents")
-    save_map(office(), folder / "office")
-    save_map(cut(office(), 4.0, 3.0, 15.0, 12.0), folder / "part")
-    laser = ("--sensor", "laser", "--length", "1.5", "--seed", "4", "--clutter", "0")
+def folder(office_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The office, with a laser's metre, databases of the whole and of a part, and one that is damaged."""
+    folder = shutil.copytree(office_folder, tmp_path_factory.mktemp("documents"), dirs_exist_ok=True)
+    laser = ("--sensor", "laser", "--length", "1.5", "--seed", "4", "--clutter", "0", "--force")
     for arguments in (
-        ("convert", folder / "office.yaml", "-o", folder / "b.submaps"),
         ("simulate", folder / "office.yaml", folder / "drive.mcap", *laser),
         ("convert", folder / "office.yaml", folder / "part.yaml", "-o", folder / "two.submaps"),
         ("convert", folder / "office.yaml", folder / "part.yaml", "-o", folder / "joined.submaps", "--join"),

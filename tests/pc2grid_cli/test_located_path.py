@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,6 @@ from typer.testing import CliRunner
 import pc2grid.pipeline
 import signature.files
 from pc2grid.geometry import SE2
-from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
@@ -26,13 +26,11 @@ DRIFT_RAD_PER_M = math.radians(1.0)
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """plan.submaps of the office, and drive.mcap of a laser that drives 14 m in it."""
-    folder = tmp_path_factory.mktemp("path")
-    save_map(office(), folder / "plan")
-    run("convert", folder / "plan.yaml", "-o", folder / "plan.submaps")
+def folder(office_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The office, and drive.mcap of a laser that drives 14 m in it."""
+    folder = shutil.copytree(office_folder, tmp_path_factory.mktemp("path"), dirs_exist_ok=True)
     config = SimulationConfig(length_m=14.0, seed=3, clutter=0)
-    simulate_session(folder / "drive.mcap", sensor="laser", grid=office(), config=config)
+    simulate_session(folder / "drive.mcap", sensor="laser", grid=office(), config=config, overwrite=True)
     return folder
 
 
@@ -64,7 +62,7 @@ def test_the_path_follows_where_the_robot_was_located(
 ) -> None:
     monkeypatch.setattr(signature.files, "follow", drifting)
     words = ("--trajectory", tmp_path / "found.tum", "--json")
-    document = json.loads(run("relocalize", folder / "drive.mcap", "-d", folder / "plan.submaps", *words))
+    document = json.loads(run("relocalize", folder / "drive.mcap", "-d", folder / "b.submaps", *words))
     truth, found = read_tum(folder / "drive.tum"), read_tum(tmp_path / "found.tum")
     np.testing.assert_array_equal(truth.stamps_ns, found.stamps_ns)
     errors_m = np.linalg.norm((truth.T_session_base - found.T_session_base)[:, :2, 3], axis=1)
@@ -84,7 +82,7 @@ def scans_and_config(folder: Path) -> tuple[Any, Any]:
 
 def test_a_recording_is_followed_as_a_robot_is(folder: Path) -> None:
     """What `watch` says on the way is the history of the answer of `relocalize`."""
-    words = (folder / "drive.mcap", "-d", folder / "plan.submaps", "--json")
+    words = (folder / "drive.mcap", "-d", folder / "b.submaps", "--json")
     said = [json.loads(line) for line in run("watch", *words, "--keep").splitlines()]
     history = json.loads(run("relocalize", *words))["history"]
     assert len(said) >= 10

@@ -11,13 +11,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from pc2grid.io.nav2_map import save_map
-from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli import console
 from pc2grid_cli.main import app
 from tests.helpers.nav2_map import spread_by_amcl, valid_for_nav2
 from tests.helpers.rooms import RESOLUTION_M
-from tests.helpers.simulated_drives import cut, office
 
 
 def pc2grid(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -34,25 +31,6 @@ def pc2grid(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int
     return code, out, err
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """office.yaml and a database of it, a part of the plan, and a laser's drive in the office."""
-    folder = tmp_path_factory.mktemp("answers")
-    save_map(office(), folder / "office")
-    save_map(cut(office(), 4.0, 3.0, 15.0, 12.0), folder / "part")
-    assert (
-        console.Console().run(
-            lambda: app(
-                ["convert", f"{folder}/office.yaml", "-o", f"{folder}/b.submaps"], standalone_mode=False
-            )
-        )
-        == 0
-    )
-    drive = SimulationConfig(length_m=8.0, seed=4, clutter=0)
-    simulate_session(folder / "drive.mcap", sensor="laser", grid=office(), config=drive)
-    return folder
-
-
 def messages(path: Path) -> dict[str, list[Any]]:
     """Decoded messages by topic."""
     found: dict[str, list[Any]] = {}
@@ -65,12 +43,12 @@ def messages(path: Path) -> dict[str, list[Any]]:
 
 
 def test_a_recording_gives_nav2_and_foxglove_the_same_pose(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    office_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pose, mcap, page = tmp_path / "pose.json", tmp_path / "answer.mcap", tmp_path / "page.html"
     options = ("--initialpose", pose, "--output", mcap, "--report", page, "--json")
     code, out, err = pc2grid(
-        capsys, "relocalize", folder / "drive.mcap", "-d", folder / "b.submaps", *options
+        capsys, "relocalize", office_folder / "drive.mcap", "-d", office_folder / "b.submaps", *options
     )
     assert code == 0, err
     answer, initial = json.loads(out)["pose"], json.loads(pose.read_text())
@@ -94,10 +72,10 @@ def test_a_recording_gives_nav2_and_foxglove_the_same_pose(
 
 
 def test_a_map_is_located_and_laid_over_the_other(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    office_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     mcap = tmp_path / "answer.mcap"
-    where = ("relocalize", folder / "part.yaml", "-d", folder / "b.submaps")
+    where = ("relocalize", office_folder / "part.yaml", "-d", office_folder / "b.submaps")
     code, out, err = pc2grid(capsys, *where, "--output", mcap, "--json")
     assert code == 0, err
     document = json.loads(out)
@@ -119,32 +97,39 @@ def test_a_map_is_located_and_laid_over_the_other(
 
 @pytest.mark.parametrize("option", ["--initialpose", "--trajectory"])
 def test_a_map_has_no_robot_to_write_about(
-    option: str, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    option: str, office_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     target = tmp_path / "x"
     code, out, err = pc2grid(
-        capsys, "relocalize", folder / "part.yaml", "-d", folder / "b.submaps", option, target
+        capsys, "relocalize", office_folder / "part.yaml", "-d", office_folder / "b.submaps", option, target
     )
     assert code == 2 and out == "" and option in err and not target.exists()
 
 
 def test_no_answer_no_pose_but_a_page(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    office_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pose, page = tmp_path / "pose.json", tmp_path / "page.html"
     options = ("--duration", "1", "--set", "relocalize.accept=0.999999", "--initialpose", pose)
     code, _, err = pc2grid(
-        capsys, "relocalize", folder / "drive.mcap", "-d", folder / "b.submaps", *options, "--report", page
+        capsys,
+        "relocalize",
+        office_folder / "drive.mcap",
+        "-d",
+        office_folder / "b.submaps",
+        *options,
+        "--report",
+        page,
     )
     assert code == 4 and not pose.exists() and "not written" in err
     assert '"status":"located"' not in page.read_text(encoding="utf-8")
 
 
 def test_export_writes_a_page_and_does_not_overwrite_it(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    office_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     page = tmp_path / "page.html"
-    assert pc2grid(capsys, "export", folder / "b.submaps", "--report", page)[0] == 0
+    assert pc2grid(capsys, "export", office_folder / "b.submaps", "--report", page)[0] == 0
     before = page.read_bytes()
-    code, _, err = pc2grid(capsys, "export", folder / "b.submaps", "--report", page)
+    code, _, err = pc2grid(capsys, "export", office_folder / "b.submaps", "--report", page)
     assert code == 1 and "--force" in err and page.read_bytes() == before

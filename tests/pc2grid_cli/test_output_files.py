@@ -10,22 +10,8 @@ from typer.main import get_command
 from typer.testing import CliRunner
 
 from pc2grid.errors import OutputError
-from pc2grid.io.nav2_map import save_map
 from pc2grid_cli import relocalize
 from pc2grid_cli.main import app
-from tests.helpers.simulated_drives import cut, office
-
-
-@pytest.fixture(scope="module")
-def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with part.yaml and the database b.submaps of the whole office."""
-    folder = tmp_path_factory.mktemp("building")
-    save_map(office(), folder / "office")
-    save_map(cut(office(), 4.0, 3.0, 15.0, 12.0), folder / "part")
-    convert = ["convert", str(folder / "office.yaml"), "-o", str(folder / "b.submaps")]
-    assert CliRunner().invoke(app, convert, catch_exceptions=False).exit_code == 0
-    return folder
-
 
 EXPORT, LOCATE = "export none.submaps", "relocalize none.mcap -d none.submaps"
 
@@ -59,13 +45,13 @@ EXPORT, LOCATE = "export none.submaps", "relocalize none.mcap -d none.submaps"
     ],
 )
 def test_what_cannot_be_written_is_refused_before_any_work(
-    command: str, words: str, building: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str, words: str, office_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("taken.png", "taken.tum"):
         (tmp_path / name).touch()
     (tmp_path / "folder").mkdir()
-    (tmp_path / "part.yaml").write_bytes((building / "part.yaml").read_bytes())
+    (tmp_path / "part.yaml").write_bytes((office_folder / "part.yaml").read_bytes())
     before = sorted(tmp_path.iterdir())
     # The recordings and databases do not exist: whoever looked at them first would say so.
     error = CliRunner().invoke(app, command.split()).exception
@@ -75,22 +61,22 @@ def test_what_cannot_be_written_is_refused_before_any_work(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_the_file_of_a_map_may_be_named_instead_of_its_stem(building: Path, tmp_path: Path) -> None:
+def test_the_file_of_a_map_may_be_named_instead_of_its_stem(office_folder: Path, tmp_path: Path) -> None:
     for name in ("a.yaml", "b.pgm", "c", "d.5"):
-        export = ["export", str(building / "b.submaps"), "--map", str(tmp_path / name)]
+        export = ["export", str(office_folder / "b.submaps"), "--map", str(tmp_path / name)]
         assert CliRunner().invoke(app, export, catch_exceptions=False).exit_code == 0
     stems = ("a", "b", "c", "d.5")
     assert sorted(p.name for p in tmp_path.iterdir()) == [f"{s}{e}" for s in stems for e in (".pgm", ".yaml")]
 
 
 def test_the_answer_is_printed_although_a_picture_cannot_be_written(
-    building: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    office_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def disk_full(*_: Any) -> None:
         raise OutputError("a.png: cannot write: No space left on device")
 
     monkeypatch.setattr(relocalize, "_write", disk_full)
-    locate = ["relocalize", str(building / "part.yaml"), "-d", str(building / "b.submaps")]
+    locate = ["relocalize", str(office_folder / "part.yaml"), "-d", str(office_folder / "b.submaps")]
     done = CliRunner().invoke(app, [*locate, "--plot", str(tmp_path / "a.png")])
     assert isinstance(done.exception, OutputError)
     assert done.stdout.startswith("located in office: x ")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,6 @@ from typer.testing import CliRunner
 
 from pc2grid.errors import ConfigError
 from pc2grid.io import open_log
-from pc2grid.io.nav2_map import save_map
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
@@ -24,11 +24,9 @@ from tests.helpers.simulated_drives import office
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """plan.yaml and plan.submaps of the office; a.mcap and b.mcap of a laser that drives in it."""
-    folder = tmp_path_factory.mktemp("windows")
-    save_map(office(), folder / "plan")
-    run("convert", folder / "plan.yaml", "-o", folder / "plan.submaps")
+def folder(office_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The office, and a.mcap and b.mcap of a laser that drives in it."""
+    folder = shutil.copytree(office_folder, tmp_path_factory.mktemp("windows"), dirs_exist_ok=True)
     for name, seed in (("a", 3), ("b", 5)):
         config = SimulationConfig(length_m=4.0, seed=seed, clutter=0)
         simulate_session(folder / f"{name}.mcap", sensor="laser", grid=office(), config=config)
@@ -44,7 +42,7 @@ def run(*words: object, code: int = 0) -> Result:
 
 def relocalize(folder: Path, names: str, *words: object, code: int = 0) -> Result:
     logs = [folder / name for name in names.split()]
-    return run("relocalize", *logs, "-d", folder / "plan.submaps", *words, code=code)
+    return run("relocalize", *logs, "-d", folder / "b.submaps", *words, code=code)
 
 
 def documents(done: Result) -> list[Any]:
@@ -79,9 +77,9 @@ def test_windows_along_a_recording_are_located_by_one_index(
 
 
 def test_a_person_gets_a_line_for_each_window(folder: Path) -> None:
-    text = relocalize(folder, "a.mcap plan.yaml").stdout
+    text = relocalize(folder, "a.mcap office.yaml").stdout
     assert text.startswith("2 queries: 2 located")
-    assert text.count("a.mcap") == 1 and text.count("plan.yaml") == 1
+    assert text.count("a.mcap") == 1 and text.count("office.yaml") == 1
 
 
 def test_exit_code_4_if_none_is_located(folder: Path) -> None:
@@ -102,7 +100,7 @@ def test_others_go_on_if_a_recording_cannot_be_read(folder: Path) -> None:
         ("a.mcap b.mcap", ("--report", "out.html"), "--report"),
         ("a.mcap", ("--every", 3, "--trajectory", "out.tum"), "--trajectory"),
         ("a.mcap", ("--every", 3, "--check", 1, 1, 0), "--check"),
-        ("plan.yaml", ("--every", 3), "--every"),
+        ("office.yaml", ("--every", 3), "--every"),
     ],
 )
 def test_what_is_of_one_query_is_refused(

@@ -133,7 +133,7 @@ def test_the_parts_of_a_recording_are_stored_together(
     ("change", "words"),
     [
         (["--set", "partition.radius_m=4"], r"partition\.radius_m = 5\.0, not 4\.0"),
-        (["--building", "B"], "the label 'no label', this one would have 'B'"),
+        (["--building", "B"], "building = None, not 'B'"),
     ],
 )
 def test_other_settings_are_refused_before_any_work(

@@ -7,11 +7,9 @@ its file.
 
 from __future__ import annotations
 
-import gc
 import os
-import shlex
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cached_property
 from importlib import import_module
 from typing import Annotated, Any, ClassVar, Literal
@@ -22,7 +20,6 @@ from typer.main import get_command
 
 from pc2grid.errors import ConfigError
 from pc2grid_cli import console
-from pc2grid_cli.options import DATABASE
 from pc2grid_cli.removed import REMOVED
 
 # Colours and boxes cost a tenth of a second at every --help; they are for terminals that want them.
@@ -32,9 +29,6 @@ MARKUP: Literal["rich"] | None = "rich" if _FANCY else None
 
 LABORATORY = "pc2grid_lab"
 """The package that a clone of the repository has, and the wheel has not."""
-_NEW_OBJECTS = 100_000
-"""After so many new objects the collector looks for cycles, not after 700: the libraries that a command loads
-when it needs them make about as many. `convert` leaves 2,000 objects in cycles in 150 s of a laser."""
 
 
 def _apply(context: typer.Context, option: typer.CallbackParam, value: int) -> None:
@@ -85,14 +79,10 @@ class Command(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Let an error say what to type."""
-        words = [*args]
         try:
             return super().parse_args(ctx, args)
         except Exception as error:  # its class is not public
-            if type(error).__name__ == "MissingParameter":
-                error.suggestion = _with_option(self.params, ctx, getattr(error, "param", None), words)  # type: ignore[attr-defined]
-            elif type(error).__name__ == "NoSuchOption":
-                _hint_of_removed(error, ctx, getattr(error, "option_name", ""))
+            _hint_of_removed(error, ctx, getattr(error, "option_name", ""))
             raise
 
 
@@ -117,10 +107,6 @@ class LateCommand(TyperCommand):
                 f"pc2grid compare {self.name}: the laboratory is not installed; it is no part of the package",
                 hint="in a clone of pc2grid's repository: pip install -e .",
             ) from None
-        if not gc.isenabled():  # `main` has stopped it. What is imported stays: it need not be walked through
-            gc.freeze()
-            gc.set_threshold(_NEW_OBJECTS)
-            gc.enable()
         app = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
         app.command(self.name, cls=Command)(getattr(module, function))
         return get_command(app)
@@ -158,20 +144,3 @@ def group(commands: Mapping[str, tuple[str, str]]) -> type[Group]:
 def _hint_of_removed(error: Exception, ctx: Any, word: str) -> None:
     """Let the error for an unknown command or option say what to use, if there was one of that name."""
     error.suggestion = REMOVED.get(f"{ctx.command_path} {word}")  # type: ignore[attr-defined]
-
-
-def _with_option(params: Iterable[Any], ctx: typer.Context, missing: Any, words: list[str]) -> str | None:
-    """The command with the missing option in front of its last word, if that names a database; else None."""
-    options = [name for name in getattr(missing, "opts", ()) if name.startswith("-")]
-    if not options or not str(getattr(missing, "metavar", "")).startswith(DATABASE) or not words:
-        return None
-    *before, last = words
-    if not last.endswith(".submaps") and not last.startswith(("postgresql://", "postgres://")):
-        return None
-    if any(
-        before[-1:] == [name] and not (param.is_flag or param.count)
-        for param in params
-        for name in param.opts
-    ):
-        return None  # it is the value of another option
-    return shlex.join([*ctx.command_path.split(), *before, min(options, key=len), last])

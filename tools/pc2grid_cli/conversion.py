@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -13,7 +12,6 @@ import typer
 
 from pc2grid.display import counted
 from pc2grid.errors import ConfigError, DatabaseError, one_line
-from pc2grid.model import SessionMap
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
@@ -150,7 +148,6 @@ def convert_all(
                 keep = True
                 for entry in outcome.entries:
                     done.add(entry, quiet=quiet, strict=strict)
-                    terminal.note(_odometry_as_text(entry[0]), level=1)
     return done
 
 
@@ -195,22 +192,6 @@ def _note_stored(terminal: console.Console, done: Done, count: int) -> Iterator[
         ready = len(done.sessions) + len(done.unchanged)
         terminal.note(f"{ready} of {count} are stored; the same command continues from there")
         raise
-
-
-def _odometry_as_text(session: SessionMap) -> str:
-    """One line on how well the odometry of a session agrees with its scans."""
-    check, trajectory = session.odometry, session.trajectory
-    if check is None or not check.compared:
-        return f"{session.session}: no odometry to compare with the scans"
-    text = f"{session.session}: the scans overruled odometry in {check.overruled} of {check.compared} scans"
-    if not check.stretches:
-        return text
-    worst, start_ns = check.stretches[0], int(trajectory.stamps_ns[0])
-    from_s, to_s = ((stamp - start_ns) * 1e-9 for stamp in (worst.from_ns, worst.to_ns))
-    return (
-        f"{text}, most {from_s:.1f} to {to_s:.1f} s after the first scan: by up to {worst.distance_m:.2f} m "
-        f"and {math.degrees(worst.turn_rad):.0f} degrees from one scan to the next"
-    )
 
 
 def _as_text(d: Converted) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import typer
@@ -32,7 +32,7 @@ from pc2grid_cli.options import (
     Report,
     TrajectoryFile,
 )
-from pc2grid_cli.output_files import check_file, map_stem
+from pc2grid_cli.output_files import check_file, given_files, map_stem, written_files
 from pc2grid_cli.session_documents import OfDatabase
 from signature.database import open_database
 from signature.localization.answer_json import plain
@@ -124,115 +124,80 @@ def export_command(
     Example: pc2grid export building.submaps --map building --trajectory building.tum
     """
     terminal = console.of(context)
-    outputs = _Outputs(
-        map_stem=map_ and map_stem(map_),
-        map_of=map_of_ or "everything",
+    outputs = given_files(
         trajectory=trajectory,
-        trajectory_format=format_,
         cloud=cloud,
         graph=graph,
         g2o=g2o,
         mcap=mcap,
         plot=plot,
+        map=map_ and map_stem(map_),
         report=report,
-        force=force,
     )
-    outputs.check(map_of_)
+    _check(outputs, map_of_, format_, force)
+    as_told = _As(of=map_of_ or "everything", format=format_, force=force)
     extras.require(extras.of_addresses(database))
     with open_database(database) as opened:
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
         frames = opened.frames() if frame == "building" else {}
-        name = _write(outputs, opened, session, frames, terminal)
+        name = _write(outputs, as_told, opened, session, frames, terminal)
         about: Export = {
             "database": opened.location,
             "session": name,
-            "written": [str(path) for path in outputs.written()],
+            "written": [str(path) for path in written_files(outputs)],
         }
-    if outputs.map_of != "everything":
-        terminal.note(f"--map-of {outputs.map_of}: {_SHOWN[outputs.map_of]}")
-    for path in outputs.written():
+    if as_told.of != "everything":
+        terminal.note(f"--map-of {as_told.of}: {_SHOWN[as_told.of]}")
+    for path in written_files(outputs):
         terminal.note(f"wrote {path}")
     if json:
         console.print_result(plain(Export, about))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Outputs:
-    """What the command writes; None: not this."""
+def _check(
+    outputs: Mapping[str, Path], of: MapOf | None, format_: TrajectoryFormat | None, force: bool
+) -> None:
+    """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written."""
+    if of is not None and not {"map", "mcap"} & outputs.keys():
+        raise ConfigError("--map-of: no map is written", hint="name --map or --mcap, too")
+    if not outputs:
+        raise ConfigError(
+            "nothing to export",
+            hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --plot, --report",
+        )
+    for option, named in outputs.items():
+        for path in written_files({option: named}):
+            check_file(option, path, force, any_suffix=option == "trajectory" and format_ is not None)
 
-    map_stem: Path | None
-    map_of: MapOf
-    trajectory: Path | None
-    trajectory_format: TrajectoryFormat | None
-    cloud: Path | None
-    graph: Path | None
-    g2o: Path | None
-    mcap: Path | None
-    plot: Path | None
-    report: Path | None
+
+@dataclass(frozen=True, slots=True)
+class _As:
+    """How it is written: what maps show, the format of the trajectory (None: by its suffix), --force."""
+
+    of: MapOf
+    format: TrajectoryFormat | None
     force: bool
-
-    def files(self) -> list[Path]:
-        """The files of a session."""
-        one = (self.trajectory, self.cloud, self.graph, self.g2o, self.mcap, self.plot)
-        return [path for path in one if path is not None] + self.map_files()
-
-    def map_files(self) -> list[Path]:
-        """The files of a nav2 map."""
-        stem = self.map_stem
-        return [] if stem is None else [stem.with_name(f"{stem.name}{end}") for end in (".yaml", ".pgm")]
-
-    def of_session(self) -> bool:
-        """Whether anything is written of a single session."""
-        return bool(self.files())
-
-    def of_building_only(self) -> bool:
-        """Whether all that is written of sessions can be of a whole building."""
-        wanted = [path for path in (self.cloud, *self.map_files()) if path is not None]
-        return bool(wanted) and len(wanted) == len(self.files())
-
-    def written(self) -> list[Path]:
-        """All files, in the order in which they are listed for the user."""
-        return self.files() + ([] if self.report is None else [self.report])
-
-    def check(self, map_of: MapOf | None) -> None:
-        """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written.
-
-        map_of : as it was given.
-        """
-        if map_of is not None and self.map_stem is None and self.mcap is None:
-            raise ConfigError("--map-of: no map is written", hint="name --map or --mcap, too")
-        if not self.of_session() and self.report is None:
-            raise ConfigError(
-                "nothing to export",
-                hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --plot, --report",
-            )
-        for option in ("trajectory", "cloud", "graph", "g2o", "mcap", "plot", "report"):
-            named = option == "trajectory" and self.trajectory_format is not None
-            check_file(option, getattr(self, option), self.force, any_suffix=named)
-        for path in self.map_files():
-            check_file("map", path, self.force)
 
 
 def _write(
-    outputs: _Outputs,
+    outputs: Mapping[str, Path],
+    as_told: _As,
     database: SubmapDatabase,
     session: str | None,
     frames: Mapping[str, BuildingFrame],
     terminal: console.Console,
 ) -> str | None:
     """Write all files. Returns the session that was written; None if it was a whole building, or none."""
-    floors = floors_of(database, frames)
-    whole = session is None and outputs.of_building_only() and len(floors) == 1
+    floors, of_sessions = floors_of(database, frames), outputs.keys() - {"report"}
     name = None
-    if whole:
-        _write_building(outputs, database, floors[0], frames, terminal)
-    elif outputs.of_session():
+    if of_sessions and session is None and of_sessions <= {"map", "cloud"} and len(floors) == 1:
+        _write_building(outputs, as_told, database, floors[0], frames, terminal)
+    elif of_sessions:
         name = _session_name(database, session)
-        _write_session(outputs, database, name, frames.get(name), terminal)
-    if outputs.report is not None:
-        write_report(outputs.report, database)
+        _write_session(outputs, as_told, database, name, frames.get(name), terminal)
+    if "report" in outputs:
+        write_report(outputs["report"], database)
     return name
 
 
@@ -250,7 +215,8 @@ def _session_name(database: SubmapDatabase, named: str | None) -> str:
 
 
 def _write_building(
-    outputs: _Outputs,
+    outputs: Mapping[str, Path],
+    as_told: _As,
     database: SubmapDatabase,
     names: Sequence[str],
     frames: Mapping[str, BuildingFrame],
@@ -260,14 +226,15 @@ def _write_building(
     others = [info.name for info in database.sessions() if info.name not in frames]
     if others:
         console.warn(f"not joined, and left out: {', '.join(others)}")
-    if outputs.map_stem is not None:
-        _write_map(outputs.map_stem, database, names, frames, outputs.map_of)
-    if outputs.cloud is not None:
-        _write_cloud(outputs.cloud, database, names, frames, terminal)
+    if "map" in outputs:
+        _write_map(outputs["map"], database, names, frames, as_told.of)
+    if "cloud" in outputs:
+        _write_cloud(outputs["cloud"], database, names, frames, terminal)
 
 
 def _write_session(
-    outputs: _Outputs,
+    outputs: Mapping[str, Path],
+    as_told: _As,
     database: SubmapDatabase,
     name: str,
     frame: BuildingFrame | None,
@@ -276,24 +243,20 @@ def _write_session(
     """Write all files of a session. frame : of its building; None: its own map frame."""
     # A session without a trajectory is refused before anything is written.
     poses = database.trajectory(name)
-    if not len(poses) and (outputs.trajectory or outputs.g2o):
+    if not len(poses) and {"trajectory", "g2o"} & outputs.keys():
         raise DatabaseError(f"{database.location}: session {name!r} is an imported map and has no trajectory")
     frames = {} if frame is None else {name: frame}
-    writers: list[tuple[Any, Callable[[Any], object]]] = [
-        (outputs.map_stem, lambda stem: _write_map(stem, database, [name], frames, outputs.map_of)),
-        (
-            outputs.trajectory,
-            lambda path: write_trajectory(path, _in_building(poses, frame), outputs.trajectory_format),
-        ),
-        (outputs.cloud, lambda path: _write_cloud(path, database, [name], frames, terminal)),
-        (outputs.graph, lambda path: write_graph(path, database.graph(name))),
-        (outputs.g2o, lambda path: write_g2o(path, poses, database.loops(name))),
-        (outputs.mcap, lambda path: write_session(path, database, name, outputs.force, outputs.map_of)),
-        (outputs.plot, lambda path: draw_session(path, database, name)),
-    ]
-    for wanted, write in writers:
-        if wanted is not None:
-            write(wanted)
+    writers: dict[str, Callable[[Path], object]] = {
+        "trajectory": lambda path: write_trajectory(path, _in_building(poses, frame), as_told.format),
+        "cloud": lambda path: _write_cloud(path, database, [name], frames, terminal),
+        "graph": lambda path: write_graph(path, database.graph(name)),
+        "g2o": lambda path: write_g2o(path, poses, database.loops(name)),
+        "mcap": lambda path: write_session(path, database, name, as_told.force, as_told.of),
+        "plot": lambda path: draw_session(path, database, name),
+        "map": lambda stem: _write_map(stem, database, [name], frames, as_told.of),
+    }
+    for option in outputs.keys() - {"report"}:
+        writers[option](outputs[option])
 
 
 def _write_map(

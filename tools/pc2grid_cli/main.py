@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import atexit
-import gc
 import os
 import sys
 from typing import Annotated
@@ -105,19 +103,7 @@ app.add_typer(
 
 
 def main() -> None:
-    """Entry point of the console script.
-
-    Imports make more than 100,000 objects, which stay. Python's collector of cycles would walk through them
-    again and again, in a sixth of the time of a short command: it is stopped until the command is loaded, and
-    has nothing left to do at the end. A process that goes on has its collector back.
-    """
+    """Entry point of the console script."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for them in all packages
-    usual = gc.get_threshold()
-    gc.disable()
-    atexit.register(gc.freeze)
     terminal = console.Console()
-    try:
-        sys.exit(terminal.run(lambda: app(prog_name="pc2grid", standalone_mode=False, obj=terminal)))
-    finally:
-        gc.set_threshold(*usual)
-        gc.enable()
+    sys.exit(terminal.run(lambda: app(prog_name="pc2grid", standalone_mode=False, obj=terminal)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 from pc2grid.errors import OutputError
@@ -36,13 +37,27 @@ def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool 
     if path is None:
         return
     known, suffix = SUFFIXES[option], path.suffix.lower()
-    optional = option != "cloud"
-    if not any_suffix and suffix not in known and (suffix or not optional):
+    unnamed = any_suffix or (not suffix and option != "cloud")
+    if suffix not in known and not unnamed:
         raise OutputError(
             f"{path}: --{option} does not write the format {suffix or '(no suffix)'}",
             hint=f"end its name in {' or '.join(known)}",
         )
     require_writable(path, force)
+
+
+def given_files(**options: Path | None) -> dict[str, Path]:
+    """What is to be written, by option; an option that was not given is left out."""
+    return {option: path for option, path in options.items() if path is not None}
+
+
+def written_files(outputs: Mapping[str, Path]) -> list[Path]:
+    """The files of some options; `map` names the stem of two."""
+    files = []
+    for option, path in outputs.items():
+        ends = (".yaml", ".pgm") if option == "map" else ("",)
+        files += [path.with_name(f"{path.name}{end}") for end in ends]
+    return files
 
 
 def map_stem(path: Path) -> Path:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 from pc2grid.errors import DatabaseError, OutputError, Pc2GridError
 from pc2grid.model import is_part_of
@@ -73,36 +73,27 @@ def _refuse_others(
 
 
 def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
-    """How a stored session differs from the one that would be made; empty: none does."""
-    known = [(present[job.name], job) for job in jobs if job.name in present]
-    every = (_differences(was, job, alone=len(jobs) == 1) for was, job in known)
-    return next(itertools.chain.from_iterable(every), "")
+    """How a stored session differs from the one that would be made, as the end of a sentence; empty: none."""
+    for job in jobs:
+        if job.name not in present:
+            continue
+        was = present[job.name]
+        old, new = _settings(was), _settings(job.made_from(was.digest))
+        for key in (*new, *(old.keys() - new.keys())):
+            if old.get(key) != new.get(key):
+                return f", {job.name!r} made with {key} = {old.get(key)!r}, not {new.get(key)!r}"
+        # Of several inputs each job compares its own content.
+        if was.source != job.path.name or (len(jobs) == 1 and _changed(was, job)):
+            return f", {job.name!r} made from a file {was.source!r} with other content"
+    return ""
 
 
-def _differences(was: Provenance, job: Job, *, alone: bool) -> Iterator[str]:
-    """How a stored session differs from the one that would be made, each as the end of a sentence.
-
-    alone : there is no other input; only then its content is compared, of several each job compares its own.
-    """
-    wanted = job.made_from(was.digest)
-    if was.label != wanted.label:
-        yield (
-            f"; its session {job.name!r} has the label {str(was.label)!r}, this one would have"
-            f" {str(wanted.label)!r} (--building, --floor)"
-        )
-    if (was.start_s, was.duration_s) != (wanted.start_s, wanted.duration_s):
-        yield f", {job.name!r} made from another part of the recording (--start, --duration)"
-    for section, settings in job.config:
-        for key, value in settings:
-            old = getattr(getattr(was.config, section), key)
-            if old != value:
-                yield f", {job.name!r} made with {section}.{key} = {old!r}, not {value!r}"
-    for library in sorted({*was.versions, *wanted.versions}):
-        versions = was.versions.get(library), wanted.versions.get(library)
-        if versions[0] != versions[1]:
-            yield f", {job.name!r} made with {library} {versions[0]}, not {versions[1]}"
-    if was.source != job.path.name or (alone and _changed(was, job)):
-        yield f", {job.name!r} made from a file {was.source!r} with other content"
+def _settings(origin: Provenance) -> dict[str, Any]:
+    """What a session is made with: label, part of the recording, settings, versions of the libraries."""
+    found: dict[str, Any] = {"start": origin.start_s, "duration": origin.duration_s}
+    found |= {"building": origin.label.building, "floor": origin.label.floor}
+    found |= {f"{section}.{key}": value for section, part in origin.config for key, value in part}
+    return found | dict(origin.versions)
 
 
 def _changed(was: Provenance, job: Job) -> bool:
