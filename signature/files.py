@@ -29,9 +29,11 @@ from signature.localization.answering import locate_map
 from signature.localization.localizer import Estimate, Localizer
 from signature.localization.located_path import followed
 from signature.localization.map_index import MapIndex
+from signature.localization.shown.report import Found
 from signature.sessions import add_sessions, build_sessions
 
 if TYPE_CHECKING:
+    from pc2grid.clouds.planar_scan import PlanarScan
     from pc2grid.io.recording import Log
     from pc2grid.mapping.drawn_map import DrawnMap
     from pc2grid.model import RegisteredScan
@@ -127,29 +129,22 @@ def relocalize(
     >>> pc2grid.relocalize("tuesday.mcap", "building.submaps", prior=elsewhere).status
     'not_found'
     """
-    observer, path = observer or ProgressBars(), Path(query)
+    if prior is not None and is_drawn_map(Path(query)):
+        raise ConfigError("prior: there is no robot in a map")
     with open_places(database, config) as opened:
-        settings = query_config(opened, config)
-        index = MapIndex.of(opened, settings, observer)
-        if is_drawn_map(path):
-            if prior is not None:
-                raise ConfigError("prior: there is no robot in a map")
-            drawn, poses = load_drawn_map(query, settings), NO_POSES
-            answer = locate_map(drawn.grid, index)
-            about = about_map(path, drawn, answer)
-        else:
-            with open_log(query, settings.read, recover=recover) as log:
-                answer, poses = locate_log(
-                    log,
-                    index if prior is None else index.within(prior),
-                    settings,
-                    span=span,
-                    until_located=until_located,
-                    observer=observer,
-                )
-                about = about_log(path, log, answer, span, poses.health)
-    asked = Asked(poses=poses, about=about, database=str(database), accept=settings.relocalize.accept)
-    return replace(answer, asked=asked)
+        found = find(
+            Path(query),
+            opened,
+            config,
+            span=span,
+            recover=recover,
+            prior=lambda log, span: prior,
+            until_located=until_located,
+            observer=observer or ProgressBars(),
+        )
+    accept = config.relocalize.accept
+    asked = Asked(poses=found.poses, about=found.about, database=str(database), accept=accept)
+    return replace(found.answer, asked=asked)
 
 
 @contextlib.contextmanager
@@ -174,39 +169,60 @@ def open_places(place: str | Path, config: Config = Config()) -> Iterator[Submap
         yield stack.enter_context(open_database(place))
 
 
-def locate_log(
-    log: Log,
-    index: MapIndex,
+def find(
+    path: Path,
+    database: SubmapDatabase,
     config: Config,
     *,
     span: TimeSpan = TimeSpan(),
+    recover: bool = False,
+    prior: Callable[[Log, TimeSpan], Prior | None] = lambda log, span: None,
     until_located: bool = False,
     see: Callable[[RegisteredScan, Estimate | None], None] = lambda registered, estimate: None,
     observer: Observer = Observer(),
-) -> tuple[Answer, Trajectory]:
-    """Find where an open recording, or the part of it that `span` names, was made; with its poses in its own
-    odometry frame, as `followed` corrects them.
+    index: MapIndex | None = None,
+) -> Found:
+    """Locate a map, or a recording, or the part of it that `span` names, in an open database.
 
-    config : see `query_config`. until_located, observer : as in `relocalize`.
+    config, span, recover, until_located, observer : as in `relocalize`.
+    prior : what is known of the pose; it may say so by the recording.
     see : called with each scan, and with what `Localizer.add` returned for it.
+    index : of the database, if it is prepared.
 
-    Raises NoScans if no scan can be used.
+    Raises the errors of `pc2grid.open_log`, MapFileError, NoScans, and what `prior` raises.
     """
-    ends_ns = log.info.start_ns, log.info.end_ns
-    localizer, seen = Localizer(index), []
-    with observer.step("locate", span.length_ns(*ends_ns) * 1e-9):
-        for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), config, observer):
-            estimate = localizer.add(registered, planar_scan)
-            observer.on_scan(registered)
-            observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
-            see(registered, estimate)
-            seen.append((registered.scan.stamp_ns, registered.T_session_base, registered.health))
-            if until_located and estimate is not None and estimate.answer.status == "located":
-                break
-        answer = localizer.answer()
-    stamps_ns, poses, health = zip(*seen, strict=True)
-    way = Trajectory(stamps_ns=np.array(stamps_ns), T_session_base=np.array(poses), health=health)
-    return answer, followed(way, answer)
+    config = query_config(database, config)
+    if is_drawn_map(path):
+        drawn = load_drawn_map(path, config)
+        answer = locate_map(drawn.grid, index or MapIndex.of(database, config, observer))
+        about = about_map(path, drawn, answer)
+        return Found(answer=answer, poses=NO_POSES, about=about, drawn=drawn.grid)
+    with open_log(path, config.read, recover=recover) as log:
+        known = prior(log, span)
+        index = index or MapIndex.of(database, config, observer)
+        localizer, seen = Localizer(index if known is None else index.within(known)), []
+        with observer.step("locate", span.length_ns(log.info.start_ns, log.info.end_ns) * 1e-9):
+            for registered, planar_scan in tracked(log, config, span, observer):
+                estimate = localizer.add(registered, planar_scan)
+                observer.on_scan(registered)
+                see(registered, estimate)
+                seen.append((registered.scan.stamp_ns, registered.T_session_base, registered.health))
+                if until_located and estimate is not None and estimate.answer.status == "located":
+                    break
+            answer = localizer.answer()
+        stamps_ns, poses, health = zip(*seen, strict=True)
+        way = Trajectory(stamps_ns=np.array(stamps_ns), T_session_base=np.array(poses), health=health)
+        about = about_log(path, log, answer, span, health)
+        return Found(answer=answer, poses=followed(way, answer), about=about, report=log.report())
+
+
+def tracked(
+    log: Log, config: Config, span: TimeSpan, observer: Observer
+) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
+    """The registered scans of a part of a recording. observer : gets the share that is done."""
+    for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), config, observer):
+        yield registered, planar_scan
+        observer.on_progress(span.share_done(registered.scan.stamp_ns, log.info.start_ns, log.info.end_ns))
 
 
 def about_log(

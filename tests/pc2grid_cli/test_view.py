@@ -27,8 +27,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.errors import NoScans
-from pc2grid.io.nav2_map import save_map
 from pc2grid.io.trajectory import read_tum
+from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from pc2grid_cli.view import Locator, live_page
 from pc2grid_cli.view_events import Events
@@ -44,16 +44,12 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture(scope="module")
-def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def desk(office_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """office.submaps, and drive.mcap, a laser's 3 m in the office."""
     folder = tmp_path_factory.mktemp("view")
-    save_map(office(), folder / "office")
-    laser = ("--sensor", "laser", "--length", "3", "--seed", "4", "--clutter", "0")
-    for arguments in (
-        ("convert", folder / "office.yaml", "-o", folder / "office.submaps"),
-        ("simulate", folder / "office.yaml", folder / "drive.mcap", *laser),
-    ):
-        assert CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False).exit_code == 0
+    shutil.copy(office_folder / "b.submaps", folder / "office.submaps")
+    config = SimulationConfig(length_m=3.0, seed=4, clutter=0)
+    simulate_session(folder / "drive.mcap", sensor="laser", grid=office(), config=config)
     return folder
 
 
@@ -229,13 +225,6 @@ def test_what_is_too_large_or_has_no_size_is_refused_before_it_is_read(serve: Ca
             connection.putheader("Content-Length", length)
         connection.endheaders()
         assert connection.getresponse().status == 411
-    full = serve(most_bytes=1 << 60)
-    connection = http.client.HTTPConnection("127.0.0.1", full.server.server_port)
-    connection.putrequest("POST", f"/{full.server.token}/locate")
-    connection.putheader("Content-Length", str(1 << 59))
-    connection.endheaders()
-    reply = connection.getresponse()
-    assert reply.status == 507 and "TMPDIR" in json.loads(reply.read())["hint"]
 
 
 def say(served: Served, request: bytes) -> bytes:
@@ -383,7 +372,6 @@ def test_the_end_of_the_server_cancels_the_work(serve: Callable[..., Served], tm
     connection = begin_upload(served, 3, b"abc")
     assert slow.begun.wait(120)
     with events.subscribed() as page:
-        assert page is not None
         served.stop()
         assert slow.ended.is_set() and page.get(timeout=5) is None
     connection.close()
@@ -411,7 +399,6 @@ def test_a_page_that_comes_later_is_told_what_was(monkeypatch: pytest.MonkeyPatc
         events.publish("scans", [[k, 0, 0, 0]])
         events.publish("moment", {"path_m": k})
     with events.subscribed() as page:
-        assert page is not None
         told = drain(page)
         assert told == [
             ("begin", {"source": "new"}),
@@ -425,7 +412,6 @@ def test_a_page_that_comes_later_is_told_what_was(monkeypatch: pytest.MonkeyPatc
 def test_memory_is_bounded_however_long_nobody_reads(monkeypatch: pytest.MonkeyPatch) -> None:
     events = Events()
     with events.subscribed() as page:
-        assert page is not None
         for k in range(20_000):
             events.publish("scans", [[k, 0, 0, 0]])
         assert page.qsize() <= 1000
@@ -434,12 +420,8 @@ def test_memory_is_bounded_however_long_nobody_reads(monkeypatch: pytest.MonkeyP
     for k in range(20_000):
         events.publish("scans", [[k, 0, 0, 0]])
     with events.subscribed() as page:
-        assert page is not None
         scans = drain(page)[1][1]
         assert 1000 < len(scans) <= 4000 and scans[0][0] == 0 and scans[-1][0] >= 19_990
-    with contextlib.ExitStack() as stack:
-        pages = [stack.enter_context(events.subscribed()) for _ in range(20)]
-        assert [page is None for page in pages] == [False] * 16 + [True] * 4
 
 
 # --- a database -------------------------------------------------------------------------------------------
@@ -458,7 +440,6 @@ def test_a_recording_is_located_while_a_page_looks_on(desk: Path, serve: Callabl
 
         recording = (desk / "drive.mcap").read_bytes()
         with locator.events.subscribed() as looking_on:
-            assert looking_on is not None
             status, document = served.post(recording, "name=drive.mcap")
             told = drain(looking_on)
         assert status == 200 and document["status"] in ("located", "ambiguous")
@@ -488,7 +469,6 @@ def test_a_robot_is_followed(desk: Path, tmp_path: Path) -> None:
         server = ViewServer(0, locator.events, tmp_path, locator.work, most_bytes=1000)
         server.pages[""] = live_page(database)
         with locator.events.subscribed() as looking_on:
-            assert looking_on is not None
             with server.in_background():
                 locator.follow(str(desk / "drive.mcap"))
                 status, body, _ = ask(urllib.request.Request(server.url + "locate", data=b"abc"))

@@ -23,7 +23,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app, main
-from pc2grid_cli.watch import ResetPolicy
+from signature.localization.resets import ResetPolicy
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
 from tests.helpers.nav2_map import as_mapped, valid_for_nav2
@@ -221,5 +221,7 @@ def test_resets_are_paused_and_bounded() -> None:
     policy = ResetPolicy(pause_s=10.0, most=2, calm_s=60.0, clock=lambda: now_s)
     allowed = {}
     for now_s in (0.0, 5.0, 11.0, 22.0, 40.0, 80.0, 85.0):
-        allowed[now_s] = policy.allows()
+        assert not policy.allows("lost", located=False)  # from now on the next pose is news
+        allowed[now_s] = policy.allows("located", located=True)
+        assert not policy.allows("located", located=True)
     assert [now_s for now_s, may in allowed.items() if may] == [0.0, 11.0, 80.0]

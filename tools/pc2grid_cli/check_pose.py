@@ -12,12 +12,11 @@ from pc2grid.errors import one_line
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.observer import Observer
-from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli.followed import Followed, Live, live
 from pc2grid_cli.known_pose import KnownPose, end_s
-from signature.files import about_log, query_config
+from signature.files import about_log, query_config, tracked
 from signature.localization.answer_json import (
     Labelled,
     Pose,
@@ -104,16 +103,14 @@ def check_log(
     config = query_config(database, config)
     with open_log(path, config.read, recover=recover) as log:
         T_map_base, stamp_ns = _believed(log, known, span)
-        ends_ns = log.info.start_ns, log.info.end_ns
         health: list[Health] = []
 
         def counted() -> Iterator[tuple[RegisteredScan, PlanarScan]]:
-            for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), config, observer):
+            for registered, planar_scan in tracked(log, config, span, observer):
                 health.append(registered.health)
-                observer.on_progress(span.share_done(registered.scan.stamp_ns, *ends_ns))
                 yield registered, planar_scan
 
-        with observer.step("check", span.length_ns(*ends_ns) * 1e-9):
+        with observer.step("check", span.length_ns(log.info.start_ns, log.info.end_ns) * 1e-9):
             index = MapIndex.of(database, config)
             checked = check_pose(counted(), index, T_map_base, stamp_ns=stamp_ns, session=known.session)
         about = about_log(path, log, checked, span, health)

@@ -18,12 +18,12 @@ from pc2grid.model import SensorKind
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.config import LidarConfig
 from pc2grid_cli import console
-from pc2grid_cli.locate import find
 from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import open_database
+from signature.files import find
 from signature.localization.shown.picture import draw_answer
 from signature.localization.shown.report import write_report
 from signature.sessions import add_sessions, build_session

@@ -5,13 +5,17 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from pc2grid.errors import TrackingLost
 from pc2grid.io import open_log
 from pc2grid.io.live.feed import FeedCounts, News
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.targets import is_robot, open_live
 from pc2grid.io.map_pose import BelievedPose
+from pc2grid.observer import Observer
+from pc2grid.pipeline import follow
+from pc2grid_cli import console
 from signature.localization.answer_json import TypedDict
 
 if TYPE_CHECKING:
@@ -19,7 +23,9 @@ if TYPE_CHECKING:
     from pc2grid.io import Log
     from pc2grid.io.map_pose import MapPose
     from pc2grid.io.message_source import Choice, RawMessage
-    from pc2grid.model import ReadReport, Scan
+    from pc2grid.model import ReadReport, RegisteredScan, Scan
+    from signature.config import Config
+    from signature.localization.follower import Follower
 
 
 class Live(TypedDict):
@@ -97,6 +103,38 @@ class WholeRecording:
 
 Followed = LiveLog | WholeRecording
 """Scans, part after part, and what is known of how they come."""
+
+
+def run(
+    drive: Followed,
+    follower: Follower[Any],
+    config: Config,
+    poll: Callable[[], bool],
+    *,
+    see: Callable[[RegisteredScan | None], None] = lambda registered: None,
+    observer: Observer = Observer(),
+) -> None:
+    """Feed a follower with all scans of a robot or a recording.
+
+    poll : called after each scan, and while none comes; true if that was enough.
+    see : called with each registered scan; None: what follows does not go on from what was before.
+    """
+    drive.on_poll = poll
+    for scans in drive.parts():
+        try:
+            for registered, planar_scan in follow(scans, config, observer):
+                see(registered)
+                follower.add(registered, planar_scan)
+                if poll():
+                    return
+        except TrackingLost as error:
+            console.warn(error.in_short)
+        if poll():
+            return
+        follower.restart()
+        see(None)
+    follower.finish()
+    poll()
 
 
 def live(drive: Followed, elapsed_s: float) -> Live:

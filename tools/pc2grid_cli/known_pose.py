@@ -72,7 +72,7 @@ class KnownPose:
         return None if region is None else replace(region, stamp_ns=0)
 
     def prior(self, log: Log, span: TimeSpan) -> Prior | None:
-        """The region that the pose is in; None if none is given.
+        """The region that the pose is in at a part of a recording; None if none is given.
 
         Raises ConfigError, or what `Log.map_pose` raises.
         """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -26,11 +26,12 @@ from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import check_log, report_check
 from pc2grid_cli.foxglove import write_answer, write_located_map
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import find, in_map, searched
+from pc2grid_cli.locate import in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
-from pc2grid_cli.output_files import check_file
+from pc2grid_cli.output_files import check_file, given_files
 from pc2grid_cli.windows import Window, find_all, show, windows_of
 from signature.database.maintenance import is_database
+from signature.files import find
 from signature.localization.answer_json import QueryRecording, Result, Sessions
 from signature.localization.in_building import answer_in_building
 from signature.localization.shown.picture import draw_answer, draw_answers
@@ -62,42 +63,8 @@ class Relocalize(Result):
     map_sigma_m: float | None
 
 
-_FILES = ("trajectory", "initialpose", "output", "plot", "report")
-"""The options that name files."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Outputs:
-    """What the command writes, beside the answer on stdout."""
-
-    trajectory: Path | None
-    initialpose: Path | None
-    output: Path | None
-    plot: Path | None
-    report: Path | None
-    force: bool
-
-    def check(self) -> None:
-        """Raises OutputError if a file cannot be written, or exists and must not be replaced."""
-        for option in _FILES:
-            check_file(option, getattr(self, option), self.force)
-
-    def of_answer(self) -> list[Path]:
-        """The files that only an answer can fill."""
-        return [path for path in (self.trajectory, self.initialpose, self.output) if path is not None]
-
-    def written(self, *, located: bool) -> list[Path]:
-        """The files that are there after the answer."""
-        always = [path for path in (self.plot, self.report) if path is not None]
-        return [*self.of_answer(), *always] if located else always
-
-    def refuse(self, reason: str, hint: str, *, but: tuple[str, ...] = ()) -> None:
-        """Raises ConfigError if there is any file, but for these."""
-        given = [option for option in _FILES if option not in but and getattr(self, option) is not None]
-        if given:
-            raise ConfigError(f"--{given[0]}: {reason}", hint=hint)
-
-
+_OF_ANSWER = ("trajectory", "initialpose", "output")
+"""The options whose files only an answer can fill."""
 _Logs = Annotated[
     list[Path],
     typer.Argument(metavar="LOG|MAP...", help="recordings or maps to locate: .yaml, .pcd, .ply, a mesh"),
@@ -170,10 +137,12 @@ def relocalize_command(
 
     Example: pc2grid relocalize tuesday.mcap --database building.submaps
     """
-    outputs = _Outputs(trajectory, initialpose, output, plot, report, force=force)
+    outputs = given_files(
+        trajectory=trajectory, initialpose=initialpose, output=output, plot=plot, report=report
+    )
     known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
     several = every is not None or len(logs) > 1
-    _check_options(logs, database, outputs, known, several=several)
+    _check_options(logs, database, outputs, force, known, several=several)
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
     )
@@ -181,36 +150,51 @@ def relocalize_command(
     with searched(database, building, floor) as (opened, left_out):
         frames = opened.frames() if frame == "building" else {}
         told = _Told(opened, frames, left_out, strict=strict, as_json=json)
-        given: Any = {"known": known, "recover": recover, "observer": console.of(context).observer()}
+        given: Any = {"recover": recover, "observer": console.of(context).observer()}
         if known.is_check:
-            judged = check_log(logs[0], opened, settings, span=windows[0].span, **given)
+            judged = check_log(logs[0], opened, settings, known, span=windows[0].span, **given)
             code = report_check(*judged, as_json=json)
         elif several:
-            code = _tell_all(find_all(windows, opened, settings, **given), told, plot)
+            code = _tell_all(find_all(windows, opened, settings, known, **given), told, plot)
         else:
-            found = find(logs[0], opened, settings, span=windows[0].span, **given)
-            code = _tell_one(found, told, outputs, settings, console.of(context))
+            found = find(logs[0], opened, settings, span=windows[0].span, prior=known.prior, **given)
+            code = _tell_one(found, told, outputs, force, settings, console.of(context))
     raise typer.Exit(code)
 
 
 def _check_options(
-    logs: Sequence[Path], database: str, outputs: _Outputs, known: KnownPose, *, several: bool
+    logs: Sequence[Path],
+    database: str,
+    outputs: Mapping[str, Path],
+    force: bool,
+    known: KnownPose,
+    *,
+    several: bool,
 ) -> None:
     """Raises what is wrong with the options before any work is done. several : queries at once."""
     extras.require(extras.of_addresses(database))
-    outputs.check()
+    for option, path in outputs.items():
+        check_file(option, path, force)
     if several:
-        outputs.refuse("is of one query", "leave it out, or give one recording and no --every", but=("plot",))
+        hint = "leave it out, or give one recording and no --every"
+        _refuse(outputs.keys() - {"plot"}, "is of one query", hint)
     for log in logs:
         if is_drawn_map(log):
-            of_map = ("output", "plot", "report")
-            outputs.refuse("there is no robot in a map", "--json and --output have its pose", but=of_map)
+            hint = "--json and --output have its pose"
+            _refuse(outputs.keys() & {"trajectory", "initialpose"}, "there is no robot in a map", hint)
         known.validate(is_map=is_map_file(log))
         _check_not_swapped(log, database)
     if known.is_check:
-        outputs.refuse("--check judges a pose and finds none", "leave it out, or ask without --check")
+        hint = "leave it out, or ask without --check"
+        _refuse(outputs.keys(), "--check judges a pose and finds none", hint)
         if several:
             raise ConfigError("--check: judges one pose", hint="give one recording, and no --every")
+
+
+def _refuse(options: Collection[str], reason: str, hint: str) -> None:
+    """Raises ConfigError if there is any of these options."""
+    if options:
+        raise ConfigError(f"--{min(options)}: {reason}", hint=hint)
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,21 +235,29 @@ class _Told:
 
 
 def _tell_one(
-    found: Found, told: _Told, outputs: _Outputs, settings: Config, terminal: console.Console
+    found: Found,
+    told: _Told,
+    outputs: Mapping[str, Path],
+    force: bool,
+    settings: Config,
+    terminal: console.Console,
 ) -> int:
     """Print the answer to one query, and write what shows it; returns the exit code."""
     stated = answer_in_building(found.answer, told.frames)
-    located = in_map(found.poses, found.answer)
+    located, missed = in_map(found.poses, found.answer), list[Path]()
     # Printed first: a file that cannot be written must not cost the answer.
     text = as_text(stated, is_map=found.drawn is not None)
     text += _about_map(map_sigma_m(found.answer, told.database))
     console.print_result(told.document(found, stated) if told.as_json else text)
-    _write(outputs, told.database, found, stated, located, settings)
-    for path in outputs.written(located=located is not None):
+    if located is None:
+        missed = [outputs[option] for option in _OF_ANSWER if option in outputs]
+        outputs = {option: path for option, path in outputs.items() if option not in _OF_ANSWER}
+    _write(outputs, told.database, found, stated, located, force, settings)
+    for path in outputs.values():
         terminal.note(f"wrote {path}")
     _warn_of_missing_points(found, told.database)
     _warn_of_unjoined(found.answer, told.database)
-    for path in outputs.of_answer() if located is None else ():
+    for path in missed:
         console.warn(f"{path}: not written, there is no answer to put into it")
     for warning in found.about["warnings"]:
         console.warn(warning)
@@ -318,33 +310,32 @@ def _check_not_swapped(log: Path, database: str) -> None:
 
 
 def _write(
-    outputs: _Outputs,
+    outputs: Mapping[str, Path],
     database: SubmapDatabase,
     found: Found,
     stated: Answer,
     located: Trajectory | None,
+    force: bool,
     settings: Config,
 ) -> None:
-    """Write the files; without an answer only the picture and the page.
+    """Write the files.
 
     stated : the answer as it is given. What shows the map of a session is in the frame of that map, whatever
-    frame the answer is given in.
+    frame the answer is given in. located : the poses of the query in that map, None without an answer.
     """
     answer = found.answer
-    if located is not None:
-        if outputs.trajectory is not None:
-            write_trajectory(outputs.trajectory, in_map(found.poses, stated) or located)
-        if outputs.initialpose is not None:
-            write_initialpose(outputs.initialpose, stated)
-        if outputs.output is not None:
-            if found.drawn is not None:
-                write_located_map(outputs.output, database, answer, found.drawn, outputs.force)
-            else:
-                write_answer(outputs.output, database, answer, located, outputs.force)
-    if outputs.plot is not None:
-        draw_answer(outputs.plot, database, answer, found.poses)
-    if outputs.report is not None:
-        write_report(outputs.report, database, found=found, accept=settings.relocalize.accept)
+    if "trajectory" in outputs and located is not None:
+        write_trajectory(outputs["trajectory"], in_map(found.poses, stated) or located)
+    if "initialpose" in outputs:
+        write_initialpose(outputs["initialpose"], stated)
+    if "output" in outputs and found.drawn is not None:
+        write_located_map(outputs["output"], database, answer, found.drawn, force)
+    elif "output" in outputs and located is not None:
+        write_answer(outputs["output"], database, answer, located, force)
+    if "plot" in outputs:
+        draw_answer(outputs["plot"], database, answer, found.poses)
+    if "report" in outputs:
+        write_report(outputs["report"], database, found=found, accept=settings.relocalize.accept)
 
 
 def map_sigma_m(answer: Answer, database: SubmapDatabase) -> float | None:

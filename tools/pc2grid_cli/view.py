@@ -18,14 +18,14 @@ from pc2grid import extras
 from pc2grid.errors import ConfigError, OutputError, Pc2GridError
 from pc2grid.io.live.targets import open_live
 from pc2grid.observer import Observer
-from pc2grid.pipeline import follow
 from pc2grid_cli import console
 from pc2grid_cli import options as options
+from pc2grid_cli.followed import run
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import find, searched
+from pc2grid_cli.locate import searched
 from pc2grid_cli.view_events import Events, Progress
 from pc2grid_cli.view_server import Cancelled, Options, ViewServer
-from signature.files import query_config
+from signature.files import find, query_config
 from signature.localization.follower import Follower
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
@@ -107,7 +107,7 @@ def _serve(
     if browser:
         _open_browser(server.url)
     if source is None:
-        server.serve()
+        server.serve_forever()
         return
     with server.in_background():
         locator.follow(source)
@@ -146,35 +146,25 @@ class Locator:
                 self._settings,
                 observer=_Shares(events),
                 see=see,
-                known=known,
+                prior=known.prior,
                 index=self._prepared(),
             )
             progress.flush()
-            self.pages["answer"] = live_page(
-                self._database, found=found, accept=self._settings.relocalize.accept
-            )
-        except Pc2GridError as error:
-            # Messages name the recording as the user does, not the place of our copy.
-            error.message = error.message.replace(str(path), path.name)
-            events.publish("end", {"source": path.name, "error": error.message, "hint": error.hint})
-            raise
-        except Cancelled:
-            events.publish("end", {"source": path.name, "error": "stopped", "hint": None})
-            raise
-        except BaseException:
-            failed = "internal error; the terminal shows it"
-            events.publish("end", {"source": path.name, "error": failed, "hint": None})
+            accept = self._settings.relocalize.accept
+            self.pages["answer"] = live_page(self._database, found=found, accept=accept)
+        except BaseException as error:
+            told: dict[str, Any] = {"error": "internal error; the terminal shows it", "hint": None}
+            if isinstance(error, Pc2GridError):
+                # Messages name the recording as the user does, not the place of our copy.
+                error.message = error.message.replace(str(path), path.name)
+                told = {"error": error.message, "hint": error.hint}
+            elif isinstance(error, Cancelled):
+                told["error"] = "stopped"
+            events.publish("end", {"source": path.name, **told})
             raise
         answer = found.answer
-        events.publish(
-            "end",
-            {
-                "source": path.name,
-                "status": answer.status,
-                "session": answer.session,
-                "confidence": answer.confidence,
-            },
-        )
+        told = {"status": answer.status, "session": answer.session, "confidence": answer.confidence}
+        events.publish("end", {"source": path.name, **told})
         return {**answer.to_json(), "query": found.about}
 
     def follow(self, source: str) -> None:
@@ -196,17 +186,8 @@ class Locator:
                     progress.tell(estimate)
                 return False
 
-            live.on_poll = poll
             self.events.publish("begin", {"source": source})
-            for scans in live.parts():
-                for registered, planar_scan in follow(scans, config):
-                    progress.add(registered)
-                    follower.add(registered, planar_scan)
-                    poll()
-                follower.restart()
-                progress.add(None)
-            follower.finish()
-            poll()
+            run(live, follower, config, poll, see=progress.add)
             progress.flush()
         self.events.publish("end", {"source": source, "error": "the source has ended", "hint": None})
 

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 
 _MOST_WAITING = 1000
 """Events that wait for a page that does not read them; older ones are dropped."""
-_MOST_PAGES = 16
 _MOST_SCANS = 4000
 """Scans of the path so far, for pages that come later; of a longer path every second one is left out."""
 _SCANS_EVERY_S = 0.1
@@ -59,29 +58,22 @@ class Events:
                 _put(page, event)
 
     @contextlib.contextmanager
-    def subscribed(self) -> Iterator[queue.Queue[bytes | None] | None]:
-        """The events as they come, then None at the end; None in place of them if too many pages look on."""
-        page = self._open_page()
-        if page is None:
-            yield None
-            return
+    def subscribed(self) -> Iterator[queue.Queue[bytes | None]]:
+        """What was, then the events as they come, then None at the end."""
+        page: queue.Queue[bytes | None] = queue.Queue(_MOST_WAITING)
+        with self._lock:
+            for kind, event in self._last.items():
+                _put(page, event)
+                if kind == "begin" and self._scans:
+                    _put(page, _event("scans", self._scans))
+            if self._closed:
+                _put(page, None)
+            self._pages.append(page)
         try:
             yield page
         finally:
             with self._lock:
                 self._pages.remove(page)
-
-    def _open_page(self) -> queue.Queue[bytes | None] | None:
-        with self._lock:
-            if self._closed or len(self._pages) >= _MOST_PAGES:
-                return None
-            page: queue.Queue[bytes | None] = queue.Queue(_MOST_WAITING)
-            self._pages.append(page)
-            for kind, event in self._last.items():
-                _put(page, event)
-                if kind == "begin" and self._scans:
-                    _put(page, _event("scans", self._scans))
-            return page
 
     def close(self) -> None:
         """No more events: tell all pages."""

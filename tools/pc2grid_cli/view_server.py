@@ -13,7 +13,6 @@ import queue
 import re
 import secrets
 import select
-import shutil
 import socket
 import sys
 import threading
@@ -29,8 +28,6 @@ from pc2grid_cli.view_events import Events
 
 _ADDRESS = "127.0.0.1"
 _BLOCK_BYTES = 1 << 20
-_SPARE_BYTES = 200 << 20
-"""Space that an upload must leave on the disk."""
 _POLL_S = 0.2
 """How often the server looks whether it is to stop."""
 _SILENCE_S = 60.0
@@ -79,10 +76,14 @@ class ViewServer(http.server.ThreadingHTTPServer):
         """The address of the first page."""
         return f"http://{_ADDRESS}:{self.server_port}/{self.token}/"
 
+    def serve_forever(self, poll_interval: float = _POLL_S) -> None:
+        """Serve until the process is interrupted."""
+        super().serve_forever(poll_interval)
+
     @contextlib.contextmanager
     def in_background(self) -> Iterator[None]:
         """Serves in a thread of its own; no recordings are taken meanwhile."""
-        thread = threading.Thread(target=self.serve_forever, args=(_POLL_S,), daemon=True)
+        thread = threading.Thread(target=self.serve_forever, daemon=True)
         with self.busy:
             thread.start()
             try:
@@ -98,10 +99,6 @@ class ViewServer(http.server.ThreadingHTTPServer):
         if self.busy.acquire(timeout=wait_s):
             self.busy.release()
         self.server_close()
-
-    def serve(self) -> None:
-        """Serve until the process is interrupted."""
-        self.serve_forever(_POLL_S)
 
     def shutdown_request(self, request: Any) -> None:
         """Close a connection. What the client still sends is read first: unread, it would reset the
@@ -244,9 +241,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     def _send_events(self) -> None:
         with self.server.events.subscribed() as events:
-            if events is None:
-                self._refuse(HTTPStatus.SERVICE_UNAVAILABLE, "too many pages look on", "close some of them")
-                return
             self._begin(HTTPStatus.OK, "text/event-stream")
             while True:
                 try:
@@ -266,9 +260,12 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         if not re.fullmatch(r"[0-9]{1,18}", text):
             return _refusal(HTTPStatus.LENGTH_REQUIRED, "the size of the recording is not said")
         size = int(text)
-        refused = self._too_large(size)
-        if refused is not None:
-            return refused
+        if size > self.server.most_bytes:
+            return _refusal(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+                f"the recording has {size / 1e9:.1f} GB; the limit is {self.server.most_bytes / 1e9:.1f} GB",
+                "pc2grid view --most-gb, or pc2grid relocalize, which needs no copy",
+            )
         path = self.server.folder / safe_name(options.get("name", ""))
         try:
             self._receive(path, size)
@@ -280,24 +277,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             return None
         finally:
             path.unlink(missing_ok=True)
-
-    def _too_large(self, size: int) -> tuple[HTTPStatus, Any] | None:
-        """Why a recording of `size` bytes is not taken; None if it is."""
-        most = self.server.most_bytes
-        if size > most:
-            return _refusal(
-                HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
-                f"the recording has {size / 1e9:.1f} GB; the limit is {most / 1e9:.1f} GB",
-                "pc2grid view --most-gb, or pc2grid relocalize, which needs no copy",
-            )
-        free = shutil.disk_usage(self.server.folder).free
-        if size + _SPARE_BYTES > free:
-            return _refusal(
-                HTTPStatus.INSUFFICIENT_STORAGE,
-                f"{free / 1e9:.1f} GB are free in {self.server.folder.parent}, too little for a copy",
-                "set TMPDIR to a larger disk, or use pc2grid relocalize, which needs no copy",
-            )
-        return None
 
     def _receive(self, path: Path, size: int) -> None:
         with path.open("wb", buffering=0) as file:

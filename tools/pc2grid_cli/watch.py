@@ -7,26 +7,26 @@ import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
 
 import typer
 
 from pc2grid import extras
 from pc2grid.display import probability
-from pc2grid.errors import ConfigError, TrackingLost, one_line
+from pc2grid.errors import ConfigError, one_line
 from pc2grid.geometry import SE2
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.live.targets import is_robot
-from pc2grid.pipeline import follow
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import as_text as check_as_text
 from pc2grid_cli.check_pose import live_document
-from pc2grid_cli.followed import Followed, Live, followed, live
+from pc2grid_cli.followed import Followed, Live, followed, live, run
 from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import searched
+from signature.files import query_config
 from signature.localization.answer_json import (
     Labelled,
     PoseInSpace,
@@ -43,6 +43,7 @@ from signature.localization.joining.building_map import map_of
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch
+from signature.localization.resets import ResetPolicy
 
 if TYPE_CHECKING:
     from pc2grid.io.live.nav2 import Outlet
@@ -166,12 +167,12 @@ def watch_command(
         searched(database, building, floor) as (opened, _),
         followed(source, settings.read, real_time=real_time) as drive,
     ):
-        following = _Following(drive, opened, settings, end_s, terminal)
+        following = _Following(drive, opened, query_config(opened, settings), end_s, terminal)
         if check_topic is not None:
             good = _check(following, check_topic, session, as_json=json)
         else:
             frames = opened.frames() if frame == "building" else {}
-            with _Robot.of(drive, opened, publish, publish_map, map_frame, frames) as robot:
+            with _robot(drive, opened, publish, publish_map, map_frame, frames) as robot:
                 good = _search(following, robot, prior, keep or publish == "tf", as_json=json)
         _summarize(drive, terminal)
     if not good:
@@ -188,24 +189,20 @@ def _check_publishes(source: str, check_topic: str | None) -> None:
 
 @dataclass(frozen=True)
 class _Following:
-    """A robot, or a recording of one, that is followed until `end_s` of `time.monotonic`, or to its end."""
+    """A robot, or a recording of one, that is followed until `end_s` of `time.monotonic`, or to its end.
+
+    config : see `query_config`.
+    """
 
     drive: Followed
     database: SubmapDatabase
-    settings: Config
+    config: Config
     end_s: float
     terminal: console.Console
 
-    @property
-    def config(self) -> Config:
-        """That of the database, but for what is the user's to set of a query."""
-        own = {name: getattr(self.settings, name) for name in ("read", "relocalize", "registration")}
-        return self.database.config().model_copy(update=own)
-
     def run(self, follower: Follower[EstimateT], use: Callable[[EstimateT], bool]) -> None:
         """Feed `follower` with scans. use : what to do with each estimate; true if that was enough."""
-        drive, config = self.drive, self.config
-        over = False
+        drive, over = self.drive, False
 
         def poll() -> bool:
             nonlocal over
@@ -215,22 +212,9 @@ class _Following:
             over = over or time.monotonic() > self.end_s
             return over
 
-        drive.on_poll = poll
         choice = drive.choose()
         self.terminal.note(f"{drive.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
-        for scans in drive.parts():
-            try:
-                for registered, planar_scan in follow(scans, config, self.terminal.observer()):
-                    follower.add(registered, planar_scan)
-                    if poll():
-                        break
-            except TrackingLost as error:
-                console.warn(error.in_short)
-            if over:
-                return
-            follower.restart()
-        follower.finish()
-        poll()
+        run(drive, follower, self.config, poll, observer=self.terminal.observer())
 
 
 def _search(
@@ -281,85 +265,24 @@ def _check(following: _Following, topic: str, session: str | None, *, as_json: b
     return fine
 
 
-@dataclass(slots=True)
-class ResetPolicy:
-    """When the robot may be told a new place: not too often, and not for ever.
-
-    Limits how often a new pose is published: repeated resets would keep navigation from continuing.
-
-    pause_s : least time between two resets. most : resets until the robot has been located for `calm_s`.
-    """
-
-    pause_s: float = 10.0
-    most: int = 5
-    calm_s: float = 60.0
-    clock: Callable[[], float] = time.monotonic
-    _last_s: float | None = None
-    _count: int = 0
-
-    def allows(self) -> bool:
-        """Whether a reset may be made now; it then counts as made."""
-        now_s = self.clock()
-        if self._last_s is not None:
-            if now_s - self._last_s > self.calm_s:
-                self._count = 0
-            if now_s - self._last_s < self.pause_s or self._count >= self.most:
-                return False
-        self._last_s = now_s
-        self._count += 1
-        return True
-
-
 @dataclass(kw_only=True)
 class _Robot:
     """The robot that is told where it is.
 
-    publisher : None if it is not told anything. pose_is_due : whether it is to be told its pose.
+    publisher : None if it is not told anything.
     map_session : the session whose map was published. sessions : of the database, by name. frames : of the
     buildings that answers are in, by session.
     """
 
-    live: LiveLog | None
+    drive: Followed
     database: SubmapDatabase
     sessions: dict[str, SessionInfo]
     publish: Publish
     publish_map: bool
-    publisher: Nav2Publisher | None
     frames: Mapping[str, BuildingFrame]
-    resets: ResetPolicy
-    pose_is_due: bool = True
+    publisher: Nav2Publisher | None = None
+    resets: ResetPolicy = field(default_factory=ResetPolicy)
     map_session: str | None = None
-
-    @staticmethod
-    @contextlib.contextmanager
-    def of(
-        drive: Followed,
-        database: SubmapDatabase,
-        publish: Publish,
-        publish_map: bool,
-        map_frame: str,
-        frames: Mapping[str, BuildingFrame],
-    ) -> Iterator[_Robot]:
-        """Raises LiveError if the robot takes no messages."""
-        live = drive if isinstance(drive, LiveLog) else None
-        robot = _Robot(
-            live=live,
-            database=database,
-            sessions={info.name: info for info in database.sessions()},
-            publish=publish,
-            publish_map=publish_map,
-            publisher=None,
-            frames=frames,
-            resets=ResetPolicy(),
-        )
-        topics = [f"/{publish}"] if publish != "none" else []
-        topics += ["/map"] if publish_map else []
-        if live is None or not topics:
-            yield robot
-            return
-        with Nav2Publisher(cast("Outlet", live.feed), map_frame) as robot.publisher:
-            robot.publisher.announce(*topics)
-            yield robot
 
     def about_map(self, session: str) -> WatchedMap:
         """The map of a session, as a document says it."""
@@ -375,17 +298,17 @@ class _Robot:
 
     def tell(self, estimate: Estimate, lock: threading.Lock) -> list[str]:
         """Publish what follows from an estimate; returns the topics. lock : is held to read the database."""
-        publisher, live, session = self.publisher, self.live, estimate.answer.session
-        if publisher is None or live is None:
+        publisher, live, session = self.publisher, self.drive, estimate.answer.session
+        if publisher is None or not isinstance(live, LiveLog):
             return []
         if estimate.state == "lost":
-            self.pose_is_due = True
             publisher.stop_tf()
+        may_reset = self.resets.allows(estimate.state, located=session is not None)
         if session is None:
             return []
         return [
             *self._tell_map(publisher, estimate, session, lock),
-            *self._tell_pose(publisher, live, estimate),
+            *self._tell_pose(publisher, live, estimate, may_reset),
         ]
 
     def _tell_map(
@@ -399,10 +322,10 @@ class _Robot:
         publisher.map(estimate.registered.scan.stamp_ns, grid)
         return ["/map"]
 
-    def _tell_pose(self, publisher: Nav2Publisher, live: LiveLog, estimate: Estimate) -> list[str]:
-        self.pose_is_due = self.pose_is_due or estimate.state == "recovered"
-        if self.publish == "initialpose" and self.pose_is_due and self.resets.allows():
-            self.pose_is_due = False
+    def _tell_pose(
+        self, publisher: Nav2Publisher, live: LiveLog, estimate: Estimate, may_reset: bool
+    ) -> list[str]:
+        if self.publish == "initialpose" and may_reset:
             assert estimate.answer.covariance is not None
             stamp_ns, T_map_base = _now(estimate, live)
             publisher.initialpose(stamp_ns, T_map_base, estimate.answer.covariance)
@@ -415,6 +338,32 @@ class _Robot:
             return []
         publisher.start_tf(odom_frame, T_map_odom, live.now_ns)
         return ["/tf"]
+
+
+@contextlib.contextmanager
+def _robot(
+    drive: Followed,
+    database: SubmapDatabase,
+    publish: Publish,
+    publish_map: bool,
+    map_frame: str,
+    frames: Mapping[str, BuildingFrame],
+) -> Iterator[_Robot]:
+    """The robot, ready to be told where it is. Raises LiveError if it takes no messages."""
+    robot = _Robot(
+        drive=drive,
+        database=database,
+        sessions={info.name: info for info in database.sessions()},
+        publish=publish,
+        publish_map=publish_map,
+        frames=frames,
+    )
+    topics = [*([f"/{publish}"] if publish != "none" else []), *(["/map"] if publish_map else [])]
+    with contextlib.ExitStack() as stack:
+        if topics and isinstance(drive, LiveLog):
+            robot.publisher = stack.enter_context(Nav2Publisher(cast("Outlet", drive.feed), map_frame))
+            robot.publisher.announce(*topics)
+        yield robot
 
 
 def _now(estimate: Estimate, live: LiveLog) -> tuple[int, SE2]:

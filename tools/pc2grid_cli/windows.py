@@ -19,8 +19,7 @@ from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import find
-from signature.files import query_config
+from signature.files import find, query_config
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.report import Found
 
@@ -98,7 +97,7 @@ def find_all(
                     span=window.span,
                     recover=recover,
                     observer=_Part(observer, number, len(windows)),
-                    known=known,
+                    prior=known.prior,
                     index=index,
                 )
             except LogError as error:

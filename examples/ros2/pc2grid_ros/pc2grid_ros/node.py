@@ -24,11 +24,11 @@ from pc2grid.io.live.feed import Feed
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.message_source import RawMessage, TopicInfo
-from pc2grid_cli.watch import ResetPolicy
 from signature.localization.follower import Follower
 from signature.localization.in_building import answer_in_building
 from signature.localization.joining.building_map import map_of
 from signature.localization.localizer import Estimate
+from signature.localization.resets import ResetPolicy
 
 PARAMETERS = {"database": "", "topic": "", "publish": "initialpose", "publish_map": False, "map_frame": "map"}
 """With their defaults; `config/pc2grid.yaml` explains them."""
@@ -147,7 +147,7 @@ class Pc2gridNode(LifecycleNode):
 
     def on_activate(self, state: Any) -> TransitionCallbackReturn:
         """Follow the robot from now on."""
-        self._estimate, self._problem, self._map_of, self._pose_is_due = None, "", None, True
+        self._estimate, self._problem, self._map_of = None, "", None
         self._resets = ResetPolicy()
         topic = self._set("topic") or None
         self._feed = RclpyFeed(self, topic)
@@ -208,8 +208,8 @@ class Pc2gridNode(LifecycleNode):
         self._estimate = estimate = replace(estimate, answer=answer)
         self.get_logger().info(f"{estimate.state} after {answer.path_m:.1f} m")
         if estimate.state == "lost":
-            self._pose_is_due = True
             self._nav2.stop_tf()
+        may_reset = self._resets.allows(estimate.state, located=answer.session is not None)
         if answer.session is None or answer.T_map_base is None or answer.covariance is None:
             return
         stamp_ns, pose = answer.stamp_ns, answer.T_map_base
@@ -220,9 +220,7 @@ class Pc2gridNode(LifecycleNode):
         T_map_odom, odom_frame = estimate.T_map_odom, self._live.odometry_frame
         if self._set("publish") == "tf" and T_map_odom is not None and odom_frame is not None:
             self._nav2.start_tf(odom_frame, T_map_odom, self._live.now_ns)
-        self._pose_is_due = self._pose_is_due or estimate.state == "recovered"
-        if self._set("publish") == "initialpose" and self._pose_is_due and self._resets.allows():
-            self._pose_is_due = False
+        if self._set("publish") == "initialpose" and may_reset:
             newest = self._live.newest_odometry()
             if newest is not None and T_map_odom is not None:  # the answer is some tenths of a second old
                 stamp_ns, pose = newest[0], T_map_odom @ pc2grid.SE2.from_matrix(newest[1])

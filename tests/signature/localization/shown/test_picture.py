@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import OccupancyGrid
-from pc2grid_cli.locate import find_map
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
 from signature.database.protocol import BuildingFrame
+from signature.files import find
 from signature.localization.shown.picture import (
     BLUE,
     GREEN,
@@ -44,7 +44,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> SubmapDatabase:
 
 def located(grid: OccupancyGrid, database: SubmapDatabase, folder: Path) -> Found:
     save_map(grid, folder / "query")
-    return find_map(folder / "query.yaml", database, Config())
+    return find(folder / "query.yaml", database, Config())
 
 
 def changed_part() -> OccupancyGrid:

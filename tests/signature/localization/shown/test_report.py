@@ -16,12 +16,12 @@ import pytest
 
 from pc2grid.io.nav2_map import save_map
 from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory
-from pc2grid_cli.locate import find_map
 from pc2grid_cli.relocalize import map_sigma_m
 from signature.boundary import boundary_histogram
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
 from signature.describe import Signature
+from signature.files import find
 from signature.freespace import freespace_histogram, shortest_paths
 from signature.localization.answer import PoseInSpace
 from signature.localization.shown.report import Found, contents, write_report
@@ -54,7 +54,7 @@ def database(tmp_path_factory: pytest.TempPathFactory) -> SubmapDatabase:
 def found(database: SubmapDatabase, tmp_path_factory: pytest.TempPathFactory) -> Found:
     stem = tmp_path_factory.mktemp("query") / "part"
     save_map(cut(office(), 4.0, 3.0, 15.0, 12.0), stem)
-    return find_map(stem.with_suffix(".yaml"), database, Config())
+    return find(stem.with_suffix(".yaml"), database, Config())
 
 
 def embedded(page: str) -> dict:
@@ -225,7 +225,7 @@ def test_what_a_changed_query_contradicts_is_where_it_was_changed(
     cells[18:62, 58:63] = 0
     cells[140:148, 110:118] = 100
     save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), tmp_path / "changed")
-    shown = contents(database, found=find_map(tmp_path / "changed.yaml", database, Config()))["answer"]
+    shown = contents(database, found=find(tmp_path / "changed.yaml", database, Config()))["answer"]
     best = shown["hypotheses"][0]
     missed_m = np.array(best["missed"]).reshape(-1, 2)
     assert len(missed_m) > 10
@@ -448,7 +448,7 @@ def test_the_place_that_a_reader_chooses_is_the_one_weighed(
 ) -> None:
     """A query of a symmetric room fits it in both headings."""
     save_map(cut(plan(8, 5, []), 0.0, 0.0, 8.0, 5.0), tmp_path / "room")
-    found = find_map(tmp_path / "room.yaml", database, Config())
+    found = find(tmp_path / "room.yaml", database, Config())
     assert found.answer.status == "ambiguous"
     write_report(tmp_path / "page.html", database, found=found)
     data = contents(database, found=found)["answer"]
