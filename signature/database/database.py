@@ -199,16 +199,8 @@ class SubmapDatabase:
 
     def check(self) -> tuple[Problem, ...]:
         """All damage of what is there now; empty if there is none."""
-        problems: list[Problem] = []
-        with SubmapDatabase(self._rows.open(self._rows.source, damaged=True)) as whole:
-            try:
-                problems += whole._rows.damaged_structure()
-                for row in whole._rows.sessions():
-                    problems += whole._rows.problems(row)
-                problems += whole._rows.orphans()
-            except DatabaseDamage as error:
-                problems.append(error.problem)
-        return tuple(dict.fromkeys(problems))
+        with contextlib.closing(self._rows.open(self._rows.source, damaged=True)) as rows:
+            return rows.all_problems()
 
     def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
         """From now on, know only the sessions of this building and floor; None: any, "": not labelled.

@@ -86,8 +86,8 @@ def check(source: Place) -> tuple[Problem, ...]:
 
     Raises NotADatabase or DatabaseVersion if `source` is no database of the format that this version reads.
     """
-    with SubmapDatabase(engine_of(source).open(source, damaged=True)) as database:
-        return database.check()
+    with contextlib.closing(engine_of(source).open(source, damaged=True)) as rows:
+        return rows.all_problems()
 
 
 def copy(

@@ -193,6 +193,18 @@ class Rows(ABC):
         except DatabaseVersion as error:
             yield Problem(f"session {row.id}", error.message)
 
+    def all_problems(self) -> tuple[Problem, ...]:
+        """What is wrong with the database, its sessions and their parts; as far as it can be read."""
+        problems: list[Problem] = []
+        try:
+            problems += self.damaged_structure()
+            for row in self.sessions():
+                problems += self.problems(row)
+            problems += self.orphans()
+        except DatabaseDamage as error:
+            problems.append(error.problem)
+        return tuple(dict.fromkeys(problems))
+
     def orphans(self) -> Iterator[Problem]:
         """Parts without a session."""
         for (number,) in self.select(_ORPHANS):

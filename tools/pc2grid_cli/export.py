@@ -255,8 +255,9 @@ def _write_session(
         "plot": lambda path: draw_session(path, database, name),
         "map": lambda stem: _write_map(stem, database, [name], frames, as_told.of),
     }
-    for option in outputs.keys() - {"report"}:
-        writers[option](outputs[option])
+    for option, write in writers.items():
+        if option in outputs:
+            write(outputs[option])
 
 
 def _write_map(
