@@ -32,7 +32,7 @@ from pc2grid_cli.options import (
     Report,
     TrajectoryFile,
 )
-from pc2grid_cli.output_files import check_file, given_files, map_stem, written_files
+from pc2grid_cli.output_files import check_file, files_of, map_stem, written_files
 from pc2grid_cli.session_documents import OfDatabase
 from signature.database import open_database
 from signature.localization.answer_json import plain
@@ -124,7 +124,7 @@ def export_command(
     Example: pc2grid export building.submaps --map building --trajectory building.tum
     """
     terminal = console.of(context)
-    outputs = given_files(
+    outputs = files_of(
         trajectory=trajectory,
         cloud=cloud,
         graph=graph,

@@ -46,7 +46,7 @@ def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool 
     require_writable(path, force)
 
 
-def given_files(**options: Path | None) -> dict[str, Path]:
+def files_of(**options: Path | None) -> dict[str, Path]:
     """What is to be written, by option; an option that was not given is left out."""
     return {option: path for option, path in options.items() if path is not None}
 

@@ -28,7 +28,7 @@ from pc2grid_cli.foxglove import write_answer, write_located_map
 from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
-from pc2grid_cli.output_files import check_file, given_files
+from pc2grid_cli.output_files import check_file, files_of
 from pc2grid_cli.windows import Window, find_all, show, windows_of
 from signature.database.maintenance import is_database
 from signature.files import find
@@ -137,12 +137,10 @@ def relocalize_command(
 
     Example: pc2grid relocalize tuesday.mcap --database building.submaps
     """
-    outputs = given_files(
-        trajectory=trajectory, initialpose=initialpose, output=output, plot=plot, report=report
-    )
+    wanted = files_of(trajectory=trajectory, initialpose=initialpose, output=output, plot=plot, report=report)
     known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
     several = every is not None or len(logs) > 1
-    _check_options(logs, database, outputs, force, known, several=several)
+    _check_options(logs, database, wanted, force, known, several=several)
     settings = options.make_config(
         config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
     )
@@ -158,7 +156,7 @@ def relocalize_command(
             code = _tell_all(find_all(windows, opened, settings, known, **given), told, plot)
         else:
             found = find(logs[0], opened, settings, span=windows[0].span, prior=known.prior, **given)
-            code = _tell_one(found, told, outputs, force, settings, console.of(context))
+            code = _tell_one(found, told, wanted, force, settings, console.of(context))
     raise typer.Exit(code)
 
 
