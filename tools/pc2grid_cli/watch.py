@@ -212,6 +212,7 @@ class _Following:
             over = over or time.monotonic() > self.end_s
             return over
 
+        drive.on_poll = poll  # a robot may be silent from the beginning
         choice = drive.choose()
         self.terminal.note(f"{drive.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
         run(drive, follower, self.config, poll, observer=self.terminal.observer())
