@@ -11,8 +11,9 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 if TYPE_CHECKING:
-    import numpy as np
     from numpy.typing import NDArray
 
     from pc2grid.arrays import F64, U8
@@ -38,7 +39,6 @@ def map_png(
     path_m : (N, 2) path of the robot. centers_m : (M, 2) centres of submaps; both in the map frame, metres.
     """
     import cv2
-    import numpy as np
 
     known = np.argwhere(cells >= 0)
     (r0, c0), (r1, c1) = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), cells.shape)
@@ -68,8 +68,6 @@ def map_png(
 
 def _shades(cells: NDArray[np.int8]) -> U8:
     """Grey of each cell: the darker, the more probably occupied."""
-    import numpy as np
-
     shade = FREE_GREY - (FREE_GREY - WALL_GREY) / 100.0 * cells
     return np.where(cells < 0, UNKNOWN_GREY, shade).astype(np.uint8)
 
