@@ -180,6 +180,9 @@ class McapSource:
             raise LogCorrupt("the index points to something else")
         if not isinstance(chunk, Chunk):
             return records
+        # A header of zeros is that of an empty chunk without a checksum.
+        if chunk.uncompressed_size != listed.uncompressed_size:
+            raise LogCorrupt(f"{chunk.uncompressed_size} bytes where {listed.uncompressed_size} are listed")
         if not chunk.uncompressed_crc and chunk.data:
             self.tally.warn(_UNCHECKED)
         return open_chunk(chunk, self._config.max_chunk_bytes)

@@ -213,6 +213,7 @@ DAMAGES: dict[str, Callable[[Part], tuple[int, bytes]]] = {
     "size": lambda p: (p.start + 25, struct.pack("<Q", 1999)),
     "size without end": lambda p: (p.start + 25, struct.pack("<Q", 1 << 40)),
     "compression": lambda p: (p.start + 37, b"x"),
+    "header": lambda p: (p.start + 9, bytes(p.body - p.start - 9)),  # of an empty chunk without a checksum
     "all of it": lambda p: (p.start, b"\xee" * (p.end - p.start)),
 }
 
