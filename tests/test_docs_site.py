@@ -46,27 +46,31 @@ def text_of(page: Path) -> str:
 @pytest.mark.parametrize("command", ["", "convert", "relocalize", "db merge", "compare sensors"])
 def test_commands_are_described_as_by_help(site: Path, command: str) -> None:
     said = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="pc2grid").stdout
-    assert said.strip() in text_of(site / "reference" / "commands.html")
+    page = f"commands/{command.replace(' ', '_')}" if command else "commands"
+    assert said.strip() in text_of(site / "reference" / f"{page}.html")
 
 
 @pytest.mark.nightly
 def test_every_setting_and_every_public_name_has_its_place(site: Path) -> None:
     settings = text_of(site / "reference" / "settings.html")
     assert "radius_m = 5.0" in settings and "[relocalize]" in settings
-    for package, file in ((pc2grid, "pc2grid_more"), (signature, "signature")):
-        page = (site / "reference" / f"{file}.html").read_text("utf-8")
+    for package in (pc2grid, signature):
+        page = site / "reference" / f"{package.__name__}.html"
+        linked = dict(re.findall(r'<a href="([^"]*/(\w+)\.html)"><code>\2<', page.read_text("utf-8")))
+        places = {name: path for path, name in linked.items()}
         for name in package.__all__:
             thing = getattr(package, name)
             if name[0] != "_":
-                assert f"{thing.__module__}.{thing.__qualname__}" in page, name
+                own = (page.parent / places[name]).read_text("utf-8")
+                assert f'id="{thing.__module__}.{thing.__qualname__}"' in own, name
 
 
 @pytest.mark.nightly
 def test_docstrings_are_set_as_text_lists_and_code(site: Path) -> None:
-    page = text_of(site / "reference" / "pc2grid_more.html")
-    assert "stamp_ns: when the scan was taken" in page and "stamp_ns : when" not in page
-    assert ">>> monday = pc2grid.convert(" in page
-    raw = (site / "reference" / "pc2grid_more.html").read_text("utf-8")
+    scan, convert = (site / "reference" / "pc2grid" / f"{name}.html" for name in ("Scan", "convert"))
+    assert "stamp_ns: when the scan was taken" in text_of(scan) and "stamp_ns : when" not in text_of(scan)
+    assert ">>> monday = pc2grid.convert(" in text_of(convert)
+    raw = convert.read_text("utf-8")
     assert "&gt;&gt;&gt; " not in re.sub(r"<pre.*?</pre>", "", raw, flags=re.DOTALL)
 
 
@@ -82,9 +86,11 @@ def test_what_people_need_has_a_short_example() -> None:
 
 @pytest.mark.nightly
 def test_what_people_need_is_on_the_first_page_of_the_reference(site: Path) -> None:
-    page = text_of(site / "reference" / "pc2grid.html")
-    for words in ("pc2grid.convert(", "pc2grid.relocalize(", "answer.plot()", "overwrite : ", "Localizer("):
-        assert words.replace(" : ", ": ") in page
+    first = (site / "reference" / "pc2grid.html").read_text("utf-8").partition('id="all-others"')[0]
+    shown = {"convert": "overwrite: ", "relocalize": "answer.plot()", "Localizer": "Localizer("}
+    for name, words in shown.items():
+        assert f'href="pc2grid/{name}.html"' in first
+        assert words in text_of(site / "reference" / "pc2grid" / f"{name}.html")
 
 
 @pytest.mark.nightly
@@ -121,7 +127,9 @@ def test_the_site_can_be_searched_without_a_server(site: Path, tmp_path: Path) -
 
 
 @pytest.mark.nightly
-@pytest.mark.parametrize("page", ["index", "examples/recordings", "reference/pc2grid"])
+@pytest.mark.parametrize(
+    "page", ["index", "examples/recordings", "reference/pc2grid", "reference/pc2grid/convert"]
+)
 def test_pages_can_be_read_in_light_in_dark_and_on_a_phone(site: Path, browser: Browser, page: str) -> None:
     behind = []
     for size, dark in ((DESK, False), (DESK, True), (PHONE, False)):

@@ -7,11 +7,12 @@ mkdocstrings from the docstrings, which `Docstrings` rewrites as Markdown.
 
 from __future__ import annotations
 
+import inspect
 import json
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -48,34 +49,44 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     for path in LINKED:
         files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
     add(f"{NOTEBOOK}.md", notebook_page(ROOT / f"{NOTEBOOK}.ipynb"))
-    add("reference/commands.md", commands_page())
     add("reference/settings.md", settings_page())
-    add("reference/pc2grid.md", needed_page())
-    add("reference/pc2grid_more.md", python_page("pc2grid"))
-    add("reference/signature.md", python_page("signature"))
+    for path, text in (*command_pages(), *python_pages("pc2grid"), *python_pages("signature")):
+        add(f"reference/{path}.md", text)
     return files
 
 
-def commands_page() -> str:
-    """What `--help` prints, of every command."""
+def command_pages() -> Iterator[tuple[str, str]]:
+    """Path and text of a page for each command with what `--help` prints of it, and of one that lists all."""
     from typer.main import get_command
 
     from pc2grid_cli.main import app
 
-    parts = ["# Commands", "What `--help` prints of each.", *helps(get_command(app), "pc2grid", None)]
-    return "\n\n".join(parts) + "\n"
+    (_, about), *others = helps(get_command(app), "pc2grid", None)
+    table = _table(f"| [`{name}`](commands/{_file(name)}.md) | {_sentence(text)} |" for name, text in others)
+    yield "commands", f"# Commands\n\n{table}\n\n```text\n{about}\n```\n"
+    for name, text in others:
+        yield f"commands/{_file(name)}", f"# {name}\n\n```text\n{text}\n```\n"
 
 
-def helps(command: Any, name: str, parent: Any) -> Iterator[str]:
-    """A heading and the help of a command, then those of the commands in it."""
+def helps(command: Any, name: str, parent: Any) -> Iterator[tuple[str, str]]:
+    """Name and help of a command, then those of the commands in it."""
     word = name.split()[-1]
     # The width of --help where no terminal says another one.
     context = command.make_context(word, [], parent=parent, resilient_parsing=True, terminal_width=80)
-    yield f"## {name}"
     command = context.command
-    yield f"```text\n{command.get_help(context)}\n```"
+    yield name, command.get_help(context)
     for inner in command.list_commands(context) if hasattr(command, "list_commands") else ():
         yield from helps(command.get_command(context, inner), f"{name} {inner}", context)
+
+
+def _file(command: str) -> str:
+    return command.removeprefix("pc2grid ").replace(" ", "_")
+
+
+def _sentence(text: str) -> str:
+    """The first sentence of a help or of a docstring, behind its usage."""
+    said = next((part for part in text.split("\n\n") if not part.startswith("Usage:")), "")
+    return re.split(r"(?<=[.?!])\s", " ".join(said.split()), maxsplit=1)[0]
 
 
 def settings_page() -> str:
@@ -96,38 +107,46 @@ NEEDED = (
     "open_log", "follow", "build_map", "map_scans", "open_database", "Localizer",
 )  # fmt: skip
 """The names of `pc2grid` that people need, in the order in which they meet them."""
+_ABOUT_NEEDED = (
+    "Twelve names are enough for most programs. Each has an example that runs: `monday.mcap` and"
+    " `tuesday.mcap` are recordings, `building.submaps` is the database of the first."
+)
 
 
-def needed_page() -> str:
-    """The twelve names that people need, for mkdocstrings to fill in."""
-    about = (
-        "Twelve names are enough for most programs. Each has an example that runs: `monday.mcap` and"
-        " `tuesday.mcap` are recordings, `building.submaps` is the database of the first. [All other"
-        " names](pc2grid_more.md) are on the next page."
-    )
-    entries = (_entry(f"pc2grid.{name}", getattr(import_module("pc2grid"), name)) for name in NEEDED)
-    return "\n\n".join(("# pc2grid", about, *entries)) + "\n"
+def python_pages(package: str) -> Iterator[tuple[str, str]]:
+    """Path and text of a page for each public name of a package, and of one that lists them.
 
-
-def python_page(package: str) -> str:
-    """The docstring of a package, and its public names: those on other pages as links."""
+    What another package has, and what people need, has its page there.
+    """
     module = import_module(package)
-    own, links = [], []
-    for name in (name for name in module.__all__ if not name.startswith("_")):
+    names = [name for name in module.__all__ if not name.startswith("_")]
+    parts = [f"# {package}", as_markdown(module.__doc__ or "")]
+    if package == "pc2grid":
+        parts += [_ABOUT_NEEDED, _table(_row(package, name) for name in NEEDED), "## All others"]
+    listed = [name for name in names if package != "pc2grid" or name not in NEEDED]
+    parts.append(_table(_row(package, name) for name in listed))
+    yield package, "\n\n".join(parts) + "\n"
+    for name in names:
         thing = getattr(module, name)
-        if name in NEEDED or thing.__module__.split(".")[0] != package:
-            links.append(f"[`{name}`][{thing.__module__}.{thing.__qualname__}]")
-        else:
-            own.append(_entry(f"{package}.{name}", thing))
-    parts = [f"# {package}", as_markdown(module.__doc__ or ""), f"On other pages: {', '.join(links)}."]
-    return "\n\n".join((*parts, *own)) + "\n"
+        if _home(thing, name) == package:
+            path = f"{thing.__module__}.{thing.__qualname__}"
+            options = f"heading: {package}.{name}\n      heading_level: 1"
+            yield f"{package}/{name}", f"::: {path}\n    options:\n      {options}\n"
 
 
-def _entry(name: str, thing: Any) -> str:
-    """A public name, for mkdocstrings to fill in."""
-    label = name.partition(".")[2]
-    path = f"{thing.__module__}.{thing.__qualname__}"
-    return f"::: {path}\n    options:\n      heading: {name}\n      toc_label: {label}"
+def _table(rows: Iterable[str]) -> str:
+    return "\n".join(("| | |", "|---|---|", *rows))
+
+
+def _row(package: str, name: str) -> str:
+    thing = getattr(import_module(package), name)
+    sentence = _sentence(inspect.getdoc(thing) or "").replace("|", "\\|")
+    return f"| [`{name}`]({_home(thing, name)}/{name}.md) | {sentence} |"
+
+
+def _home(thing: Any, name: str) -> str:
+    """The package whose reference has the page of a public name."""
+    return "pc2grid" if name in NEEDED else thing.__module__.split(".")[0]
 
 
 def notebook_page(path: Path) -> str:
