@@ -66,10 +66,10 @@ def test_robots_that_are_carried_away_are_those_of_the_page() -> None:
     )
     kidnaps, noticed, s, m, shown, again, again_s, again_m, alarms, rows, judged, wrong = found
     said = (
-        f"Of {kidnaps} robots that were carried away, {noticed} noticed it, after {s} s and {m} m in the "
-        f"median; where the map shows what they saw there, {again} of {shown} were located again, after "
-        f"{again_s} s and {again_m} m. {wrong} of {judged} places that they told were wrong, and in {rows} "
-        f"drives there were {alarms} false alarms."
+        f"Of {kidnaps} such robots, {noticed} noticed it, {s} s and {m} m after they were put down (median). "
+        f"At {shown} of the new places the map shows what the robot sees: {again} robots were located again, "
+        f"after {again_s} s and {again_m} m. There were {alarms} false alarms in {rows} drives, and of "
+        f"{judged} poses {wrong} were wrong."
     )
     assert said in FLAT
 
