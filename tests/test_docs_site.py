@@ -87,7 +87,12 @@ def test_what_people_need_has_a_short_example() -> None:
 @pytest.mark.nightly
 def test_what_people_need_is_on_the_first_page_of_the_reference(site: Path) -> None:
     first = (site / "reference" / "pc2grid.html").read_text("utf-8").partition('id="all-others"')[0]
-    shown = {"convert": "overwrite: ", "relocalize": "answer.plot()", "Localizer": "Localizer("}
+    shown = {
+        "convert": "overwrite: ",
+        "relocalize": "pc2grid.relocalize(",
+        "Answer": "answer.plot()",
+        "Localizer": "Localizer(",
+    }
     for name, words in shown.items():
         assert f'href="pc2grid/{name}.html"' in first
         assert words in text_of(site / "reference" / "pc2grid" / f"{name}.html")

@@ -120,7 +120,7 @@ def python_pages(package: str) -> Iterator[tuple[str, str]]:
     """
     module = import_module(package)
     names = [name for name in module.__all__ if not name.startswith("_")]
-    parts = [f"# {package}", as_markdown(module.__doc__ or "")]
+    parts = [f"# {package}", _sentence(module.__doc__ or "")]
     if package == "pc2grid":
         parts += [_ABOUT_NEEDED, _table(_row(package, name) for name in NEEDED), "## All others"]
     listed = [name for name in names if package != "pc2grid" or name not in NEEDED]
@@ -135,7 +135,7 @@ def python_pages(package: str) -> Iterator[tuple[str, str]]:
 
 
 def _table(rows: Iterable[str]) -> str:
-    return "\n".join(("| | |", "|---|---|", *rows))
+    return "\n".join(("| name | what it is |", "|---|---|", *rows))
 
 
 def _row(package: str, name: str) -> str:
