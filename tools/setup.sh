@@ -102,7 +102,7 @@ if ! has_browser && has_apt && is_root; then
 fi
 has_browser || echo "setup: no chromium, so tests of pages are skipped; on Debian: sudo apt-get install chromium" >&2
 
-.venv/bin/python -c 'import pip' >/dev/null 2>&1 || "$python" -m venv --clear .venv
+.venv/bin/python -c 'import pip' >/dev/null 2>&1 || watched "$python" -m venv --clear .venv
 echo "setup: installing into .venv with $(.venv/bin/python --version) (the first time takes some minutes)"
 watched .venv/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]' ||
     fail "pip could not install pc2grid; its message is above"

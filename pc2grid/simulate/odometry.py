@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import lfilter
 
 from pc2grid.arrays import F64, freeze
 from pc2grid.geometry import SE2
@@ -40,8 +40,8 @@ def _slip(steps: int, error: float, step_s: float, memory_s: float, rng: np.rand
     keep = math.exp(-step_s / memory_s)
     white = rng.standard_normal(steps) * error * math.sqrt(1 - keep * keep)
     first = error * rng.standard_normal()
-    slip: F64 = lfilter([1.0], [1.0, -keep], white, zi=[keep * first])[0]
-    return slip
+    slip = itertools.accumulate(white.tolist(), lambda before, new: keep * before + new, initial=first)
+    return np.array([*slip][1:])
 
 
 def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) -> SimulatedOdometry:

@@ -80,10 +80,11 @@ def demo_command(
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]
         terminal.note("4/4 draw it")
-
         truth_m = np.array([(p.x, p.y) for p in true_poses])
-        draw_answer(picture, opened, answer, found.poses, truth_m)
-        write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
+        with terminal.progress("draw the picture and the page") as update:
+            draw_answer(picture, opened, answer, found.poses, truth_m)
+            update(0.5)
+            write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
     scans, submaps = counted(len(session.trajectory), "lidar scan"), counted(len(session.submaps), "submap")
     print(f"map: {scans}, {submaps}: {database}")
     print(as_text(answer))
