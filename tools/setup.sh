@@ -106,5 +106,6 @@ has_browser || echo "setup: no chromium, so tests of pages are skipped; on Debia
 echo "setup: installing into .venv with $(.venv/bin/python --version) (the first time takes some minutes)"
 watched .venv/bin/python -m pip install -q --disable-pip-version-check -c constraints.txt -e '.[dev]' ||
     fail "pip could not install pc2grid; its message is above"
-.venv/bin/python -c 'import open3d' || fail "open3d does not load; its message is above"
+# The first import of so much takes seconds: here they are seen, and not at the first command.
+watched .venv/bin/python -c 'import open3d, pc2grid_cli.demo' || fail "open3d does not load; its message is above"
 echo "setup: ready"
