@@ -52,9 +52,9 @@ class Piece:
     center_m: tuple[float, float]
 
     @staticmethod
-    def of(grid: OccupancyGrid, target: MapIndex) -> Piece:
-        """A square that is described as the places of `target` are."""
-        query = map_as_query(grid, target.made_with, target.config)
+    def of(square: OccupancyGrid, index: MapIndex) -> Piece:
+        """A square of a map, described as the places of an index are."""
+        query = map_as_query(square, index.made_with, index.config)
         x, y = query.walls.points_m.mean(axis=0).tolist() if len(query.walls.points_m) else (0.0, 0.0)
         return Piece(query, (x, y))
 
