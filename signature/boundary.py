@@ -1,4 +1,10 @@
-"""Boundary histogram: the distances between all pairs of points on the walls (paper III-B)."""
+"""Boundary histogram: the distances between all pairs of points on the walls (paper III-B).
+
+Of a submap, and of what is seen from a viewpoint. A submap is cut out of a map and known whole; its points
+are spread evenly over its walls. The points of a view are the ends of its rays. What hides from it counts
+neither for nor against: each bin is a share of what *was seen*, so that a part has about the histogram of the
+whole.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +13,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, I64, BoolGrid, cells_of
+from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.model import Submap
+from pc2grid.submaps.isovist import HIDDEN, OPEN, WALL, ray_ends
 from pc2grid.submaps.sampling import sample_evenly
 from pc2grid.submaps.skeleton import thin
 from signature.config import SignatureConfig
@@ -17,6 +24,12 @@ ROUNDING_BINS = 1e-6
 """Added to a distance in bins before it is rounded down, so that a distance on the edge of two bins counts in
 the upper one: 0.6 m / 0.2 m is 2.9999999999999996. It exceeds the rounding of float64 and is less than what
 a distance of cells differs from an edge if it does not lie on it."""
+
+RANGE_BINS, PAIR_BINS = 20, 40
+"""Bins of what is seen: of distances from the viewpoint, up to the limit of
+sight, and of distances of two wall points, up to twice of it. On sessions of office 1, csail and fr079 the
+right place came earlier with 40 bins of pairs than with 20: as number 63, 37 and 24 of 30,000 instead of 101,
+37 and 34, after 1, 3 and 8 m."""
 
 
 def boundary_edges(submap: Submap, config: SignatureConfig) -> BoolGrid:
@@ -40,14 +53,50 @@ def boundary_histogram(points: I64, radius_m: float, resolution_m: float, config
     points : (N, 2) cells. Returns (N_hb,) float32, sum 1; all 0 if there are fewer than two points.
     Distances of 2 r and more count in the last bin.
     """
-    from signature import _kernels
-
-    cells = np.ascontiguousarray(points, np.int64)
     bins_per_cell = resolution_m / config.boundary_bin_m
-    bins = boundary_bins(radius_m, config)
-    return normalized(_kernels.pair_distance_counts(cells, bins_per_cell, ROUNDING_BINS, bins))
+    return normalized(pair_distance_counts(points * bins_per_cell, boundary_bins(radius_m, config)))
+
+
+def pair_distance_counts(points: F64, bins: int) -> I64:
+    """How many pairs of points (N, 2), in units of the bin width, lie how far from each other: (bins,). The
+    last bin holds the longer distances as well."""
+    from scipy.spatial.distance import pdist
+
+    at = (pdist(points) + ROUNDING_BINS).astype(np.int64)
+    return np.bincount(np.minimum(at, bins - 1), minlength=bins)
 
 
 def normalized(counts: NDArray[np.generic]) -> F32:
     """Counts (N,) as shares, float32 of sum 1; all 0 stays all 0."""
     return np.asarray(counts / max(counts.sum(), 1), np.float32)
+
+
+def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
+    """The boundary of what is seen from N viewpoints: distances from there, and of all pairs of wall points.
+
+    ranges_m, ends : (N, B) of isovists. Returns (N, Kb) square roots of shares. A ray without a wall within
+    sight has no distance, but says that there is none: such rays, pairs with one and pairs of two have bins
+    of their own.
+    """
+    at = np.minimum((ranges_m / sight_m * RANGE_BINS).astype(np.int64), RANGE_BINS - 1)
+    ranges = shares(np.where(ends == OPEN, RANGE_BINS, at), ends != HIDDEN, RANGE_BINS + 1)
+    points = ray_ends(ranges_m) * (PAIR_BINS / (2.0 * sight_m))
+    pairs = np.empty((len(ranges_m), PAIR_BINS + 2))
+    for counts, at_ends, wall in zip(pairs, points, ends == WALL, strict=True):
+        counts[:PAIR_BINS] = pair_distance_counts(at_ends[wall], PAIR_BINS)
+    walls, opens = (np.count_nonzero(ends == kind, axis=1) for kind in (WALL, OPEN))
+    pairs[:, PAIR_BINS], pairs[:, PAIR_BINS + 1] = walls * opens, opens * (opens - 1) // 2
+    return np.sqrt(np.concatenate((ranges, as_shares(pairs)), axis=1))
+
+
+def shares(at: NDArray[np.int64], valid: NDArray[np.bool_], bins: int) -> F64:
+    """(N, bins) which share of the valid entries of each row of `at` (N, M) lies in each bin; all 0 without a
+    valid entry."""
+    rows = np.arange(len(at))[:, None] * bins
+    counts = np.bincount((rows + at)[valid], minlength=len(at) * bins)
+    return as_shares(counts.reshape(len(at), bins))
+
+
+def as_shares(counts: NDArray[np.number]) -> F64:
+    """Counts (N, bins) as shares of their row; all 0 stays all 0."""
+    return np.asarray(counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0), np.float64)

@@ -1,4 +1,9 @@
-"""Free-space histogram: the lengths of the shortest paths between the places of a submap (paper III-C)."""
+"""Free-space histogram: the lengths of the shortest paths between places of the free space (paper III-C).
+
+Of a submap, whose places lie on its skeleton, and of what is seen from a viewpoint, whose places are the
+viewpoint and the ends of its rays. In both, the places are nodes of a `networkx` graph, joined where they see
+each other.
+"""
 
 from __future__ import annotations
 
@@ -8,16 +13,32 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.model import OccupancyGrid, Submap
+from pc2grid.submaps.isovist import HIDDEN, ray_ends
 from pc2grid.submaps.sampling import sample_evenly
 from pc2grid.submaps.skeleton import skeleton_of
-from signature.boundary import ROUNDING_BINS, normalized
+from signature.boundary import ROUNDING_BINS, normalized, shares
 from signature.config import SignatureConfig
 
 if TYPE_CHECKING:
     import networkx as nx
+
+PATH_BINS = 20
+"""Bins of lengths of paths in what is seen, up to twice the limit of sight."""
+DETOUR_BINS, LARGEST_DETOUR = 6, 5.0 / 12.0
+"""Bins of the share by which a path is longer than the straight
+line, and the share from which it counts in the last of them."""
+STEPS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
+"""Edges of the bins of the step between neighbouring rays."""
+EVERY = 2
+"""The ends of so many-th rays are nodes of the free-space graph."""
+TOUCH_M = 0.05
+"""A straight line may leave what is seen by this, about the width of a cell."""
+NO_PATH = 1e6
+"""Metres; longer than any path."""
 
 
 def freespace_nodes(submap: Submap, config: SignatureConfig) -> I64:
@@ -116,3 +137,88 @@ def freespace_histogram(lengths_m: F64, radius_m: float, config: SignatureConfig
     pairs = lengths_m[np.triu_indices(len(lengths_m), 1)]
     length_bins = pairs[np.isfinite(pairs)] / config.freespace_bin_m + ROUNDING_BINS
     return normalized(np.bincount(np.minimum(length_bins.astype(np.int64), bins - 1), minlength=bins))
+
+
+def freespace_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
+    """The free space of what is seen from N viewpoints: lengths of paths, detours, openings.
+
+    ranges_m, ends : (N, B) of isovists. Returns (N, Kf) square roots of the shares of the path lengths of all
+    pairs of nodes of `seen_graph` (Eq. 3-4), of how much longer than the straight line these are, and of the
+    steps between the ranges of neighbouring rays: at a step, the free space goes on.
+    """
+    lengths_m, straight_m = path_lengths(ranges_m, ends)
+    first, second = np.triu_indices(lengths_m.shape[1], 1)
+    lengths, straight = lengths_m[:, first, second], straight_m[:, first, second]
+    known = lengths < NO_PATH
+    at = np.minimum(lengths / (2.0 * sight_m) * PATH_BINS + ROUNDING_BINS, PATH_BINS - 1).astype(np.int64)
+    paths = shares(at, known, PATH_BINS)
+    # From the viewpoint, node 0, every path is straight.
+    detour = (lengths - straight) / np.maximum(lengths, 1e-6) * ((DETOUR_BINS - 1) / LARGEST_DETOUR)
+    at = np.minimum(detour, DETOUR_BINS - 1).astype(np.int64)
+    detours = shares(at, known & (first > 0), DETOUR_BINS)
+    seen = ends != HIDDEN
+    step_m = np.abs(ranges_m - np.roll(ranges_m, -1, axis=1))
+    at = np.searchsorted(np.array(STEPS_M), step_m)
+    steps = shares(at, seen & np.roll(seen, -1, axis=1), len(STEPS_M) + 1)
+    return np.sqrt(np.concatenate((paths, detours, steps), axis=1))
+
+
+def seen_graph(ranges_m: F32, ends: NDArray[np.int8]) -> nx.Graph:
+    """The free-space graph of one isovist (B,): node 0 is the viewpoint, node 1 + k the end of ray k `every`.
+
+    Nodes of rays whose ends are hidden are left out. Edges with `length_m` join nodes whose straight line
+    stays inside of what is seen (III-C 2).
+    """
+    import networkx as nx
+
+    points_m, known, visible = _nodes(ranges_m[None], ends[None])
+    graph = nx.Graph()
+    graph.add_nodes_from(np.flatnonzero(known[0]).tolist())
+    for a, b in np.argwhere(np.triu(visible[0], 1)).tolist():
+        graph.add_edge(a, b, length_m=math.dist(points_m[0, a], points_m[0, b]))
+    return graph
+
+
+def path_lengths(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, F64]:
+    """Lengths (N, M, M) of the shortest paths and of the straight lines between the nodes of `seen_graph`.
+
+    Of nodes that are left out, the paths are `NO_PATH` long. All isovists together, by Floyd and Warshall's
+    algorithm: 0.1 ms each, where networkx' Dijkstra takes 10.
+    """
+    points_m, _, visible = _nodes(ranges_m, ends)
+    straight_m = np.hypot(*(points_m[:, :, None] - points_m[:, None]).transpose(3, 0, 1, 2))
+    lengths_m = np.where(visible, straight_m, NO_PATH)
+    for via in range(lengths_m.shape[1]):
+        np.minimum(lengths_m, lengths_m[:, :, via, None] + lengths_m[:, None, via], out=lengths_m)
+    return np.minimum(lengths_m, NO_PATH), straight_m
+
+
+def _nodes(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Points (N, M, 2) of the nodes of `seen_graph`, which are known (N, M), and which pairs see each other
+    (N, M, M)."""
+    count, bearings = ranges_m.shape
+    angles = 2.0 * math.pi * np.arange(bearings) / bearings
+    at = np.arange(0, bearings, EVERY)
+    nodes = 1 + len(at)
+    points_m = np.zeros((count, nodes, 2))
+    points_m[:, 1:] = ray_ends(ranges_m)[:, at]
+    known = np.ones((count, nodes), bool)
+    known[:, 1:] = ends[:, at] != HIDDEN
+    visible = np.zeros((count, nodes, nodes), bool)
+    visible[:, 0], visible[:, :, 0] = True, True
+    reach_m = ranges_m + TOUCH_M
+    for apart in range(1, (len(at) - 1) // 2 + 1):
+        # The line from end a to end b crosses each ray between them at a distance of
+        # r_a r_b sin(b - a) / (r_a sin(k - a) + r_b sin(b - k)).
+        other = np.roll(ranges_m, -apart * EVERY, axis=1)[:, at]
+        own = ranges_m[:, at]
+        across = own * other * math.sin(angles[apart * EVERY])
+        clear = np.ones(own.shape, bool)
+        for between in range(1, apart * EVERY):
+            wide = own * math.sin(angles[between]) + other * math.sin(angles[apart * EVERY - between])
+            clear &= across <= wide * np.roll(reach_m, -between, axis=1)[:, at]
+        a = np.arange(len(at))
+        b = (a + apart) % len(at)
+        visible[:, 1 + a, 1 + b], visible[:, 1 + b, 1 + a] = clear, clear
+    visible &= known[:, :, None] & known[:, None]
+    return points_m, known, visible

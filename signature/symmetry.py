@@ -1,4 +1,8 @@
-"""Reflection symmetry scores: how well the walls coincide with their own mirror image (paper III-D)."""
+"""Reflection symmetry: how well the walls coincide with their own mirror image (paper III-D).
+
+Of a submap, mirrored at its two main directions, and of what is seen from a viewpoint, whose ranges are
+mirrored at every axis through it.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +11,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.submaps.isovist import HIDDEN
 from signature.config import SignatureConfig
 
 _DIRECTIONS = 180
@@ -16,6 +22,15 @@ _DIRECTIONS = 180
 
 _LEAST_VOTE = 1e-6
 """A direction needs more than this share of alpha's vote to become beta: the blur's rounding is less."""
+
+MIRROR_M = 0.5
+"""Two ranges that differ by this do not agree at all."""
+FEW = 0.15
+"""Added to the number of mirrored pairs, as a share of all rays, so that the agreement of few
+pairs counts for less."""
+BESIDE = ((0,), (0.5,), (0.25, 0.75), (0.125, -0.125), (0.375, -0.375))
+"""Directions of mirror axes relative to the best one, as shares of half a circle; the mean of each group."""
+QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 
 
 class Axes(NamedTuple):
@@ -130,3 +145,46 @@ def symmetry_scores(edges: BoolGrid, resolution_m: float, config: SignatureConfi
     image = blurred(edges, resolution_m, config)
     cells = cells_of(edges)
     return np.array([reflection_score(cells, image, axis) for axis in axes], np.float32)
+
+
+def symmetry_seen(ranges_m: F32, ends: NDArray[np.int8]) -> F64:
+    """The symmetry of what is seen from N viewpoints: agreement, 0..1, with its mirror image and with half a
+    turn.
+
+    ranges_m, ends : (N, B) of isovists, B a multiple of 8. Returns (N, Ks). The mirror axes pass through the
+    viewpoint, one every half ray. The columns: at the best axis, at those of `BESIDE` beside it (of the two
+    diagonal ones the worse and the better), the mean of all, their quantiles, and the agreement after half a
+    turn.
+    """
+    count, bearings = ranges_m.shape
+    agreement = mirror_agreement(ranges_m, ends)
+    best = agreement.argmax(axis=1)
+    beside = [
+        agreement[
+            np.arange(count)[:, None],
+            (best[:, None] + np.array([round(s * bearings) for s in axes])) % bearings,
+        ]
+        for axes in BESIDE
+    ]
+    diagonal = np.sort(beside[2], axis=1)
+    columns = [beside[0], beside[1], diagonal, *(b.mean(axis=1, keepdims=True) for b in beside[3:])]
+    columns += [agreement.mean(axis=1, keepdims=True), np.quantile(agreement, QUANTILES, axis=1).T]
+    opposite = (np.arange(bearings) + bearings // 2) % bearings
+    half_turn = _agreement(ranges_m, ends != HIDDEN, opposite)
+    return np.concatenate([*columns, half_turn[:, None]], axis=1)
+
+
+def mirror_agreement(ranges_m: F32, ends: NDArray[np.int8]) -> F64:
+    """(N, B) agreement, 0..1, of the ranges with their mirror image at each axis through the viewpoint; axis
+    k lies pi k / B from the first ray."""
+    rays, seen = np.arange(ranges_m.shape[1]), ends != HIDDEN
+    at_each = [_agreement(ranges_m, seen, (axis - rays) % len(rays)) for axis in rays]
+    return np.stack(at_each, axis=1)
+
+
+def _agreement(ranges_m: F32, seen: NDArray[np.bool_], partner: NDArray[np.intp]) -> F64:
+    """(N,) mean agreement of each range with that of its partner (B,), where both are known."""
+    both = seen & seen[:, partner]
+    apart = np.abs(ranges_m - ranges_m[:, partner]) / MIRROR_M
+    total = (np.maximum(0.0, 1.0 - apart) * both).sum(axis=1)
+    return np.asarray(total / (both.sum(axis=1) + FEW * ranges_m.shape[1]))

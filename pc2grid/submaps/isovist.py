@@ -74,6 +74,13 @@ def look_around(
     return ranges * np.float32(grid.resolution_m), ends
 
 
+def ray_ends(ranges_m: F32) -> F64:
+    """The points (N, B, 2) where the rays of isovists (N, B) end, from the points that they are seen from."""
+    bearings_rad = 2.0 * np.pi * np.arange(ranges_m.shape[1]) / ranges_m.shape[1]
+    directions = np.stack((np.cos(bearings_rad), np.sin(bearings_rad)), axis=-1)
+    return np.asarray(ranges_m[..., None] * directions, np.float64)
+
+
 def isovist(
     grid: OccupancyGrid,
     center_m: tuple[float, float],

@@ -16,10 +16,13 @@ from pc2grid.arrays import F32, F64, BoolGrid
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import look_around
+from signature.boundary import RANGE_BINS, boundary_seen
+from signature.freespace import PATH_BINS, freespace_seen
 from signature.retrieval.place_index import POSES
-from signature.seen import SEEN, boundary_seen, freespace_seen, mirror_agreement, seen_signatures
+from signature.seen import seen_signatures
 from signature.seen_likelihood import seen_spread, seen_weights
 from signature.seen_places import PROFILE_BEARINGS
+from signature.symmetry import mirror_agreement
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -98,8 +101,8 @@ def _described(
     """What is seen from points (N, 2), and the signatures (N, K); the axes of symmetry are counted on by
     `turned`."""
     ranges_m, ends = look_around(grid, points_m, sight_m, bearings=PROFILE_BEARINGS)
-    boundary = boundary_seen(ranges_m, ends, sight_m)[:, SEEN.range_bins + 1 :] ** 2
-    freespace = freespace_seen(ranges_m, ends, sight_m)[:, : SEEN.path_bins] ** 2
+    boundary = boundary_seen(ranges_m, ends, sight_m)[:, RANGE_BINS + 1 :] ** 2
+    freespace = freespace_seen(ranges_m, ends, sight_m)[:, :PATH_BINS] ** 2
     symmetry = np.roll(mirror_agreement(ranges_m, ends), turned, axis=1)
     drawn = [
         DrawnSignatures(boundary=one, freespace=two, symmetry=three)

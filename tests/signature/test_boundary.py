@@ -6,12 +6,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.distance import pdist
 
-from pc2grid.arrays import I64
-from signature import _kernels
 from signature.boundary import (
-    ROUNDING_BINS,
     boundary_bins,
     boundary_edges,
     boundary_histogram,
@@ -21,15 +17,6 @@ from signature.config import SignatureConfig
 from tests.helpers.rooms import RESOLUTION_M, rectangle, submap_of
 
 CONFIG = SignatureConfig()
-
-
-def pair_distance_counts(cells: I64, bins_per_cell: float, rounding_bins: float, bins: int) -> I64:
-    """How many pairs m < n of cells (N, 2) lie how far from each other, Eq. 1-2: (bins,).
-
-    Bin k holds the distances from k to k + 1 in units of the bin width, the last bin the longer ones as well.
-    """
-    at = (pdist(cells * bins_per_cell) + rounding_bins).astype(np.int64)
-    return np.bincount(np.minimum(at, bins - 1), minlength=bins)
 
 
 def histogram(cells: np.ndarray, config: SignatureConfig = CONFIG) -> np.ndarray:
@@ -83,14 +70,6 @@ def test_matches_brute_force(seed: int, count: int, bin_m: float) -> None:
     points = np.random.default_rng(seed).integers(0, 226, (count, 2))
     found = boundary_histogram(points, 8.0, RESOLUTION_M, config)
     assert found == pytest.approx(brute_force(points, config), abs=1e-6)
-
-
-@given(seed=st.integers(0, 10_000), count=st.integers(0, 60), bin_cells=st.sampled_from([2.0, 4.0, 6.0, 5.0]))
-@settings(max_examples=40, deadline=None)
-def test_the_compiled_counts_are_those_of_scipy(seed: int, count: int, bin_cells: float) -> None:
-    cells = np.random.default_rng(seed).integers(0, 226, (count, 2))
-    arguments = (cells, 1.0 / bin_cells, ROUNDING_BINS, 40)
-    assert np.array_equal(_kernels.pair_distance_counts(*arguments), pair_distance_counts(*arguments))
 
 
 def test_only_clearly_occupied_cells_are_boundary() -> None:

@@ -12,14 +12,9 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32
 from pc2grid.submaps.isovist import HIDDEN, OPEN, WALL
-from signature.seen import (
-    SEEN,
-    boundary_seen,
-    parts,
-    path_lengths,
-    seen_graph,
-    seen_signatures,
-)
+from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_seen
+from signature.freespace import DETOUR_BINS, PATH_BINS, path_lengths, seen_graph
+from signature.seen import parts, seen_signatures
 
 SIGHT_M, BEARINGS = 5.0, 48
 Ends = NDArray[np.int8]
@@ -50,9 +45,9 @@ def test_each_histogram_is_a_share_of_what_was_seen() -> None:
     columns = parts()
     assert found.shape[1] == columns["symmetry"].stop + 1
     squares = found.astype(np.float64) ** 2
-    ranges = SEEN.range_bins + 1
-    paths = columns["freespace"].start + SEEN.path_bins
-    edges = [0, ranges, columns["boundary"].stop, paths, paths + SEEN.detours, columns["freespace"].stop]
+    ranges = RANGE_BINS + 1
+    paths = columns["freespace"].start + PATH_BINS
+    edges = [0, ranges, columns["boundary"].stop, paths, paths + DETOUR_BINS, columns["freespace"].stop]
     for start, stop in itertools.pairwise(edges):
         np.testing.assert_allclose(squares[:, start:stop].sum(axis=1), 1.0, atol=1e-5)
     assert (found[:, columns["symmetry"]] >= 0).all() and (found[:, columns["symmetry"]] <= 1).all()
@@ -62,7 +57,7 @@ def test_each_histogram_is_a_share_of_what_was_seen() -> None:
 def test_pair_distances_are_those_of_all_pairs_of_wall_points() -> None:
     ranges_m, ends = random_views(1)
     angles = 2 * math.pi * np.arange(BEARINGS) / BEARINGS
-    counts = np.zeros(SEEN.pair_bins + 2)
+    counts = np.zeros(PAIR_BINS + 2)
     for i in range(BEARINGS):
         for j in range(i):
             pair = ends[0, i], ends[0, j]
@@ -72,9 +67,9 @@ def test_pair_distances_are_those_of_all_pairs_of_wall_points() -> None:
                 complex(r * math.cos(t), r * math.sin(t))
                 for r, t in zip(ranges_m[0, [i, j]], angles[[i, j]], strict=True)
             )
-            at = min(int(abs(a - b) / (2 * SIGHT_M) * SEEN.pair_bins), SEEN.pair_bins - 1)
-            counts[SEEN.pair_bins + pair.count(OPEN) - 1 if OPEN in pair else at] += 1
-    found = boundary_seen(ranges_m, ends, SIGHT_M)[0, SEEN.range_bins + 1 :][: SEEN.pair_bins + 2]
+            at = min(int(abs(a - b) / (2 * SIGHT_M) * PAIR_BINS), PAIR_BINS - 1)
+            counts[PAIR_BINS + pair.count(OPEN) - 1 if OPEN in pair else at] += 1
+    found = boundary_seen(ranges_m, ends, SIGHT_M)[0, RANGE_BINS + 1 :][: PAIR_BINS + 2]
     np.testing.assert_allclose(found**2, counts / counts.sum(), atol=0.01)
 
 
