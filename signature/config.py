@@ -10,7 +10,17 @@ from typing_extensions import Self
 import pc2grid.config
 from pc2grid.config import PartitionConfig, Section
 
-ShortlistBy = Literal["signatures", "shuffled", "random"]
+ShortlistBy = Literal[
+    "signatures",
+    "boundary",
+    "freespace",
+    "symmetry",
+    "boundary+freespace",
+    "boundary+symmetry",
+    "freespace+symmetry",
+    "shuffled",
+    "random",
+]
 """By the signatures; as a control, by those of another place, or by chance."""
 
 
@@ -148,8 +158,8 @@ class RelocalizeConfig(Section):
     shortlist_most: int = Field(3200, gt=0, description="but no more than so many")
     shortlist_by: ShortlistBy = Field(
         "signatures",
-        description="what selects them; two controls show what signatures are worth: shuffled, by those of"
-        " another viewpoint; random",
+        description="what selects them; the others are controls, which show what the signatures are worth:"
+        " some of the three; shuffled, by those of another viewpoint; random",
     )
     coarse_floor: float = Field(
         0.4, ge=0, le=1, description="placements with a lower coarse score are dropped"

@@ -14,13 +14,14 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64, BoolGrid
+from pc2grid.arrays import F64, I64
 from pc2grid.model import OccupancyGrid
-from signature.config import RelocalizeConfig
+from signature.config import RelocalizeConfig, ShortlistBy
 from signature.retrieval.lazy_maps import LazySequence
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex, Poses
 from signature.retrieval.place_signatures import PlaceSignatures
 from signature.retrieval.view import View
+from signature.seen_likelihood import seen_spread, seen_weights
 from signature.seen_places import SeenPlaces
 from signature.similarity import SignatureTable
 
@@ -77,6 +78,7 @@ class Places:
         self._session_of_block = np.unique(table.session_index)
         self.ground: LazySequence[tuple[F64, I64]] = LazySequence(self._ground, len(grids), _KEPT_SESSIONS)
         """By session, the squares (K, 2) that hold free ground, and the places next to them (K,)."""
+        self._controls: dict[ShortlistBy, tuple[PlaceIndex, PlaceSignatures | None]] = {}
         self._selected: tuple[Sequence[View], RelocalizeConfig, I64] | None = None
 
     @property
@@ -101,10 +103,26 @@ class Places:
             return every[:0]
         if config.shortlist_by == "random":
             return self._at_once(self._chance.permutation(every)[:most])
-        shuffled = config.shortlist_by == "shuffled"
-        index = self._shuffled if shuffled else self.index()
-        found = index.poses(views, base_m, None if shuffled else self.likely(views, most))
-        return self._at_once(self.next_to(found, most))
+        index, first_look = self._searched(config.shortlist_by)
+        among = None if first_look is None else first_look.likely(views, most)
+        return self._at_once(self.next_to(index.poses(views, base_m, among), most))
+
+    def _searched(self, by: ShortlistBy) -> tuple[PlaceIndex, PlaceSignatures | None]:
+        """The viewpoints, and the places for a first look, by all signatures or as a control wants them.
+        There is no first look at places that were made with other bins."""
+        if by == "signatures":
+            return self.index(), self._first_look
+        if by not in self._controls:
+            names = by.split("+")
+            self._controls[by] = (
+                (self.index().shuffled(self._chance), None)
+                if by == "shuffled"
+                else (
+                    PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names)),
+                    PlaceSignatures.of(self.table, names=names),
+                )
+            )
+        return self._controls[by]
 
     def next_to(self, poses: Poses, most: int) -> I64:
         """The `most` places (R,) that the robot stands next to in the likeliest poses, likeliest first; if
@@ -125,11 +143,6 @@ class Places:
         kept: I64 = rows[np.isin(of, sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])])]
         return kept
 
-    def likely(self, views: Sequence[View], most: int) -> BoolGrid | None:
-        """The places (N,) that a first look by the signatures of the places leaves; None if it cannot be
-        taken, because they were made with other bins."""
-        return None if self._first_look is None else self._first_look.likely(views, most)
-
     @cached_property
     def _first_look(self) -> PlaceSignatures | None:
         return PlaceSignatures.of(self.table)
@@ -148,11 +161,6 @@ class Places:
         if self._index is None:
             self._index = PlaceIndex.of(self.blocks(on_progress))
         return self._index
-
-    @cached_property
-    def _shuffled(self) -> PlaceIndex:
-        """The same viewpoints, each with the signatures of another one: a control."""
-        return self.index().shuffled(self._chance)
 
     def blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[PlaceBlock]:
         """What is seen from the places of each session: as stored, or else computed from the map."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from pc2grid.arrays import F32, F64, I64
 from pc2grid.geometry import SE2
 from pc2grid.simulate import office_floorplan
-from signature.config import RelocalizeConfig
+from signature.config import RelocalizeConfig, ShortlistBy
 from signature.localization.query import Query, QueryMap
 from signature.retrieval._kernels import best_headings
 from signature.retrieval.place_index import POSES, PlaceBlock, PlaceIndex
@@ -119,13 +120,14 @@ def test_a_share_of_the_places_is_selected_and_at_least_a_hundred() -> None:
 def test_the_controls_select_as_many_places_and_find_fewer() -> None:
     """As by `relocalize --set relocalize.shortlist_by=shuffled`."""
     asked, found = queries(), {}
-    for by in ("signatures", "shuffled", "random"):
+    for by in get_args(ShortlistBy):
         config = RelocalizeConfig.model_validate({"shortlist": 5, "shortlist_share": 0.0, "shortlist_by": by})
         places = building({"office": office()}).places
         rows = [places.select(query.views, query.center_m, config) for query, _ in asked]
         assert {len(chosen) for chosen in rows} == {5}
         found[by] = np.mean([np.isin(r, right(*each)).any() for r, each in zip(rows, asked, strict=True)])
-    assert found["signatures"] >= max(found["shuffled"], found["random"]) + 0.2
+    assert min(found["signatures"], found["boundary"]) >= max(found["shuffled"], found["random"]) + 0.2
+    assert found["symmetry"] < found["boundary"]
 
 
 def test_the_free_ground_next_to_a_place_is_searched() -> None:

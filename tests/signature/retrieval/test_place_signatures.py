@@ -19,7 +19,6 @@ from signature.retrieval.place_signatures import (
     table_rows,
     view_rows,
 )
-from signature.retrieval.viewpoints import Places
 from signature.similarity import SignatureTable
 from tests.helpers.simulated_drives import building, office
 
@@ -94,7 +93,6 @@ def test_histograms_with_other_bins_cannot_be_looked_at() -> None:
         [describe(submap, paper.signature) for submap in submaps], [submap.center_m for submap in submaps]
     )
     assert PlaceSignatures.of(table) is None
-    assert Places(table, [office()], 8.0, [office().free_m2]).likely(VIEWS, 5) is None
 
 
 def test_rows_are_roots_of_shares_and_what_was_seen() -> None:

@@ -1,17 +1,18 @@
-"""What the signatures decide: real windows, located with their shortlist, a shuffled one, and one at random.
+"""What the signatures decide: real windows, located with their shortlist, with parts of it, and without.
 
-    python -m pc2grid_lab.fit.shortlists DATA WORK [--only PATTERN]
+    python -m pc2grid_lab.fit.shortlists DATA WORK [--only PATTERN] [--places 13000,100000]
 
 DATA is the folder of recordings, WORK the one in which `compare recordings` has kept its maps and answers.
-Each window whose place is known is asked in its map, if that has enough places to be chosen from, and in one
-map of each building as one database. For both, a row for each shortlist: how many windows there are, how many
-are located rightly and wrongly, and the processor time of a look-up with its decision (median, s).
+Each window whose place is known is asked in its map, in one map of each building as one database, and in that
+together with so many office floors that it has 13,000 and 100,000 places. A row for each database and each
+`signature.config.ShortlistBy`: how many windows there are, how many are located rightly and wrongly, and the
+processor time of a look-up with its decision (median, s).
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
@@ -20,41 +21,54 @@ import numpy as np
 import typer
 
 from pc2grid.geometry import SE2
+from pc2grid_lab.experiments.answers import index_of as index_of_grid
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.fit.posterior import RIGHT_M, RIGHT_RAD
-from pc2grid_lab.fit.recorded_queries import Only, error_of, index_of, windows
+from pc2grid_lab.fit.queries import office_floor
+from pc2grid_lab.fit.recorded_queries import Only, Window, error_of, index_of, windows
 from signature.config import Config, ShortlistBy
 from signature.localization.decision import decide
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 from signature.similarity import SignatureTable
 
-_ENOUGH = 200
+_FEW = 200
 """Of fewer places, half or more are aligned at in any case."""
+_FIRST_FLOOR = 40_000
+"""Seed of the first office floor: others than those that the weights were learned from."""
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """An answer: in which maps, by which shortlist; whether located, whether right, and its time."""
+    """An answer: whether located, whether right, and its processor time."""
 
-    where: str
-    by: ShortlistBy
     located: bool
     right: bool
     cpu_s: float
 
 
-def asked(where: str, index: MapIndex, query: QueryMap, truth: Mapping[str, SE2]) -> Iterator[Asked]:
-    """The answers by each shortlist. truth : where the base is, by session of the index."""
-    for by in get_args(ShortlistBy):
-        index.config = index.config.model_copy(update={"shortlist_by": by})
-        begin = time.process_time()
-        verdict = decide(index, query, index.look_up(query))
-        cpu_s = time.process_time() - begin
-        errors = (error_of(index, query, place, truth) for place in verdict.hypotheses[:1])
-        right = any(error_m <= RIGHT_M and error_rad <= RIGHT_RAD for error_m, error_rad in errors)
-        yield Asked(where, by, verdict.status == "located", right, cpu_s)
+@dataclass(frozen=True, slots=True)
+class Database:
+    """A database that windows are asked in.
+
+    index : the one for a window; None if it is not asked there. truth : where the base is, by session.
+    """
+
+    name: str
+    index: Callable[[Window], MapIndex | None]
+    truth: Callable[[Window], Mapping[str, SE2]]
+
+
+def asked(index: MapIndex, query: QueryMap, by: ShortlistBy, truth: Mapping[str, SE2]) -> Asked:
+    """The answer by a shortlist. truth : where the base is, by session of the index."""
+    index.config = index.config.model_copy(update={"shortlist_by": by})
+    begin = time.process_time()
+    verdict = decide(index, query, index.look_up(query))
+    cpu_s = time.process_time() - begin
+    errors = (error_of(index, query, place, truth) for place in verdict.hypotheses[:1])
+    right = any(error_m <= RIGHT_M and error_rad <= RIGHT_RAD for error_m, error_rad in errors)
+    return Asked(verdict.status == "located", right, cpu_s)
 
 
 def together(maps: Mapping[str, MapIndex]) -> MapIndex:
@@ -67,21 +81,31 @@ def together(maps: Mapping[str, MapIndex]) -> MapIndex:
     return MapIndex(grids, SignatureTable.concatenated(tables), Config(), Config())
 
 
-def answers(catalogue: Catalogue, folder: Folder) -> Iterator[Asked]:
-    """The answers to every window of the catalogue whose place is known."""
-    maps = {name: index_of(folder.map(name)) for name in one_each(folder)}
-    every = together(maps)
-    print(f"all maps: {len(maps)}, {len(every.places.table)} places", flush=True)
-    for window in windows(catalogue, folder):
+def databases(folder: Folder, sizes: Sequence[int]) -> Iterator[Database]:
+    """The databases, one after the other. sizes : places of those with office floors."""
+    own: dict[str, MapIndex] = {}
+
+    def its_map(window: Window, few: bool) -> MapIndex | None:
         name = window.pair.map_name
-        if not window.truth:
-            continue
-        own = index_of(folder.map(name))
-        if len(own.places.table) >= _ENOUGH:
-            yield from asked("its map", own, window.whole, window.truth)
-        if name in maps:
-            yield from asked("all maps", every, window.whole, {name: next(iter(window.truth.values()))})
-        print(name, f"{window.span.start_s:.1f} s", flush=True)
+        if name not in own:
+            own[name] = index_of(folder.map(name))
+        return own[name] if (len(own[name].places.table) < _FEW) == few else None
+
+    yield Database(f"its map, up to {_FEW} places", lambda w: its_map(w, True), lambda w: w.truth)
+    yield Database("its map, more places", lambda w: its_map(w, False), lambda w: w.truth)
+    maps = {name: index_of(folder.map(name)) for name in one_each(folder)}
+
+    def one_truth(window: Window) -> Mapping[str, SE2]:
+        return {window.pair.map_name: next(iter(window.truth.values()))}
+
+    seed = _FIRST_FLOOR
+    for size in (0, *sizes):
+        while sum(len(index.places.table) for index in maps.values()) < size:
+            maps[f"floor {seed}"] = index_of_grid("floor", office_floor(seed), Config())
+            seed += 1
+        every = together(maps)
+        name = f"{len(maps)} buildings, {len(every.places.table)} places"
+        yield Database(name, lambda w, e=every: e if w.pair.map_name in e.sessions else None, one_truth)
 
 
 def one_each(folder: Folder) -> list[str]:
@@ -93,14 +117,27 @@ def one_each(folder: Folder) -> list[str]:
     return list(found.values())
 
 
-def main(data: Path, work: Path, only: Only = None) -> None:
+def row(database: Database, by: ShortlistBy, known: Sequence[Window]) -> str:
+    """A row of the table: the windows asked in a database by a shortlist."""
+    found = [
+        asked(index, window.whole, by, database.truth(window))
+        for window in known
+        if (index := database.index(window)) is not None
+    ]
+    located = [one.right for one in found if one.located]
+    cpu_s = np.median([one.cpu_s for one in found]) if found else 0.0
+    return (
+        f"| {database.name} | {by} | {len(found)} | {sum(located)} | {located.count(False)} | {cpu_s:.2f} |"
+    )
+
+
+def main(data: Path, work: Path, only: Only = None, places: str = "13000,100000") -> None:
     """Print the table: windows located by each shortlist. DATA and WORK are those of `compare recordings`."""
-    found = list(answers(Catalogue.of(only=only), Folder(data.resolve(), work.resolve())))
-    for where, by in dict.fromkeys((one.where, one.by) for one in found):
-        rows = [one for one in found if (one.where, one.by) == (where, by)]
-        located = [one.right for one in rows if one.located]
-        cpu_s = np.median([one.cpu_s for one in rows])
-        print(f"| {where} | {by} | {len(rows)} | {sum(located)} | {located.count(False)} | {cpu_s:.2f} |")
+    folder = Folder(data.resolve(), work.resolve())
+    known = [window for window in windows(Catalogue.of(only=only), folder) if window.truth]
+    for database in databases(folder, [int(size) for size in places.split(",")]):
+        for by in get_args(ShortlistBy):
+            print(row(database, by, known), flush=True)
 
 
 if __name__ == "__main__":
