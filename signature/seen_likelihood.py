@@ -42,7 +42,7 @@ _TOO_LITTLE = 0.15
 """Share of the rays; a view that has seen less is not used to learn how much a distance says."""
 COMBINATIONS = tuple(c for n in (1, 2, 3) for c in itertools.combinations(parts(), n))
 """The names of all combinations of the signatures; the last one is all three."""
-_FILE = Path(__file__).with_name("seen_statistics.npz")
+_FILE = Path(__file__).with_name("statistics.npz")
 
 
 FloatArray = TypeVar("FloatArray", F32, F64)
@@ -114,24 +114,35 @@ class SeenStatistics:
         a, b, c, d, e, one, two = self.spreads[COMBINATIONS.index(chosen)].tolist()
         return Spread(one_place=(a, b, c), two_places=(d, e), one_shape=one, two_shape=two)
 
-    def save(self, path: Path) -> None:
-        """Write the statistics to a .npz file."""
+    @staticmethod
+    def save(path: Path, **each: SeenStatistics) -> None:
+        """Write statistics to one .npz file, each under its name."""
+        content = {
+            f"{name}.{field.name}": getattr(statistics, field.name).astype(np.float32)
+            for name, statistics in each.items()
+            for field in fields(statistics)
+        }
         with replace_file(path) as draft, draft.open("wb") as file:
-            content = {field.name: getattr(self, field.name).astype(np.float32) for field in fields(self)}
             np.savez_compressed(file, **content)
 
     @staticmethod
-    def load(path: Path = _FILE) -> SeenStatistics:
-        """Read what `save` has written; by default the statistics that come with the program.
+    def load(name: str = "viewpoints", path: Path = _FILE) -> SeenStatistics:
+        """Read what `save` has written under a name; by default the statistics that come with the program: of
+        `viewpoints`, and of `places`, by which the first look is taken.
 
-        `python -m pc2grid_lab.fit.simulated FOLDER office:1 fr079.yaml intel.yaml` has made a fifth of
-        the variation within one place: 18 simulated sessions in each of these plans, 6 each by lidar, laser
+        `python -m pc2grid_lab.fit.simulated FOLDER office:1 fr079.yaml intel.yaml` has made a fifth of the
+        variation within one viewpoint: 18 simulated sessions in each of these plans, 6 each by lidar, laser
         and depth camera, after 1, 3 and 8 m of travel, in the maps of all three sensors, with 30 pieces of
         clutter and a fifth of the doors and of the furniture changed in each session. All else is of the real
         logs of fr079, intel, csail and killian, by `pc2grid_lab.fit.signatures`.
         """
         with np.load(path, allow_pickle=False) as file:
-            return SeenStatistics(**{name: file[name].astype(np.float64) for name in file.files})
+            return SeenStatistics(
+                **{
+                    field.name: file[f"{name}.{field.name}"].astype(np.float64)
+                    for field in fields(SeenStatistics)
+                }
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -168,11 +179,15 @@ class SeenWeights:
         return np.asarray((signatures[:, signature_columns()] - self.place_mean) @ self.matrix, np.float32)
 
 
+learned = functools.cache(SeenStatistics.load)
+"""The statistics that come with the program, of `viewpoints` and of `places`; read once."""
+
+
 @functools.cache
-def seen_weights(*names: str) -> SeenWeights:
+def seen_weights(*names: str, of: str = "viewpoints") -> SeenWeights:
     """The weights of all three signatures, or of those named, by the statistics that come with the
     program."""
-    return SeenWeights.of(SeenStatistics.load(), names)
+    return SeenWeights.of(learned(of), names)
 
 
 def fitted_spreads(statistics: SeenStatistics, pairs: Pairs, *, seed: int = 0) -> F64:
@@ -185,7 +200,7 @@ def fitted_spreads(statistics: SeenStatistics, pairs: Pairs, *, seed: int = 0) -
 @functools.cache
 def seen_spread(*names: str) -> Spread:
     """How much the distance by the signatures of `seen_weights` says."""
-    return SeenStatistics.load().spread(names)
+    return learned("viewpoints").spread(names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

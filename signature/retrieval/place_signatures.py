@@ -11,21 +11,18 @@ logs.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, BoolGrid
 from signature.retrieval.view import View
-from signature.seen_likelihood import SeenStatistics, SeenWeights
+from signature.seen_likelihood import SeenWeights, learned, seen_weights
 from signature.similarity import SignatureTable
 
-_FILE = Path(__file__).with_name("place_statistics.npz")
 _BRIGHTEST = 255.0
 """Largest symmetry score: the brightness of a white pixel."""
 _AT_ONCE = 65_536
@@ -45,15 +42,12 @@ class PlaceSignatures:
     weights: SeenWeights
 
     @staticmethod
-    def of(
-        table: SignatureTable, statistics: SeenStatistics | None = None, names: Sequence[str] = ()
-    ) -> PlaceSignatures | None:
+    def of(table: SignatureTable, names: Sequence[str] = ()) -> PlaceSignatures | None:
         """The places of a table; None if its bins are not those that the weights were learned for (`--preset
         paper`). names : of the signatures that are compared, by default all."""
-        statistics = statistics or place_statistics()
-        if tuple(statistics.sizes) != columns_of(table):
+        if tuple(learned("places").sizes) != columns_of(table):
             return None
-        weights = SeenWeights.of(statistics, names)
+        weights = seen_weights(*names, of="places")
         parts = [slice(at, at + _AT_ONCE) for at in range(0, len(table), _AT_ONCE)]
         vectors = [weights.of_places(table_rows(table, part)).astype(np.float16) for part in parts]
         empty = np.empty((0, weights.matrix.shape[1]), np.float16)
@@ -79,12 +73,6 @@ class PlaceSignatures:
             squares = np.einsum("nd,nd->n", vectors, vectors)[:, None]
             found[at : at + _AT_ONCE] = squares - 2.0 * (vectors @ queries.T)
         return found
-
-
-@functools.cache
-def place_statistics() -> SeenStatistics:
-    """The statistics that come with the program, by `pc2grid_lab.fit.signatures` of real logs."""
-    return SeenStatistics.load(_FILE)
 
 
 def table_rows(table: SignatureTable, part: slice = slice(None)) -> F32:

@@ -56,8 +56,8 @@ def test_bins_that_tell_places_apart_weigh_more_than_those_that_differ_by_the_se
 
 def test_statistics_come_back_from_their_file(tmp_path: Path) -> None:
     statistics = SeenStatistics.of(made_up_pairs(200))
-    statistics.save(tmp_path / "statistics.npz")
-    again = SeenStatistics.load(tmp_path / "statistics.npz")
+    SeenStatistics.save(tmp_path / "statistics.npz", viewpoints=statistics)
+    again = SeenStatistics.load(path=tmp_path / "statistics.npz")
     np.testing.assert_allclose(again.within, statistics.within, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(again.spreads, statistics.spreads, rtol=1e-5)
 

@@ -9,7 +9,7 @@ places are those of the other logs' maps, of drawn maps, and of office floors.
     python -m pc2grid_lab.fit.signatures DATA SIMULATED.npz OUT.npz [--logs csail,...] [--maps aces,...]
 
 The weights of the signatures of places, by which the first look is taken, are learned from the same logs, and
-from the place of the map that is nearest to each view; they are written to OUT.places.npz.
+from the place of the map that is nearest to each view.
 
 DATA is as of `queries`; with `maps/NAME.yaml`, maps of buildings without queries.
 """
@@ -98,16 +98,16 @@ def main(
     maps: str = "aces,workshop_1",
     queries: int = 24,
 ) -> None:
-    """Learn and store the statistics: of viewpoints in OUT.npz, of places in OUT.places.npz."""
+    """Learn and store the statistics of viewpoints and of places, in one file."""
     config, kept = Config(), out.parent / "drives"
     kept.mkdir(parents=True, exist_ok=True)
     drawn = {name: read(data, name, queries, kept, config) for name in logs.split(",")}
     floors = [load_map(data / "maps" / f"{name}.yaml") for name in maps.split(",")]
     floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
     pairs = pairs_of_logs(drawn, floors, config)
-    statistics_of(pairs, SeenStatistics.load(simulated)).save(out)
+    of_viewpoints = statistics_of(pairs, SeenStatistics.load(path=simulated))
     of_places = place_statistics_of(place_pairs_of_logs(drawn, floors, config), config)
-    of_places.save(out.with_suffix(".places.npz"))
+    SeenStatistics.save(out, viewpoints=of_viewpoints, places=of_places)
     print(f"{out}: learned from {len(pairs.queries):,} pairs and {len(pairs.other):,} other places")
 
 

@@ -70,7 +70,7 @@ def main(
     floors = [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
     pairs = pairs_of(asked(plans, drives, queries, Config()), floors, Config())
     out = folder / "simulated.npz"
-    SeenStatistics.of(pairs).save(out)
+    SeenStatistics.save(out, viewpoints=SeenStatistics.of(pairs))
     print(f"{out}: learned from {len(pairs.queries):,} pairs")
 
 
