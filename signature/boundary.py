@@ -53,8 +53,8 @@ def boundary_histogram(points: I64, radius_m: float, resolution_m: float, config
     points : (N, 2) cells. Returns (N_hb,) float32, sum 1; all 0 if there are fewer than two points.
     Distances of 2 r and more count in the last bin.
     """
-    bins_per_cell = resolution_m / config.boundary_bin_m
-    return normalized(pair_distance_counts(points * bins_per_cell, boundary_bins(radius_m, config)))
+    in_bins = points.astype(np.float64) * (resolution_m / config.boundary_bin_m)
+    return normalized(pair_distance_counts(in_bins, boundary_bins(radius_m, config)))
 
 
 def pair_distance_counts(points: F64, bins: int) -> I64:

@@ -14,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import get_args
 
@@ -105,7 +106,12 @@ def databases(folder: Folder, sizes: Sequence[int]) -> Iterator[Database]:
             seed += 1
         every = together(maps)
         name = f"{len(maps)} buildings, {len(every.places.table)} places"
-        yield Database(name, lambda w, e=every: e if w.pair.map_name in e.sessions else None, one_truth)
+        yield Database(name, partial(_among, every), one_truth)
+
+
+def _among(index: MapIndex, window: Window) -> MapIndex | None:
+    """The index, if it has the map of the window."""
+    return index if window.pair.map_name in index.sessions else None
 
 
 def one_each(folder: Folder) -> list[str]:
