@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64
 
+_DAMPING = 1e-6  # so that directions that no point measures can be solved for
 
-@njit(cache=True)
+
+@njit(cache=True, error_model="numpy")
 def _line_at(
     index: NDArray[np.int32], moments: F64, row: int, column: int, radius: int, sector: int, line: F64
 ) -> bool:
@@ -50,7 +52,7 @@ def _line_at(
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def normal_equations(
     index: NDArray[np.int32],
     moments: F64,
@@ -70,14 +72,13 @@ def normal_equations(
     Returns H (3, 3) and g (3,) of the Gauss-Newton step H d = -g for points of unit variance, and the
     number of points that found a line.
 
-    Measured: 0.09 ms instead of 23 ms for 700 points of a lidar, 0.025 instead of 7 ms for a planar laser; a
-    scan needs seven calls, and all of its tracking 6 ms and 2 ms.
+    Measured: 0.03 ms instead of 7 ms for 290 points of a planar laser.
     """
     height, width = index.shape
     sectors = moments.shape[1]
     H, g, line = np.zeros((3, 3)), np.zeros(3), np.empty(5)
     c, s = math.cos(pose[2]), math.sin(pose[2])
-    found = 0
+    found, last, is_line = 0, (-1, -1, -1), False
     for k in range(points.shape[0]):
         rx = c * points[k, 0] - s * points[k, 1]
         ry = s * points[k, 0] + c * points[k, 1]
@@ -85,8 +86,10 @@ def normal_equations(
         column, row = math.floor(x / cell_m), math.floor(y / cell_m)
         if row < radius or column < radius or row >= height - radius or column >= width - radius:
             continue
-        sector = round((normal_rad[k] + pose[2]) * (sectors / (2.0 * math.pi))) % sectors
-        if not _line_at(index, moments, row, column, radius, sector, line):
+        at = row, column, round((normal_rad[k] + pose[2]) * (sectors / (2.0 * math.pi))) % sectors
+        if at != last:  # neighbours on a wall share it
+            last, is_line = at, _line_at(index, moments, row, column, radius, at[2], line)
+        if not is_line:
             continue
         nx, ny = line[2], line[3]
         r = nx * (x - line[0]) + ny * (y - line[1])
@@ -104,6 +107,83 @@ def normal_equations(
         g[2] += w * j2 * r
     H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
     return H, g, found
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(A: F64, b: F64, x: F64) -> None:
+    """Write the solution of A x = b, with a positive definite matrix A (3, 3), by its factors L D L^T."""
+    l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
+    d1 = A[1, 1] - l10 * A[1, 0]
+    l21 = (A[2, 1] - l20 * A[1, 0]) / d1
+    d2 = A[2, 2] - l20 * A[2, 0] - l21 * l21 * d1
+    y1 = b[1] - l10 * b[0]
+    x[2] = (b[2] - l20 * b[0] - l21 * y1) / d2
+    x[1] = y1 / d1 - l21 * x[2]
+    x[0] = b[0] / A[0, 0] - l10 * x[1] - l20 * x[2]
+
+
+@njit(cache=True, error_model="numpy")
+def aligned(
+    index: NDArray[np.int32],
+    moments: F64,
+    points: F64,
+    normal_rad: F64,
+    guess: F64,
+    prior: F64,
+    prior_information: F64,
+    cell_m: float,
+    radii: NDArray[np.int64],
+    residual_scale_m: float,
+    prior_scale: float,
+    converged: float,
+) -> tuple[F64, F64, F64, int]:
+    """Gauss-Newton of the point-to-line distances, held to a prior, one radius of `radii` an iteration.
+
+    index, moments, points, normal_rad, cell_m : as of `normal_equations`. guess, prior : (3,) poses from the
+    corner of cell (0, 0). prior_information : (3, 3). residual_scale_m, prior_scale, converged : see
+    `MatchingParameters`.
+
+    Returns the pose (3,); that by the points alone (3,), linearised where the last iteration began, with its
+    information (3, 3); and the number of points that found a line there.
+    """
+    unit, pose, alone = cell_m**-2.0, guess.copy(), guess.copy()
+    information, A, b, step, away = np.zeros((3, 3)), np.empty((3, 3)), np.empty(3), np.zeros(3), np.empty(3)
+    found = 0
+    for radius in radii:
+        H, g, found = normal_equations(
+            index, moments, points, normal_rad, pose, cell_m, radius, residual_scale_m * radius
+        )
+        for i in range(3):
+            alone[i], away[i] = pose[i], pose[i] - prior[i]
+            for j in range(3):
+                information[i, j] = unit * H[i, j]
+        away[2] -= 2.0 * math.pi * math.floor(away[2] / (2.0 * math.pi) + 0.5)
+        chi2 = 0.0
+        for i in range(3):
+            for j in range(3):
+                chi2 += away[i] * prior_information[i, j] * away[j]
+        # Cauchy weight: wheels slip, so a prior that disagrees with the points counts less.
+        weight = 1.0 / (1.0 + chi2 / prior_scale**2)
+        for i in range(3):
+            b[i] = -unit * g[i]
+            for j in range(3):
+                A[i, j] = information[i, j] + weight * prior_information[i, j]
+                b[i] -= weight * prior_information[i, j] * away[j]
+            A[i, i] += _DAMPING
+        _solve(A, b, step)
+        for i in range(3):
+            pose[i] += step[i]
+        if radius == radii[-1] and abs(step[0]) + abs(step[1]) + abs(step[2]) < converged:
+            break
+    for i in range(3):
+        b[i] = -unit * g[i]
+        for j in range(3):
+            A[i, j] = information[i, j]
+        A[i, i] += unit * _DAMPING
+    _solve(A, b, step)
+    for i in range(3):
+        alone[i] += step[i]
+    return pose, alone, information, found
 
 
 @njit(cache=True)

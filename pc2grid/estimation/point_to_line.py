@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from pc2grid.arrays import F32, F64, SUBPIXEL_BITS, BoolGrid, polygon_corners
-from pc2grid.estimation._kernels import normal_equations, placement_scores
+from pc2grid.estimation._kernels import aligned, normal_equations, placement_scores
 from pc2grid.estimation.manifold import weakest
 from pc2grid.estimation.parameters import MATCHING_PARAMETERS, MatchingParameters
 from pc2grid.geometry import SE2, wrap_angle
@@ -166,33 +166,33 @@ class PointGrid:
         The iterations start at `guess` and are held to `prior` by `prior_information` (3, 3) of x, y, yaw.
         radii : half widths of the neighbourhood, as `MatchingParameters.radii_cells`, its default.
         """
-        p, steps = self._parameters, radii or self._parameters.radii_cells
-        points, normals = np.asarray(points_m, np.float64), np.asarray(normal_rad, np.float64)
-        unit, damping = p.cell_m**-2, 1e-6 * np.eye(3)
-        pose = np.array([guess.x, guess.y, guess.yaw])
-        held = np.array([prior.x, prior.y, prior.yaw])
-        information, gradient, found, linearised = np.zeros((3, 3)), np.zeros(3), 0, pose
-        for radius in steps:
-            H, g, found = self._equations(points, normals, pose, radius)
-            information, gradient, linearised = unit * H, unit * g, pose
-            away = pose - held
-            away[2] = wrap_angle(float(away[2]))
-            # Cauchy weight: wheels slip, so a prior that disagrees with the points counts less.
-            weight = prior_information / (1.0 + (away @ prior_information @ away) / p.prior_scale**2)
-            step = np.linalg.solve(information + weight + damping, -(gradient + weight @ away))
-            pose = pose + step
-            if radius == steps[-1] and np.abs(step).sum() < p.converged:
-                break
-        alone = linearised - np.linalg.solve(information + unit * damping, gradient)
+        p, (low_x, low_y) = self._parameters, self.low_m.tolist()
+        points = np.asarray(points_m, np.float64)
+        pose, alone, information, found = aligned(
+            self._index,
+            self._moments,
+            points,
+            np.asarray(normal_rad, np.float64),
+            np.array([guess.x - low_x, guess.y - low_y, guess.yaw]),
+            np.array([prior.x - low_x, prior.y - low_y, prior.yaw]),
+            prior_information,
+            self.cell_m,
+            np.array(radii or p.radii_cells),
+            p.residual_scale_m,
+            p.prior_scale,
+            p.converged,
+        )
+        placed, by_points = (
+            SE2(x + low_x, y + low_y, wrap_angle(yaw)) for x, y, yaw in (pose.tolist(), alone.tolist())
+        )
         overlap = found / max(len(points), 1)
-        placed = SE2(float(pose[0]), float(pose[1]), wrap_angle(float(pose[2])))
         return Match(
             placed,
-            SE2(float(alone[0]), float(alone[1]), wrap_angle(float(alone[2]))),
+            by_points,
             information,
             overlap,
             min(self.free(placed.apply(points)), 1.0 - overlap),
-            weakest(information, 2) > unit * p.least_points,
+            weakest(information, 2) > p.least_points / self.cell_m**2,
         )
 
 

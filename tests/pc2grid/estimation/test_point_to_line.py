@@ -9,14 +9,14 @@ import pytest
 from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64
-from pc2grid.estimation._kernels import normal_equations, placement_scores
+from pc2grid.estimation._kernels import aligned, normal_equations, placement_scores
 from pc2grid.estimation.parameters import CAMERA_MATCHING, MATCHING_PARAMETERS
 from pc2grid.estimation.point_to_line import (
     PointGrid,
     best_placements,
     sector_of,
 )
-from pc2grid.geometry import SE2
+from pc2grid.geometry import SE2, wrap_angle
 
 
 def normal_equations_plain(
@@ -64,6 +64,41 @@ def normal_equations_plain(
         g += weight * r * J
         found += 1
     return H, g, found
+
+
+def aligned_plain(
+    index: NDArray[np.int32],
+    moments: F64,
+    points: F64,
+    normal_rad: F64,
+    guess: F64,
+    prior: F64,
+    prior_information: F64,
+    cell_m: float,
+    radii: NDArray[np.int64],
+    residual_scale_m: float,
+    prior_scale: float,
+    converged: float,
+) -> tuple[F64, F64, F64, int]:
+    """Gauss-Newton of the point-to-line distances, held to a prior, one radius an iteration, in numpy.
+
+    Parameters and results are those of `pc2grid.estimation._kernels.aligned`.
+    """
+    unit, damping, pose = cell_m**-2, 1e-6 * np.eye(3), guess
+    for radius in radii:
+        H, g, found = normal_equations_plain(
+            index, moments, points, normal_rad, pose, cell_m, radius, residual_scale_m * radius
+        )
+        information, gradient, linearised = unit * H, unit * g, pose
+        away = pose - prior
+        away[2] = wrap_angle(float(away[2]))
+        weight = prior_information / (1.0 + (away @ prior_information @ away) / prior_scale**2)
+        step = np.linalg.solve(information + weight + damping, -(gradient + weight @ away))
+        pose = pose + step
+        if radius == radii[-1] and np.abs(step).sum() < converged:
+            break
+    alone = linearised - np.linalg.solve(information + unit * damping, gradient)
+    return pose, alone, information, found
 
 
 def placement_scores_plain(
@@ -152,20 +187,39 @@ def test_moments_of_points_added_in_parts_are_those_of_all_at_once() -> None:
     assert whole._moments[whole._index[filled]] == pytest.approx(parts._moments[parts._index[filled]])
 
 
-@pytest.mark.parametrize("radius", [1, 2, 3])
-def test_normal_equations_are_those_of_their_definition(radius: int) -> None:
-    rng = np.random.default_rng(radius)
+def corner(rng: np.random.Generator) -> tuple[PointGrid, F64, F64]:
+    """A map of two walls and some clutter, and points (N, 2) near the walls with their normals (N,)."""
     along, side = np.linspace(0.5, 7.5, 300), np.full(300, 2.0)
     wall = np.concatenate((np.column_stack((along, side)), np.column_stack((side, along))))
     normals = np.repeat((-math.pi / 2, math.pi), 300)
     grid = PointGrid((0.0, 0.0), (8.0, 8.0))
     grid.add(wall + rng.normal(0, 0.01, wall.shape), normals)
     grid.add(rng.uniform(0, 8, (50, 2)), rng.uniform(-3, 3, 50))
-    points = wall[::5] + rng.normal(0, 0.02, wall[::5].shape)
+    return grid, wall[::5] + rng.normal(0, 0.02, wall[::5].shape), normals[::5]
+
+
+@pytest.mark.parametrize("radius", [1, 2, 3])
+def test_normal_equations_are_those_of_their_definition(radius: int) -> None:
+    grid, points, normals = corner(np.random.default_rng(radius))
     pose = np.array([0.05, -0.03, 0.02])
-    arguments = (grid._index, grid._moments, points, normals[::5], pose, grid.cell_m, radius, 0.05 * radius)
+    arguments = (grid._index, grid._moments, points, normals, pose, grid.cell_m, radius, 0.05 * radius)
     for found, expected in zip(normal_equations(*arguments), normal_equations_plain(*arguments), strict=True):
         assert found == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+@pytest.mark.parametrize("sigma", [0.01, 0.3, np.inf])
+@pytest.mark.parametrize("turns", [-1, 0])
+def test_a_match_is_that_of_its_definition(sigma: float, turns: int) -> None:
+    """Whether the prior is held, or outweighed, or there is none; its turn may be a whole one off."""
+    grid, points, normals = corner(np.random.default_rng(7))
+    guess, prior = np.array([0.05, -0.03, 0.02]), np.array([0.02, 0.1, 0.05 + 2.0 * math.pi * turns])
+    information = np.diag([sigma**-2, sigma**-2, 4.0 * sigma**-2])
+    arguments = (
+        *(grid._index, grid._moments, points, normals, guess, prior, information, grid.cell_m),
+        *(np.array([3, 2, 1, 1, 1, 1]), 0.05, 2.0, 1e-4),
+    )
+    for found, expected in zip(aligned(*arguments), aligned_plain(*arguments), strict=True):
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_likelihood_falls_with_the_distance_from_the_points() -> None:
