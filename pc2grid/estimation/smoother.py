@@ -21,7 +21,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg.lapack import dposv, dpotrs
 
 from pc2grid.arrays import F64
 from pc2grid.estimation._smoother_kernels import corrected, drift_variance, normal_equations, unsteadiness
@@ -153,8 +153,8 @@ class Smoother:
             np.concatenate((before.readings, reading[None])),
             before.errors,
         )
-        self._state, information = self._solved(state)
-        self._covariance = self._last_covariance(information)
+        self._state, factor = self._solved(state)
+        self._covariance = self._last_covariance(factor)
         if len(self._state.poses) > self._parameters.lag:
             self._marginalise()
         return self.belief
@@ -172,27 +172,30 @@ class Smoother:
         return Window(*(np.array(value)[None] for value in row))
 
     def _solved(self, state: State) -> tuple[State, F64]:
-        """Gauss-Newton from a state; returns the last one, and the information matrix on its unknowns."""
+        """Gauss-Newton from a state; returns the last one, and the Cholesky factor of the information on its
+        unknowns."""
         p, n = self._parameters, len(state.poses)
         for _ in range(p.iterations):
             H, g, self._drift_scale = normal_equations(
                 state, self._window, self._prior, self._free, p, self._drift_scale, n
             )
             H[np.diag_indices(len(g))] += _DAMPING
-            delta = -cho_solve(cho_factor(H, check_finite=False), g, check_finite=False)
+            factor, delta, failed = dposv(H, -g)
+            if failed:
+                raise np.linalg.LinAlgError("the information of the smoother is not positive definite")
             changes = np.zeros((2, n, 6))
             changes[:, :, self._free] = delta[ERRORS:].reshape(n, 2, -1).swapaxes(0, 1)
             state = state.changed(delta[:ERRORS], changes)
             if np.abs(delta).max() < p.converged:
                 break
-        return state, H
+        return state, factor
 
-    def _last_covariance(self, information: F64) -> F64:
-        """The covariance (D, D) of the last pose."""
-        count, d = len(information), len(self._free)
+    def _last_covariance(self, factor: F64) -> F64:
+        """The covariance (D, D) of the last pose, by the Cholesky factor of all information."""
+        count, d = len(factor), len(self._free)
         last = np.zeros((count, d))
         last[count - 2 * d : count - d] = np.eye(d)
-        solved = cho_solve(cho_factor(information, check_finite=False), last, check_finite=False)
+        solved, _ = dpotrs(factor, last)
         covariance: F64 = solved[count - 2 * d : count - d]
         return covariance
 
@@ -225,8 +228,8 @@ class Smoother:
 def _without(H: F64, g: F64, first: int) -> tuple[F64, F64]:
     """The information and the gradient on the other unknowns when the `first` ones after the errors of
     odometry are marginalised: the Schur complement."""
-    old, rest = np.s_[ERRORS : ERRORS + first], np.r_[:ERRORS, ERRORS + first : len(H)]
+    old, rest = np.s_[ERRORS : ERRORS + first], np.delete(np.arange(len(H)), np.s_[ERRORS : ERRORS + first])
     A, B = H[old, old] + _DAMPING * np.eye(first), H[rest, old]
     solved = np.linalg.solve(A, np.column_stack((B.T, g[old])))
-    reduced = H[np.ix_(rest, rest)] - B @ solved[:, :-1]
+    reduced = H[rest][:, rest] - B @ solved[:, :-1]
     return 0.5 * (reduced + reduced.T), g[rest] - B @ solved[:, -1]
