@@ -18,7 +18,8 @@ from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
 from pc2grid_lab.compare.paper import compare_paper_command
 from pc2grid_lab.experiments.paper_experiment import BestMatches
 from pc2grid_lab.experiments.paper_tables import MAPS, TABLE_3, TABLE_4
-from pc2grid_lab.experiments.paper_task import ABLATION, paper_tasks
+from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, paper_tasks
+from signature.config import SignatureConfig
 from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
 
 app = typer.Typer()
@@ -46,18 +47,19 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
 ) -> None:
     monkeypatch.setattr(console, "_LINE_EVERY_S", 0.0)
     arguments = ["--maps", str(maps), "--out", str(tmp_path), "--queries", "4", "--jobs", "1"]
-    arguments += ["--offset", "0.5", "--methods", "proposed", "--methods", "shape_context"]
+    arguments += ["--offset", "0.5", "--methods", "proposed", "--methods", "as_used_here"]
     first = runner.invoke(app, arguments)
     assert first.exit_code == 0, first.output
     assert re.search(r"^pc2grid: \d+ cells of the tables: \d+%", first.stderr, re.MULTILINE)
     document = json.loads((tmp_path / "results.json").read_text())
-    assert len(document["cells"]) == 8  # 2 methods x 3 levels, and 2 radii
+    assert len(document["cells"]) == 10  # 2 methods x (3 levels, and 2 radii)
     assert {c["published"]["auc"] for c in document["cells"] if c["radius_m"] == 6.0} == {0.935}
+    assert [c["published"]["auc"] for c in document["cells"] if c["level"] == 2] == [0.955, 0.955]
     assert (tmp_path / "figure-9-offset-0.5.png").read_bytes().startswith(b"\x89PNG")
     written = {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").rglob("*.pickle")}
     second = runner.invoke(app, arguments)
     assert second.exit_code == 0, second.output
-    assert len(written) == 8
+    assert len(written) == 10
     assert written == {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").rglob("*.pickle")}
     assert "Table III, AUC" in second.stdout and "Table IV" in second.stdout
 
@@ -66,17 +68,8 @@ def test_the_ablation_and_any_floor(tmp_path: Path) -> None:
     """A floor that the paper does not have gets its own column, without published figures."""
     save_map(grid_of(np.hstack([cross(6.0, 2.0), rectangle(8.0, 5.0), l_shape()])), tmp_path / "depot")
     arguments = ["--maps", str(tmp_path / "depot.yaml"), "--out", str(tmp_path / "out"), "--queries", "3"]
-    arguments += [
-        "--jobs",
-        "1",
-        "--offset",
-        "1.0",
-        "--methods",
-        "proposed",
-        "--ablation",
-        "--speckles",
-        "0.25",
-    ]
+    arguments += ["--jobs", "1", "--offset", "1.0", "--methods", "as_used_here", "--ablation"]
+    arguments += ["--speckles", "0.25"]
     run = runner.invoke(app, arguments)
     assert run.exit_code == 0, run.output
     assert "depot" in run.stdout and "boundary alone" in run.stdout and "R@1" in run.stdout
@@ -114,6 +107,11 @@ def test_wrong_arguments_say_what_is_wrong(
 ) -> None:
     error = runner.invoke(app, ["--maps", str(maps), "--out", str(tmp_path), *options]).exception
     assert isinstance(error, kind) and words in str(error)
+
+
+def test_the_first_choices_together_are_the_paper_to_the_letter() -> None:
+    changed = dict(override for choice in OPEN_CHOICES[:5] for override in choice.overrides)
+    assert SignatureConfig(**changed) == SignatureConfig.paper()
 
 
 @pytest.mark.parametrize("method", METHOD_NAMES + EXTRA_METHOD_NAMES)

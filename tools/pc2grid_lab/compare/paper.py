@@ -43,7 +43,8 @@ def compare_paper_command(
         list[str] | None,
         typer.Option(
             "--methods",
-            help="Only these; repeatable. Extras: proposed_centres, boundary_centres, shape_context_centres.",
+            help="Only these; repeatable. Not in the paper: as_used_here_centres, boundary_centres, "
+            "shape_context_centres.",
         ),
     ] = None,
     offset: Annotated[
@@ -57,7 +58,7 @@ def compare_paper_command(
         typer.Option("--open-choices", help="Also what each departure and open parameter moves."),
     ] = False,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="Also the proposed method without some of its signatures.")
+        bool, typer.Option("--ablation", help="Also the method as used here without some of its signatures.")
     ] = False,
     speckles: Annotated[
         float,

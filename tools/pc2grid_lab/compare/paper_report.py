@@ -14,7 +14,7 @@ from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.experiments.paper_experiment import MatchMeasures
 from pc2grid_lab.experiments.paper_tables import SUBMAPS, Measures
-from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, RADII_M, PaperCell, SettingChoice
+from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, OURS, RADII_M, PaperCell, SettingChoice
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
 
@@ -54,10 +54,10 @@ def _table_3(
 
 
 def _table_4(plain: Sequence[PaperCell], maps: Sequence[str], where: str) -> Table:
-    shown = table(f"Table IV (proposed, noise level 1), {where}", ("radius", "measure"), maps)
-    for radius_m, measure in itertools.product(RADII_M, Measures._fields):
-        row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == ("proposed", 1, radius_m)]
-        shown.add_row(f"{radius_m:g} m", measure.upper(), *_cells(row, maps, measure))
+    shown = table(f"Table IV (noise level 1), {where}", ("radius", "method", "measure"), maps)
+    for radius_m, method, measure in itertools.product(RADII_M, OURS, Measures._fields):
+        row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == (method, 1, radius_m)]
+        shown.add_row(f"{radius_m:g} m", method, measure.upper(), *_cells(row, maps, measure))
     return shown
 
 
@@ -85,7 +85,9 @@ def _print_choices(
         return
     shown = table(title, ("choice", "the paper says", "we do", "noise"), (*maps, "mean", "mean R@1"))
     for level in (0, 2):
-        here = [r for r in results if (r.method, r.task.level, r.task.radius_m) == ("proposed", level, 8.0)]
+        here = [
+            r for r in results if (r.method, r.task.level, r.task.radius_m) == ("as_used_here", level, 8.0)
+        ]
         base = {r.task.map_name: _auc_and_right(r) for r in here if r.is_plain}
         shown.add_row("all three", "", "Eq. 6", str(level), *_with_means(base, maps, ""))
         for choice in choices:

@@ -27,22 +27,26 @@ from signature.config import SignatureConfig
 RADII_M = (6.0, 8.0, 10.0)
 """Table IV."""
 
+OURS = ("proposed", "as_used_here")
+"""The paper's method in two settings, both beside the published row."""
+
 TOGETHER = (
     ("proposed",),
+    ("as_used_here",),
     ("sdf",),
     ("sift_bow", "sift_tfidf"),
     ("surf_bow", "surf_tfidf"),
     ("shape_context",),
-    ("proposed_centres",),
+    ("as_used_here_centres",),
     ("boundary_centres",),
     ("shape_context_centres",),
 )
 """Methods that share their features and therefore run together."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class SettingChoice:
-    """Another setting of the proposed method, to measure what it moves.
+    """Another setting of the method as it is used here, to measure what it moves.
 
     name : in a few words. paper : what the paper says of it. ours : what the default does instead.
     overrides : fields of SignatureConfig with the other values.
@@ -57,107 +61,64 @@ class SettingChoice:
 _NO_SYMMETRY = ("symmetry_sigma", 1e6)
 
 ABLATION = (
+    SettingChoice("boundary and free space", "Eq. 6 with Omega = 1", "Eq. 6", (_NO_SYMMETRY,)),
     SettingChoice(
-        name="boundary and free space",
-        paper="Eq. 6 with Omega = 1",
-        ours="Eq. 6",
-        overrides=(_NO_SYMMETRY,),
+        "boundary alone", "omega_b = 1, Omega = 1", "Eq. 6", (("weight_boundary", 1.0), _NO_SYMMETRY)
     ),
     SettingChoice(
-        name="boundary alone",
-        paper="omega_b = 1, Omega = 1",
-        ours="Eq. 6",
-        overrides=(("weight_boundary", 1.0), _NO_SYMMETRY),
+        "free space alone", "omega_b = 0, Omega = 1", "Eq. 6", (("weight_boundary", 0.0), _NO_SYMMETRY)
     ),
-    SettingChoice(
-        name="free space alone",
-        paper="omega_b = 0, Omega = 1",
-        ours="Eq. 6",
-        overrides=(("weight_boundary", 0.0), _NO_SYMMETRY),
-    ),
-    SettingChoice(
-        name="symmetry made to count",
-        paper="sigma = 120",
-        ours="sigma = 120; here 4",
-        overrides=(("symmetry_sigma", 4.0),),
-    ),
+    SettingChoice("symmetry made to count", "sigma = 120", "sigma = 120; here 4", (("symmetry_sigma", 4.0),)),
 )
 """What each signature adds."""
 
-OPEN_CHOICES = (
-    SettingChoice(
-        name="to the letter",
-        paper="all of the next five",
-        ours="none of them",
-        overrides=tuple(
-            (key, value) for key, value in SignatureConfig.paper() if value != getattr(SignatureConfig(), key)
+OPEN_CHOICES = tuple(
+    SettingChoice(name, paper, ours, (override,))
+    for name, paper, ours, override in (
+        (
+            "-ln BC",
+            "Bhattacharyya distance",
+            "sqrt(1 - BC), which OpenCV calls so",
+            ("histogram_distance", "bhattacharyya"),
         ),
-    ),
-    SettingChoice(
-        name="-ln BC",
-        paper="Bhattacharyya distance",
-        ours="sqrt(1 - BC), which OpenCV calls so",
-        overrides=(("histogram_distance", "bhattacharyya"),),
-    ),
-    SettingChoice(
-        name="Zhang-Suen thinning",
-        paper="thinning, not which one",
-        ours="Guo-Hall in the signatures",
-        overrides=(("thinning", "zhang_suen"),),
-    ),
-    SettingChoice(
-        name="full resolution",
-        paper="skeleton of the map",
-        ours="free-space skeleton on blocks of 0.1 m",
-        overrides=(("freespace_cell_m", 0.05),),
-    ),
-    SettingChoice(
-        name="no limit in S^G",
-        paper="no limit",
-        ours="cut at 34, the value of a straight line",
-        overrides=(("symmetry_limited", False),),
-    ),
-    SettingChoice(
-        name="plain vote",
-        paper="voting on the angles",
-        ours="by length, blurred, refined",
-        overrides=(("axis_vote", "plain"),),
-    ),
-    SettingChoice(
-        name="boundary points 0.05 m", paper="-", ours="0.1 m", overrides=(("boundary_spacing_m", 0.05),)
-    ),
-    SettingChoice(
-        name="boundary points 0.2 m", paper="-", ours="0.1 m", overrides=(("boundary_spacing_m", 0.2),)
-    ),
-    SettingChoice(
-        name="nodes 0.4 m apart", paper="-", ours="0.6 m", overrides=(("freespace_spacing_m", 0.4),)
-    ),
-    SettingChoice(
-        name="nodes 1.0 m apart", paper="-", ours="0.6 m", overrides=(("freespace_spacing_m", 1.0),)
-    ),
-    SettingChoice(
-        name="eroded by 0.3 m",
-        paper="erosion, not how much",
-        ours="0.2 m",
-        overrides=(("freespace_clearance_m", 0.3),),
-    ),
-    SettingChoice(
-        name="nodes joined to 1.5 m",
-        paper="all that see each other",
-        ours="the same",
-        overrides=(("freespace_join_m", 1.5),),
-    ),
-    SettingChoice(name="S^G peaks at 255", paper="-", ours="34", overrides=(("symmetry_peak", 255.0),)),
-    SettingChoice(name="omega_b = 0.7", paper="0.9", ours="0.9", overrides=(("weight_boundary", 0.7),)),
+        (
+            "Zhang-Suen thinning",
+            "thinning, not which one",
+            "Guo-Hall in the signatures",
+            ("thinning", "zhang_suen"),
+        ),
+        (
+            "full resolution",
+            "skeleton of the map",
+            "free-space skeleton on blocks of 0.1 m",
+            ("freespace_cell_m", 0.05),
+        ),
+        (
+            "no limit in S^G",
+            "no limit",
+            "cut at 34, the value of a straight line",
+            ("symmetry_limited", False),
+        ),
+        ("plain vote", "voting on the angles", "by length, blurred, refined", ("axis_vote", "plain")),
+        ("boundary points 0.05 m", "-", "0.1 m", ("boundary_spacing_m", 0.05)),
+        ("boundary points 0.2 m", "-", "0.1 m", ("boundary_spacing_m", 0.2)),
+        ("nodes 0.4 m apart", "-", "0.6 m", ("freespace_spacing_m", 0.4)),
+        ("nodes 1.0 m apart", "-", "0.6 m", ("freespace_spacing_m", 1.0)),
+        ("eroded by 0.3 m", "erosion, not how much", "0.2 m", ("freespace_clearance_m", 0.3)),
+        ("nodes joined to 1.5 m", "all that see each other", "the same", ("freespace_join_m", 1.5)),
+        ("S^G peaks at 255", "-", "34", ("symmetry_peak", 255.0)),
+        ("omega_b = 0.7", "0.9", "0.9", ("weight_boundary", 0.7)),
+    )
 )
-"""Where the default departs from the paper, and other values of what the paper leaves open."""
+"""Where the default departs from the paper (the first five, which are the row "proposed" together), and other
+values of what the paper leaves open."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperTask:
     """Methods on one map at one noise level.
 
-    overrides : fields of SignatureConfig that differ from their defaults, for the proposed method.
+    overrides : fields of SignatureConfig that differ from their defaults, for the method as it is used here.
     speckle_sigma_m : spread of the boundary noise, which the paper leaves open.
     """
 
@@ -198,8 +159,9 @@ def paper_tasks(
     for offset_m, group, path in itertools.product(offsets_m, filter(None, groups), maps):
         task = PaperTask(map_path=path, methods=group, level=0, radius_m=8.0, offset_m=offset_m, **setting)
         yield from (replace(task, level=level) for level in range(len(NOISE_LEVELS)))
-        if group == ("proposed",):
+        if group[0] in OURS:
             yield from (replace(task, level=1, radius_m=r) for r in RADII_M if r != task.radius_m)
+        if group == ("as_used_here",):
             for choice, level in itertools.product(choices, (0, 2)):
                 yield replace(task, level=level, overrides=choice.overrides)
 
@@ -255,7 +217,8 @@ class PaperCell:
         if task.overrides or task.map_name not in MAPS:
             return None
         if task.radius_m == 8.0:
-            return TABLE_3[task.level].get(self.method, {}).get(task.map_name)
+            method = "proposed" if self.method in OURS else self.method
+            return TABLE_3[task.level].get(method, {}).get(task.map_name)
         return TABLE_4[int(task.radius_m)].get(task.map_name)
 
     def summary(self) -> dict[str, Any]:
@@ -278,8 +241,8 @@ def _run(task: PaperTask) -> list[PaperCell]:
     experiment = Experiment(queries=task.queries, offset_m=task.offset_m, seed=task.seed)
     noise = replace(NOISE_LEVELS[task.level], speckle_sigma_m=task.speckle_sigma_m)
     methods = make_methods(task.methods)
-    if "proposed" in methods:
-        methods["proposed"] = Proposed(SignatureConfig(**dict(task.overrides)))
+    if task.overrides:
+        methods = {"as_used_here": Proposed(SignatureConfig(**dict(task.overrides)))}
     cells = []
     for method, matches in evaluate(methods, grid, submaps, experiment, noise).items():
         low, high = matches.intervals()
