@@ -17,9 +17,9 @@ import typer
 
 import pc2grid
 from pc2grid.config import PartitionConfig
-from pc2grid_lab.baselines import make_methods
-from pc2grid_lab.experiments.noise import NOISE_LEVELS
-from pc2grid_lab.experiments.paper_experiment import Experiment, evaluate
+from pc2grid_lab.paper.experiment import Experiment, evaluate
+from pc2grid_lab.paper.methods import make_methods
+from pc2grid_lab.paper.noise import NOISE_LEVELS
 
 
 class WallDistances:

@@ -141,7 +141,8 @@ def histogram_distance(a: F32, b: F32, config: SignatureConfig) -> F64:
     bc = np.where(bc > 1.0 - _BC_ROUNDING, 1.0, bc)
     if config.histogram_distance == "hellinger":
         return np.asarray(np.sqrt(1.0 - bc))
-    return np.asarray(-np.log(np.maximum(bc, np.exp(-FARTHEST))))
+    # 0 - ln 1 is 0; -ln 1 would be -0, and the similarity, its reciprocal, -inf.
+    return np.asarray(0.0 - np.log(np.maximum(bc, np.exp(-FARTHEST))))
 
 
 def structural_factor(a: F32, b: F32, config: SignatureConfig) -> F64:

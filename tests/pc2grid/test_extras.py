@@ -100,7 +100,7 @@ def test_commands_say_all_that_is_missing_before_any_work(
 
 
 def test_methods_that_need_no_extra_run_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pc2grid_lab.baselines import require_packages
+    from pc2grid_lab.paper.methods import require_packages
 
     missing(monkeypatch, *EXTRAS)
     require_packages(["proposed", "shape_context", "sift_bow", "sdf"])

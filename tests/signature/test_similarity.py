@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from signature.config import SignatureConfig
 from signature.describe import Signature, describe
-from signature.similarity import SignatureTable, distances, histogram_distance
+from signature.similarity import SignatureTable, distances, histogram_distance, similarity
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, rectangle, submap_of
 
 CONFIG = SignatureConfig()
@@ -37,6 +37,12 @@ def test_eq_6_to_8_by_hand() -> None:
     log = SignatureConfig(histogram_distance="bhattacharyya")
     expected = phi_alpha * phi_beta * (0.9 * math.log(2) - 0.1 * math.log(0.8))
     assert distances(query, table(other), log)[0] == pytest.approx(expected, rel=1e-6)
+
+
+@pytest.mark.parametrize("config", [CONFIG, SignatureConfig.paper()])
+def test_a_submap_is_most_similar_to_itself(config: SignatureConfig) -> None:
+    itself = signature([1.0, 0.0], [0.0, 1.0], [50.0, 20.0])
+    assert similarity(distances(itself, table(itself), config)).tolist() == [math.inf]
 
 
 def test_alike_submaps_are_nearer_than_others() -> None:

@@ -56,7 +56,7 @@ COMPARE = {
         "pc2grid_lab.compare.peers:compare_peers_command",
         "Other programs, the same maps and queries.",
     ),
-    "paper": ("pc2grid_lab.compare.paper:compare_paper_command", "The paper's tables and figures 9 and 10."),
+    "paper": ("pc2grid_lab.paper.command:compare_paper_command", "The paper's tables and figures 9 and 10."),
 }
 
 app = typer.Typer(

@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F64, I64
 from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
-from pc2grid_lab.baselines.method import Matcher, Method
+from pc2grid_lab.paper.protocol import Matcher, Method
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

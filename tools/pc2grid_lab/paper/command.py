@@ -12,18 +12,13 @@ import typer
 from pc2grid.errors import ConfigError
 from pc2grid_cli.console import json_text, of
 from pc2grid_cli.output_files import make_folder
-from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
 from pc2grid_lab.compare import options as options
-from pc2grid_lab.compare.paper_report import draw_figure, print_tables
-from pc2grid_lab.experiments.paper_task import (
-    ABLATION,
-    OPEN_CHOICES,
-    cells_of,
-    known_maps,
-    paper_tasks,
-)
 from pc2grid_lab.experiments.program import BACK, FRONT, LABORATORY, digest_of_sources
 from pc2grid_lab.experiments.stored import in_processes, write_text
+from pc2grid_lab.paper.cells import cells_of, known_maps, paper_tasks
+from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
+from pc2grid_lab.paper.report import draw_figure, print_tables
 
 
 def compare_paper_command(

@@ -16,19 +16,17 @@ from pc2grid.errors import MapFileError
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.submaps.partition import partition
-from pc2grid_lab.baselines import METHOD_NAMES, make_methods
-from pc2grid_lab.baselines.proposed import Proposed
-from pc2grid_lab.experiments.noise import NOISE_LEVELS
-from pc2grid_lab.experiments.paper_experiment import BestMatches, Experiment, MatchMeasures, evaluate
-from pc2grid_lab.experiments.paper_tables import MAPS, SIZE_PX, TABLE_3, TABLE_4, Measures
 from pc2grid_lab.experiments.stored import once
+from pc2grid_lab.paper.choices import SettingChoice
+from pc2grid_lab.paper.experiment import BestMatches, Experiment, MatchMeasures, evaluate
+from pc2grid_lab.paper.methods import METHOD_NAMES, OURS, make_methods
+from pc2grid_lab.paper.noise import NOISE_LEVELS
+from pc2grid_lab.paper.proposed import Proposed
+from pc2grid_lab.paper.published import MAPS, SIZE_PX, TABLE_3, TABLE_4, Measures
 from signature.config import SignatureConfig
 
 RADII_M = (6.0, 8.0, 10.0)
 """Table IV."""
-
-OURS = ("proposed", "as_used_here")
-"""The paper's method in two settings, both beside the published row."""
 
 TOGETHER = (
     ("proposed",),
@@ -42,76 +40,6 @@ TOGETHER = (
     ("shape_context_centres",),
 )
 """Methods that share their features and therefore run together."""
-
-
-@dataclass(frozen=True, slots=True)
-class SettingChoice:
-    """Another setting of the method as it is used here, to measure what it moves.
-
-    name : in a few words. paper : what the paper says of it. ours : what the default does instead.
-    overrides : fields of SignatureConfig with the other values.
-    """
-
-    name: str
-    paper: str
-    ours: str
-    overrides: tuple[tuple[str, Any], ...]
-
-
-_NO_SYMMETRY = ("symmetry_sigma", 1e6)
-
-ABLATION = (
-    SettingChoice("boundary and free space", "Eq. 6 with Omega = 1", "Eq. 6", (_NO_SYMMETRY,)),
-    SettingChoice(
-        "boundary alone", "omega_b = 1, Omega = 1", "Eq. 6", (("weight_boundary", 1.0), _NO_SYMMETRY)
-    ),
-    SettingChoice(
-        "free space alone", "omega_b = 0, Omega = 1", "Eq. 6", (("weight_boundary", 0.0), _NO_SYMMETRY)
-    ),
-    SettingChoice("symmetry made to count", "sigma = 120", "sigma = 120; here 4", (("symmetry_sigma", 4.0),)),
-)
-"""What each signature adds."""
-
-OPEN_CHOICES = tuple(
-    SettingChoice(name, paper, ours, (override,))
-    for name, paper, ours, override in (
-        (
-            "-ln BC",
-            "Bhattacharyya distance",
-            "sqrt(1 - BC), which OpenCV calls so",
-            ("histogram_distance", "bhattacharyya"),
-        ),
-        (
-            "Zhang-Suen thinning",
-            "thinning, not which one",
-            "Guo-Hall in the signatures",
-            ("thinning", "zhang_suen"),
-        ),
-        (
-            "full resolution",
-            "skeleton of the map",
-            "free-space skeleton on blocks of 0.1 m",
-            ("freespace_cell_m", 0.05),
-        ),
-        (
-            "no limit in S^G",
-            "no limit",
-            "cut at 34, the value of a straight line",
-            ("symmetry_limited", False),
-        ),
-        ("plain vote", "voting on the angles", "by length, blurred, refined", ("axis_vote", "plain")),
-        ("boundary points 0.05 m", "-", "0.1 m", ("boundary_spacing_m", 0.05)),
-        ("boundary points 0.2 m", "-", "0.1 m", ("boundary_spacing_m", 0.2)),
-        ("nodes 0.4 m apart", "-", "0.6 m", ("freespace_spacing_m", 0.4)),
-        ("nodes 1.0 m apart", "-", "0.6 m", ("freespace_spacing_m", 1.0)),
-        ("eroded by 0.3 m", "erosion, not how much", "0.2 m", ("freespace_clearance_m", 0.3)),
-        ("nodes joined to 1.5 m", "all that see each other", "the same", ("freespace_join_m", 1.5)),
-        ("S^G peaks at 255", "-", "34", ("symmetry_peak", 255.0)),
-        ("omega_b = 0.7", "0.9", "0.9", ("weight_boundary", 0.7)),
-    )
-)
-"""Where the default departs from the paper (the first five, which are the row "proposed" together), and other
-values of what the paper leaves open."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,20 +1,16 @@
-"""The paper's method and its six rivals (paper IV-A) behind one protocol.
-
-A method is fitted to the submaps of a map. Then it compares queries with each of them.
-"""
+"""The methods of the comparison by name: the paper's own and its six rivals (paper IV-A)."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 
 from pc2grid import extras
-from pc2grid_lab.baselines.method import Matcher as Matcher
-from pc2grid_lab.baselines.method import Method as Method
-from pc2grid_lab.baselines.proposed import Proposed
-from pc2grid_lab.baselines.sdf import DistanceFeatures
-from pc2grid_lab.baselines.several_centres import SeveralCentres
-from pc2grid_lab.baselines.shape_context import ShapeContext
-from pc2grid_lab.baselines.words import FEATURES, Vocabulary, Words
+from pc2grid_lab.paper.proposed import Proposed
+from pc2grid_lab.paper.protocol import Method
+from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
+from pc2grid_lab.paper.rivals.shape_context import ShapeContext
+from pc2grid_lab.paper.rivals.words import FEATURES, Vocabulary, Words
+from pc2grid_lab.paper.several_centres import SeveralCentres
 from signature.config import SignatureConfig
 
 METHOD_NAMES = (
@@ -28,6 +24,9 @@ METHOD_NAMES = (
     "sdf",
 )
 """The paper's method to the letter and with our default settings; its rivals in the order of Table III."""
+
+OURS = METHOD_NAMES[:2]
+"""Both stand beside the published row."""
 
 EXTRA_METHOD_NAMES = ("as_used_here_centres", "boundary_centres", "shape_context_centres")
 """Beyond the paper: places described from several centres, by Eq. 6, by its boundary alone, and by the shape

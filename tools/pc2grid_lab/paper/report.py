@@ -12,9 +12,11 @@ from rich.table import Table
 from pc2grid.arrays import F64
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare.picture import picture
-from pc2grid_lab.experiments.paper_experiment import MatchMeasures
-from pc2grid_lab.experiments.paper_tables import SUBMAPS, Measures
-from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, OURS, RADII_M, PaperCell, SettingChoice
+from pc2grid_lab.paper.cells import RADII_M, PaperCell
+from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES, SettingChoice
+from pc2grid_lab.paper.experiment import MatchMeasures
+from pc2grid_lab.paper.methods import OURS
+from pc2grid_lab.paper.published import SUBMAPS
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
 
@@ -35,44 +37,55 @@ def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
         of_offset = [r for r in results if r.task.offset_m == offset_m]
         plain = [r for r in of_offset if r.is_plain]
         where = f"queries within {offset_m:g} m of a submap centre"
-        for measure in MatchMeasures._fields:
-            show(_table_3(plain, maps, methods, measure, where))
+        for measures in (("auc", "r_at_1"), ("rp9", "f1")):
+            show(_table_3(plain, maps, methods, measures, where))
         show(_table_4(plain, maps, where))
         _print_choices(of_offset, maps, f"What each signature adds: {where}", ABLATION)
         _print_choices(of_offset, maps, f"What other choices move: {where}", OPEN_CHOICES)
 
 
 def _table_3(
-    plain: Sequence[PaperCell], maps: Sequence[str], methods: Sequence[str], measure: str, where: str
+    plain: Sequence[PaperCell],
+    maps: Sequence[str],
+    methods: Sequence[str],
+    measures: Sequence[str],
+    where: str,
 ) -> Table:
-    title = "R@1" if measure == "r_at_1" else measure.upper()
-    shown = table(f"Table III, {title}, {where}", ("noise", "method"), maps)
+    headings = [f"{name} {_title(measure)}" for name, measure in itertools.product(maps, measures)]
+    title = " and ".join(map(_title, measures))
+    shown = table(f"Table III, {title}, {where}", ("noise", "method"), headings)
     for level, method in itertools.product(range(len(_LEVELS)), methods):
         row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == (method, level, 8.0)]
-        shown.add_row(str(level), method, *_cells(row, maps, measure))
+        shown.add_row(str(level), method, *_cells(row, maps, measures))
     return shown
 
 
 def _table_4(plain: Sequence[PaperCell], maps: Sequence[str], where: str) -> Table:
     shown = table(f"Table IV (noise level 1), {where}", ("radius", "method", "measure"), maps)
-    for radius_m, method, measure in itertools.product(RADII_M, OURS, Measures._fields):
+    for radius_m, method, measure in itertools.product(RADII_M, OURS, MatchMeasures._fields):
         row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == (method, 1, radius_m)]
-        shown.add_row(f"{radius_m:g} m", method, measure.upper(), *_cells(row, maps, measure))
+        shown.add_row(f"{radius_m:g} m", method, _title(measure), *_cells(row, maps, [measure]))
     return shown
 
 
-def _cells(row: Sequence[PaperCell], maps: Sequence[str], measure: str) -> list[str]:
-    """A text for each map."""
+def _title(measure: str) -> str:
+    return "R@1" if measure == "r_at_1" else measure.upper()
+
+
+def _cells(row: Sequence[PaperCell], maps: Sequence[str], measures: Sequence[str]) -> list[str]:
+    """A text for each map and measure."""
     by_map = {r.task.map_name: r for r in row}
-    return [_cell(by_map[name], measure) if name in by_map else "" for name in maps]
+    wanted = itertools.product(maps, measures)
+    return [_cell(by_map[name], measure) if name in by_map else "" for name, measure in wanted]
 
 
 def _cell(cell: PaperCell, measure: str) -> str:
     ours = round(1000 * getattr(cell.measures, measure))
     spread = f"+-{round(1000 * getattr(cell.half_widths, measure)):<2d}"
-    if cell.published is None or measure == "r_at_1":
+    published = getattr(cell.published, measure, None)
+    if published is None:
         return f"{ours} {spread}"
-    there = round(1000 * getattr(cell.published, measure))
+    there = round(1000 * published)
     return f"{there:3d} {ours:4d} {ours - there:+4d} {spread}"
 
 

@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 
 from pc2grid.model import Submap
-from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES, Matcher, Method, make_methods
-from pc2grid_lab.baselines.sdf import (
-    DistanceFeatures,
-)
-from pc2grid_lab.baselines.several_centres import SeveralCentres, lattice, smaller_disc
-from pc2grid_lab.baselines.shape_context import ShapeContext
-from pc2grid_lab.experiments.paper_experiment import rotated_submap
+from pc2grid_lab.paper.experiment import rotated_submap
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods
+from pc2grid_lab.paper.protocol import Matcher, Method
+from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
+from pc2grid_lab.paper.rivals.shape_context import ShapeContext
+from pc2grid_lab.paper.several_centres import SeveralCentres, lattice, smaller_disc
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
 ALL = METHOD_NAMES + EXTRA_METHOD_NAMES
@@ -47,7 +46,7 @@ def test_every_method_finds_a_submap_itself(name: str, matchers: dict[str, Match
 
 
 # Bags of words are not asked: the stairs of turned walls are the only features of rooms as bare as these.
-ON_GEOMETRY = ["shape_context", "proposed", "sdf"]
+ON_GEOMETRY = ["shape_context", "proposed", "as_used_here", "sdf"]
 
 
 @pytest.mark.parametrize("name", ON_GEOMETRY[:-1])

@@ -14,11 +14,12 @@ from typer.testing import CliRunner
 from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.io.nav2_map import save_map
 from pc2grid_cli import console
-from pc2grid_lab.baselines import EXTRA_METHOD_NAMES, METHOD_NAMES
-from pc2grid_lab.compare.paper import compare_paper_command
-from pc2grid_lab.experiments.paper_experiment import BestMatches
-from pc2grid_lab.experiments.paper_tables import MAPS, TABLE_3, TABLE_4
-from pc2grid_lab.experiments.paper_task import ABLATION, OPEN_CHOICES, paper_tasks
+from pc2grid_lab.paper.cells import paper_tasks
+from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES
+from pc2grid_lab.paper.command import compare_paper_command
+from pc2grid_lab.paper.experiment import BestMatches
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES
+from pc2grid_lab.paper.published import MAPS, TABLE_3, TABLE_4
 from signature.config import SignatureConfig
 from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
 
@@ -61,7 +62,9 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
     assert second.exit_code == 0, second.output
     assert len(written) == 10
     assert written == {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").rglob("*.pickle")}
-    assert "Table III, AUC" in second.stdout and "Table IV" in second.stdout
+    assert "Table III, AUC and R@1" in second.stdout and "Table IV" in second.stdout
+    first_row = re.search(r"^0 .*", second.stdout, re.MULTILINE)
+    assert first_row and re.match(r"0 +proposed +965 +\d+ +[-+]\d+ \+-\d+ +\d+ \+-\d+ *$", first_row[0])
 
 
 def test_the_ablation_and_any_floor(tmp_path: Path) -> None:

@@ -14,8 +14,8 @@ from sklearn.metrics import auc, precision_recall_curve
 
 from pc2grid.arrays import F64
 from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
-from pc2grid_lab.baselines import Method
-from pc2grid_lab.experiments.noise import Noise, add_noise
+from pc2grid_lab.paper.noise import Noise, add_noise
+from pc2grid_lab.paper.protocol import Method
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class BestMatches:
     def measures(self) -> MatchMeasures:
         """All measures of these matches."""
         curve = self.curve()
-        return MatchMeasures(curve.auc, curve.recall_at_90, curve.f1, float(self.correct.mean()))
+        return MatchMeasures(curve.auc, float(self.correct.mean()), curve.recall_at_90, curve.f1)
 
     def intervals(self, resamples: int = 300, seed: int = 0) -> tuple[MatchMeasures, MatchMeasures]:
         """5 and 95 % quantiles of each measure when the queries are drawn again (bootstrap)."""
@@ -71,14 +71,14 @@ class BestMatches:
 
 
 class MatchMeasures(NamedTuple):
-    """Area under the precision-recall curve, recall at a precision of 0.9, F1, and the share of the queries
-    whose best match is true (R@1); each 0 .. 1.
+    """Area under the precision-recall curve, the share of the queries whose best match is true (R@1), recall
+    at a precision of 0.9, and F1; each 0 .. 1. R@1 is not in the paper.
     """
 
     auc: float
+    r_at_1: float
     rp9: float
     f1: float
-    r_at_1: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

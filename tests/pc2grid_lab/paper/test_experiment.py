@@ -7,14 +7,14 @@ import pytest
 
 from pc2grid.model import FREE, OccupancyGrid
 from pc2grid.submaps.partition import submap_at
-from pc2grid_lab.baselines import make_methods
-from pc2grid_lab.experiments.noise import NOISE_LEVELS, Noise, add_noise
-from pc2grid_lab.experiments.paper_experiment import (
+from pc2grid_lab.paper.experiment import (
     Experiment,
     draw_queries,
     evaluate,
     precision_recall,
 )
+from pc2grid_lab.paper.methods import make_methods
+from pc2grid_lab.paper.noise import NOISE_LEVELS, Noise, add_noise
 from tests.helpers.rooms import canvas, cross, disc, grid_of, l_shape, rectangle, submap_of
 
 SILENT = NOISE_LEVELS[0]

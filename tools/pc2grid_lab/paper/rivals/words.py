@@ -17,7 +17,7 @@ from sklearn.feature_extraction.text import TfidfTransformer
 
 from pc2grid.arrays import F32, F64
 from pc2grid.model import Submap
-from pc2grid_lab.baselines.surf import surf_descriptors
+from pc2grid_lab.paper.rivals.surf import surf_descriptors
 
 Feature = Callable[[NDArray[np.uint8]], F32]
 
