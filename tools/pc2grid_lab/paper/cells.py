@@ -134,11 +134,6 @@ class PaperCell:
     half_widths: MatchMeasures
 
     @property
-    def is_plain(self) -> bool:
-        """Whether the method has its own settings."""
-        return not self.task.overrides
-
-    @property
     def published(self) -> Measures | None:
         """What the paper has printed for it; None if it has nothing."""
         task = self.task
@@ -171,12 +166,10 @@ def _run(task: PaperTask) -> list[PaperCell]:
     methods = make_methods(task.methods)
     if task.overrides:
         methods = {"as_used_here": Proposed(SignatureConfig(**dict(task.overrides)))}
-    cells = []
-    for method, matches in evaluate(methods, grid, submaps, experiment, noise).items():
-        low, high = matches.intervals()
-        half = MatchMeasures(*((b - a) / 2 for a, b in zip(low, high, strict=True)))
-        cells.append(PaperCell(task, method, len(submaps), matches, matches.measures(), half))
-    return cells
+    return [
+        PaperCell(task, method, len(submaps), matches, matches.measures(), matches.half_widths())
+        for method, matches in evaluate(methods, grid, submaps, experiment, noise).items()
+    ]
 
 
 def known_maps(path: Path) -> list[Path]:

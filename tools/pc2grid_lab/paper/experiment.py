@@ -57,8 +57,8 @@ class BestMatches:
         curve = self.curve()
         return MatchMeasures(curve.auc, float(self.correct.mean()), curve.recall_at_90, curve.f1)
 
-    def intervals(self, resamples: int = 300, seed: int = 0) -> tuple[MatchMeasures, MatchMeasures]:
-        """5 and 95 % quantiles of each measure when the queries are drawn again (bootstrap)."""
+    def half_widths(self, resamples: int = 300, seed: int = 0) -> MatchMeasures:
+        """Half of the interval from 5 to 95 % of each measure, by bootstrap over the queries."""
         rng = np.random.default_rng(seed)
         drawn = np.array(
             [
@@ -66,8 +66,7 @@ class BestMatches:
                 for rows in rng.integers(len(self.correct), size=(resamples, len(self.correct)))
             ]
         )
-        low, high = np.quantile(drawn, (0.05, 0.95), axis=0).tolist()
-        return MatchMeasures(*low), MatchMeasures(*high)
+        return MatchMeasures(*(np.diff(np.quantile(drawn, (0.05, 0.95), axis=0), axis=0)[0] / 2).tolist())
 
 
 class MatchMeasures(NamedTuple):

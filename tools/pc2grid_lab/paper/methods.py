@@ -9,7 +9,7 @@ from pc2grid_lab.paper.proposed import Proposed
 from pc2grid_lab.paper.protocol import Method
 from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
 from pc2grid_lab.paper.rivals.shape_context import ShapeContext
-from pc2grid_lab.paper.rivals.words import FEATURES, Vocabulary, Words
+from pc2grid_lab.paper.rivals.words import Vocabulary, Words, sift, surf
 from pc2grid_lab.paper.several_centres import SeveralCentres
 from signature.config import SignatureConfig
 
@@ -46,26 +46,20 @@ def make_methods(names: Iterable[str]) -> dict[str, Method]:
     Methods with the same local features share them when they are made together, so that the features of a
     submap are extracted once. Raises KeyError for a name that is not known.
     """
-    vocabularies: dict[str, Vocabulary] = {}
-    return {name: _make(name, vocabularies) for name in names}
-
-
-def _make(name: str, vocabularies: dict[str, Vocabulary]) -> Method:
-    if name == "boundary_centres":
-        # A spread of 1e6 makes Omega of Eq. 6 equal to 1.
-        return SeveralCentres(method=Proposed(SignatureConfig(weight_boundary=1.0, symmetry_sigma=1e6)))
-    if name in EXTRA_METHOD_NAMES:
-        return SeveralCentres(method=_make(name.removesuffix("_centres"), vocabularies))
-    if name == "proposed":
-        return Proposed(SignatureConfig.paper())
-    if name == "as_used_here":
-        return Proposed()
-    if name == "shape_context":
-        return ShapeContext()
-    if name == "sdf":
-        return DistanceFeatures()
-    feature, _, weighting = name.partition("_")
-    if name in METHOD_NAMES:
-        vocabulary = vocabularies.setdefault(feature, Vocabulary(FEATURES[feature]))
-        return Words(vocabulary, tfidf=weighting == "tfidf")
-    raise KeyError(f"no method {name!r}; there are {', '.join(METHOD_NAMES + EXTRA_METHOD_NAMES)}")
+    sift_words, surf_words = Vocabulary(sift), Vocabulary(surf)
+    # A spread of 1e6 makes Omega of Eq. 6 equal to 1.
+    boundary = Proposed(SignatureConfig(weight_boundary=1.0, symmetry_sigma=1e6))
+    known: dict[str, Method] = {
+        "proposed": Proposed(SignatureConfig.paper()),
+        "as_used_here": Proposed(),
+        "shape_context": ShapeContext(),
+        "sift_bow": Words(sift_words, tfidf=False),
+        "surf_bow": Words(surf_words, tfidf=False),
+        "sift_tfidf": Words(sift_words, tfidf=True),
+        "surf_tfidf": Words(surf_words, tfidf=True),
+        "sdf": DistanceFeatures(),
+        "as_used_here_centres": SeveralCentres(method=Proposed()),
+        "boundary_centres": SeveralCentres(method=boundary),
+        "shape_context_centres": SeveralCentres(method=ShapeContext()),
+    }
+    return {name: known[name] for name in names}

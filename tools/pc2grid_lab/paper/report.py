@@ -35,7 +35,7 @@ def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
     )
     for offset_m in dict.fromkeys(r.task.offset_m for r in results):
         of_offset = [r for r in results if r.task.offset_m == offset_m]
-        plain = [r for r in of_offset if r.is_plain]
+        plain = [r for r in of_offset if not r.task.overrides]
         where = f"queries within {offset_m:g} m of a submap centre"
         for measures in (("auc", "r_at_1"), ("rp9", "f1")):
             show(_table_3(plain, maps, methods, measures, where))
@@ -101,7 +101,7 @@ def _print_choices(
         here = [
             r for r in results if (r.method, r.task.level, r.task.radius_m) == ("as_used_here", level, 8.0)
         ]
-        base = {r.task.map_name: _auc_and_right(r) for r in here if r.is_plain}
+        base = {r.task.map_name: _auc_and_right(r) for r in here if not r.task.overrides}
         shown.add_row("all three", "", "Eq. 6", str(level), *_with_means(base, maps, ""))
         for choice in choices:
             moved = {
@@ -127,7 +127,9 @@ def _with_means(by_map: dict[str, F64], maps: Sequence[str], sign: str) -> list[
 
 def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Path:
     """figure-9-offset-OFFSET.png: precision over recall by map and noise level; returns its path."""
-    plain = [r for r in results if r.is_plain and (r.task.offset_m, r.task.radius_m) == (offset_m, 8.0)]
+    plain = [
+        r for r in results if not r.task.overrides and (r.task.offset_m, r.task.radius_m) == (offset_m, 8.0)
+    ]
     maps = list(dict.fromkeys(r.task.map_name for r in plain))
     path = out / f"figure-9-offset-{offset_m:g}.png"
     with picture(path, 3.2 * len(maps), 8.5) as figure:

@@ -55,9 +55,6 @@ def surf(image: NDArray[np.uint8]) -> F32:
     return surf_descriptors(image, MAX_FEATURES)
 
 
-FEATURES: dict[str, Feature] = {"sift": sift, "surf": surf}
-
-
 @dataclass(slots=True)
 class Vocabulary:
     """1024 words for one kind of feature, learned by k-means.
