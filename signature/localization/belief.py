@@ -1,11 +1,7 @@
 """The posterior filtered over time, with a rate of kidnapping.
 
-    prior_t(h)  =  1 + exp(-b) (1 - k) mass_s(h) / (1 - (1 - k) sum_g mass_s(g)),    k = 1 - (1 - slip)^n
+    prior_t(h)  =  1 + (1 - k) mass_s(h) / (1 - (1 - k) sum_g mass_s(g)),    k = 1 - (1 - slip)^n
     mass_t(h)   =  prior_t(h) exp(z_h) / N        (`signature.localization.posterior`)
-
-exp(b) is what a place has beside "nowhere" before anything is seen, and it is in exp(z_h) of every search. A
-place that has mass already does not begin there again, so it is taken out. Otherwise 8 m of bare corridor,
-which tell nothing, would say that the robot is nowhere.
 
 The scans of a search are those of the last metres, so the searches overlap. The prior of search t follows
 from the latest search s that lies before all scans of t. Then each scan counts once, however far the robot
@@ -14,8 +10,8 @@ of a query in the map is that of its odometry frame, which does not move.
 
 At each of the n scans of t, odometry may fail or the robot may be carried away, at the rate `slip`. This
 share of the mass joins "anywhere", of which each place has the mass of "nowhere" again, as at the beginning.
-So the past makes a place at most exp(-b) / k times as likely, and a place that the robot was never believed
-to be at has the prior 1.
+So the past makes a place at most 1 / k times as likely, and a place that the robot was never believed to be
+at has the prior 1.
 
 Fox, Burgard and Thrun 1999, "Markov localization for mobile robots in dynamic environments"; Thrun, Burgard
 and Fox, "Probabilistic Robotics", chapter 8.
@@ -23,7 +19,6 @@ and Fox, "Probabilistic Robotics", chapter 8.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -80,8 +75,7 @@ class Masses:
     def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
         """Prior of a place, relative to that of "nowhere", for a query of later scans."""
         share = kept(query)
-        odds = share * self.mass(place) / (1.0 - share * sum(self.masses))
-        return 1.0 + math.exp(-POSTERIOR.bias) * odds
+        return 1.0 + share * self.mass(place) / (1.0 - share * sum(self.masses))
 
 
 def kept(query: QueryMap) -> float:

@@ -54,7 +54,7 @@ from signature.localization.query import QueryMap
 class PosteriorParameters:
     """What the equation above is made of.
 
-    bias, fit, lead : b, c and d. A place that fits as wrong places do is exp(b) times as likely as "nowhere".
+    bias, fit, lead : b, c and d.
     slip : s. Fitted to evidence of an earlier tracking, which slipped at times; now it is too rare to tell s.
     few : wall points (0.1 m apart, by weight). Chosen among 3 to 100 by what is judged without the building;
         from half to twice of it the likelihood is as high.

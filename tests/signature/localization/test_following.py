@@ -13,9 +13,8 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.config import Config, RelocalizeConfig
-from signature.localization.belief import Belief, Masses, kept
+from signature.localization.belief import Belief, Masses
 from signature.localization.localizer import Estimate, Localizer
-from signature.localization.posterior import masses
 from signature.localization.prior import Prior
 from tests.helpers.simulated_drives import building, drive, office, plan
 
@@ -128,20 +127,6 @@ def test_a_place_is_given_up_when_it_is_as_certain_that_the_robot_is_not_there()
         for mass, sure in ((0.9, True), (0.5, False), (0.3, False), (0.8, True), (0.2, False), (0.5, False))
     ]
     assert states == ["located", "doubtful", "doubtful", "located", "lost", "lost"]
-
-
-def test_scans_that_fit_no_better_than_at_wrong_places_leave_the_mass_where_it_was() -> None:
-    """Such as those of a bare corridor. It is the slips that are possible meanwhile that take a little."""
-    localizer = Localizer(OFFICE)
-    estimates_of(localizer, list(stretch(FIRST)))
-    seen, answer = localizer.query.map(), localizer.answer()
-    before = replace(Masses.of(seen, answer), masses=(0.9, *(0.0 for _ in answer.masses[1:])))
-    nothing = replace(answer.evidence, forward=0.6, backward=0.6, lead=0.0)
-    assert masses([nothing])[0] < 0.001
-    now = masses([nothing], before.prior(seen, answer.hypotheses[:1]))[0]
-    assert now == pytest.approx(0.9 * kept(seen), abs=0.001)
-    never = replace(before, hypotheses=(), places=())
-    assert never.prior(seen, answer.hypotheses[:1]) == 1.0
 
 
 def test_a_robot_elsewhere_is_never_located() -> None:
