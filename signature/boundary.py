@@ -26,10 +26,10 @@ the upper one: 0.6 m / 0.2 m is 2.9999999999999996. It exceeds the rounding of f
 a distance of cells differs from an edge if it does not lie on it."""
 
 RANGE_BINS, PAIR_BINS = 20, 40
-"""Bins of what is seen: of distances from the viewpoint, up to the limit of
-sight, and of distances of two wall points, up to twice of it. On sessions of office 1, csail and fr079 the
-right place came earlier with 40 bins of pairs than with 20: as number 63, 37 and 24 of 30,000 instead of 101,
-37 and 34, after 1, 3 and 8 m."""
+"""Bins of what is seen: of distances from the viewpoint, up to the limit of sight, and of distances of two
+wall points, up to twice of it. On sessions of office 1, csail and fr079 the right place came earlier with
+40 bins of pairs than with 20: as number 63, 37 and 24 of 30,000 instead of 101, 37 and 34, after 1, 3 and
+8 m."""
 
 
 def boundary_edges(submap: Submap, config: SignatureConfig) -> BoolGrid:

@@ -21,7 +21,7 @@ ShortlistBy = Literal[
     "shuffled",
     "random",
 ]
-"""By the signatures; as a control, by those of another place, or by chance."""
+"""By the three signatures; as controls, by some of them, by those of another place, or by chance."""
 
 
 class SignatureConfig(Section):

@@ -29,8 +29,8 @@ if TYPE_CHECKING:
 PATH_BINS = 20
 """Bins of lengths of paths in what is seen, up to twice the limit of sight."""
 DETOUR_BINS, LARGEST_DETOUR = 6, 5.0 / 12.0
-"""Bins of the share by which a path is longer than the straight
-line, and the share from which it counts in the last of them."""
+"""Bins of the share by which a path is longer than the straight line, and the share from which it counts in
+the last of them."""
 STEPS_M = (0.05, 0.1, 0.2, 0.4, 0.8, 1.6, 3.0)
 """Edges of the bins of the step between neighbouring rays."""
 EVERY = 2
@@ -164,7 +164,7 @@ def freespace_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64
 
 
 def seen_graph(ranges_m: F32, ends: NDArray[np.int8]) -> nx.Graph:
-    """The free-space graph of one isovist (B,): node 0 is the viewpoint, node 1 + k the end of ray k `every`.
+    """The free-space graph of one isovist (B,): node 0 is the viewpoint, node 1 + k the end of ray k `EVERY`.
 
     Nodes of rays whose ends are hidden are left out. Edges with `length_m` join nodes whose straight line
     stays inside of what is seen (III-C 2).

@@ -113,16 +113,16 @@ class Places:
         if by == "signatures":
             return self.index(), self._first_look
         if by not in self._controls:
-            names = by.split("+")
-            self._controls[by] = (
-                (self.index().shuffled(self._chance), None)
-                if by == "shuffled"
-                else (
-                    PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names)),
-                    PlaceSignatures.of(self.table, names=names),
-                )
-            )
+            self._controls[by] = self._control(by)
         return self._controls[by]
+
+    def _control(self, by: ShortlistBy) -> tuple[PlaceIndex, PlaceSignatures | None]:
+        """What `_searched` says of a control; made anew."""
+        if by == "shuffled":
+            return self.index().shuffled(self._chance), None
+        names = by.split("+")
+        index = PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names))
+        return index, PlaceSignatures.of(self.table, names)
 
     def next_to(self, poses: Poses, most: int) -> I64:
         """The `most` places (R,) that the robot stands next to in the likeliest poses, likeliest first; if

@@ -14,7 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import get_args
 
@@ -84,17 +84,18 @@ def together(maps: Mapping[str, MapIndex]) -> MapIndex:
 
 def databases(folder: Folder, sizes: Sequence[int]) -> Iterator[Database]:
     """The databases, one after the other. sizes : places of those with office floors."""
-    own: dict[str, MapIndex] = {}
+
+    @cache
+    def opened(name: str) -> MapIndex:
+        return index_of(folder.map(name))
 
     def its_map(window: Window, few: bool) -> MapIndex | None:
-        name = window.pair.map_name
-        if name not in own:
-            own[name] = index_of(folder.map(name))
-        return own[name] if (len(own[name].places.table) < _FEW) == few else None
+        index = opened(window.pair.map_name)
+        return index if (len(index.places.table) < _FEW) == few else None
 
     yield Database(f"its map, up to {_FEW} places", lambda w: its_map(w, True), lambda w: w.truth)
     yield Database("its map, more places", lambda w: its_map(w, False), lambda w: w.truth)
-    maps = {name: index_of(folder.map(name)) for name in one_each(folder)}
+    maps = {name: opened(name) for name in one_each(folder)}
 
     def one_truth(window: Window) -> Mapping[str, SE2]:
         return {window.pair.map_name: next(iter(window.truth.values()))}

@@ -129,6 +129,8 @@ def main(data: Path, work: Path, only: Only = None, starts: int = 16) -> None:
         verdicts = [False] * len(answers) if elsewhere else right(drive, answers)
         for travel_m in TRAVEL_M:
             here = [(a, v) for a, v in zip(answers, verdicts, strict=True) if a.travel_m == travel_m]
+            if not here:
+                continue
             located = [verdict for one, verdict in here if one.answer.status == "located"]
             mass, cpu_s = np.array([(one.answer.confidence, one.cpu_s) for one, _ in here]).T
             print(

@@ -38,8 +38,7 @@ def compare_paper_command(
         list[str] | None,
         typer.Option(
             "--methods",
-            help="Only these; repeatable. Not in the paper: as_used_here_centres, boundary_centres, "
-            "shape_context_centres.",
+            help=f"Only these; repeatable. Extras: {', '.join(EXTRA_METHOD_NAMES)}.",
         ),
     ] = None,
     offset: Annotated[
