@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +37,7 @@ class RegistrationParameters:
     """How points are registered and compared. All chosen by hand, tried in simulation.
 
     voxel_m : edge of the voxels that the query, and the map for it, are reduced to. points : so many of the
-        query are registered.
+        query are registered. least_points : so many of these must meet the map.
     tile_m : edge of the squares of the map whose normals are estimated together.
     margin_m : of the part of the map that is used, around the query.
     floor_m : the floors are compared so far around the sensor.
@@ -53,6 +54,7 @@ class RegistrationParameters:
 
     voxel_m: float = 0.1
     points: int = 2000
+    least_points: int = 100
     tile_m: float = 4.0
     margin_m: float = 1.0
     floor_m: float = 8.0
@@ -170,6 +172,11 @@ class Rays:
         return int(np.count_nonzero(over)) - int(np.count_nonzero(under))
 
 
+Unfit = Literal["unknown", "left"]
+"""Why there is no fit: the map shows too little of the points, or of the floor, there; or ICP leaves the
+planar pose, as nothing there holds it."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SpatialFit:
     """A query in space on a map.
@@ -195,6 +202,13 @@ class SpatialFit:
         freeze(self, "T_map_query", np.float64, (4, 4))
         freeze(self, "information", np.float64, (6, 6))
         freeze(self, "center_m", np.float64, (3,))
+
+    @property
+    def held(self) -> float:
+        """0..1, three times the share of the information about the position that is along its least known
+        direction: surfaces that all face one way fit onto any wall."""
+        position = self.information[:3, :3]
+        return 3.0 * float(np.linalg.eigvalsh(position)[0] / np.trace(position))
 
     def covariance_at(self, T_query_base: F64) -> F64:
         """Covariance (6, 6) of the pose of a base (4, 4) in the query.
@@ -266,11 +280,11 @@ def register_in_space(
     T_map_query: SE2,
     parameters: RegistrationParameters = REGISTRATION,
     rays: RayParameters = RAYS,
-) -> SpatialFit | None:
+) -> SpatialFit | Unfit:
     """Register the scans of a query with the points of a map, from a planar pose of its odom frame.
 
-    None if the map has no points there, the floors are not found on both sides, or ICP leaves the
-    neighbourhood of the planar pose.
+    "unknown" if the map has no points there, or the floors are not found on both sides; "left" if ICP leaves
+    the neighbourhood of the planar pose.
     """
     p = parameters
     cloud = VoxelCloud(p.voxel_m)
@@ -278,24 +292,16 @@ def register_in_space(
         cloud.add(view.points_m)
     query = cloud.points_m()
     if not len(query):
-        return None
+        return "unknown"
     lifted = T_map_query.lift()
     target = _around(surface.points_m, transform_points(lifted, query), p.margin_m)
     start = _on_floor(target, query, lifted, views[-1].sensor_m)
     if start is None:
-        return None
+        return "unknown"
     found = _icp(query, surface.near(transform_points(start, query)), start, p)
-    if found is None:
-        return None
+    if isinstance(found, str):
+        return found
     T, information, center_m, rmse_m = found
-    turn_rad = rotation_vector(invert_pose(start) @ T)
-    before_m, after_m = (transform_points(pose, query.mean(axis=0)[None])[0] for pose in (start, T))
-    if (
-        math.hypot(*(after_m - before_m)[:2]) > p.farthest_m
-        or abs(turn_rad[2]) > p.farthest_rad
-        or math.hypot(turn_rad[0], turn_rad[1]) > p.tilt_rad
-    ):
-        return None
     compared = compare_rays(views, target, T, rays)
     on, through, before = compared.counts
     count = on + through + before
@@ -351,8 +357,8 @@ def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None
 
 def _icp(
     query: F64, surface: tuple[F64, F64], start: F64, p: RegistrationParameters
-) -> tuple[F64, F64, F64, float] | None:
-    """The pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m; None without overlap.
+) -> tuple[F64, F64, F64, float] | Unfit:
+    """The pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m.
 
     surface : points (M, 3) and normals (M, 3) of the map.
     """
@@ -372,8 +378,10 @@ def _icp(
         criteria = steps.ICPConvergenceCriteria(converged, converged, p.iterations)
         result = steps.registration_icp(source, target, distance_m, T, estimate, criteria)
         T = np.array(result.transformation)
-        if len(result.correspondence_set) < 100:
-            return None
+        if len(result.correspondence_set) < p.least_points:
+            return "unknown"
+        if _has_left(query.mean(axis=0), start, T, p):
+            return "left"
     pairs = np.asarray(result.correspondence_set)
     placed = transform_points(T, np.asarray(source.points))[pairs[:, 0]]
     normals = normals[pairs[:, 1]]
@@ -387,6 +395,18 @@ def _icp(
     independent = min(1.0, (p.voxel_m / p.patch_m) ** 2) / share
     information = J.T @ J * (independent / max(rmse_m, p.noise_m) ** 2)
     return T, information, center_m, rmse_m
+
+
+def _has_left(center_m: F64, start: F64, T: F64, p: RegistrationParameters) -> bool:
+    """Whether a pose (4, 4) moves or turns a query about its centre (3,) farther from where it began than a
+    planar pose can be off."""
+    turn_rad = rotation_vector(invert_pose(start) @ T)
+    before_m, after_m = (transform_points(pose, center_m[None])[0] for pose in (start, T))
+    return (
+        math.hypot(*(after_m - before_m)[:2]) > p.farthest_m
+        or abs(turn_rad[2]) > p.farthest_rad
+        or math.hypot(turn_rad[0], turn_rad[1]) > p.tilt_rad
+    )
 
 
 def compare_rays(

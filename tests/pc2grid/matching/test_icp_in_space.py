@@ -9,7 +9,7 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, invert_pose, pose_from_rotation_vector, rotation_vector, transform_points
-from pc2grid.matching.icp_in_space import MapSurface, SpatialView, register_in_space
+from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, SpatialView, register_in_space
 from pc2grid.model import PointMap
 from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
@@ -32,7 +32,7 @@ def asked(height_m: float) -> tuple[QueryInSpace, SE2, F64, F64]:
 def test_pose_in_space_is_exact_to_a_centimetre(height_m: float, x_m: float) -> None:
     query, T_room_odom, T_room_base, T_odom_base = asked(height_m)
     fit = register_in_space(query.views, MapSurface(twin_map()), SE2(x_m, 0.0, 0.0) @ T_room_odom @ OFF)
-    assert fit is not None
+    assert isinstance(fit, SpatialFit)
     true = T_room_base.copy()
     true[0, 3] += x_m
     error = invert_pose(true) @ fit.T_map_query @ T_odom_base
@@ -55,7 +55,7 @@ def test_a_query_that_is_not_level_is_tilted_with_its_floor() -> None:
         for view in query.views
     ]
     fit = register_in_space(tilted, MapSurface(twin_map()), T_room_odom)
-    assert fit is not None
+    assert isinstance(fit, SpatialFit)
     error = invert_pose(T_room_base) @ fit.T_map_query @ tilt @ T_odom_base
     assert np.linalg.norm(error[:3, 3]) < 0.02
 
@@ -72,7 +72,7 @@ def test_a_hall_that_is_mostly_floor_is_registered() -> None:
     assert np.median(points_m[:, 2]) < 0.05
     view = SpatialView(sensor_m=np.array([1.0, 0.5, 1.0]), points_m=points_m)
     fit = register_in_space([view], MapSurface(PointMap.of(points_m, 0.05)), OFF)
-    assert fit is not None and fit.on > 0.97
+    assert isinstance(fit, SpatialFit) and fit.on > 0.97
     assert np.linalg.norm(fit.T_map_query[:3, 3]) < 0.02
 
 
@@ -87,7 +87,7 @@ def test_twin_rooms_of_other_height_are_told_apart() -> None:
             register_in_space(query.views, MapSurface(twin_map()), SE2(x_m, 0.0, 0.0) @ T_room_odom)
             for x_m in (own_m, other_m)
         )
-        assert own is not None and other is not None
+        assert isinstance(own, SpatialFit) and isinstance(other, SpatialFit)
         assert own.on > other.on + 0.1
         assert getattr(other, share) > 0.1 > getattr(own, share)
 
@@ -101,7 +101,7 @@ def test_a_shelf_is_no_wall() -> None:
     view = SpatialView(sensor_m=np.array([2.0, 2.0, 1.2]), points_m=np.concatenate([*walls, *shelf]))
     through = register_in_space([view], MapSurface(PointMap.of(with_wall, 0.05)), SE2())
     right = register_in_space([view], MapSurface(PointMap.of(view.points_m, 0.05)), SE2())
-    assert through is not None and right is not None
+    assert isinstance(through, SpatialFit) and isinstance(right, SpatialFit)
     assert through.through > 0.05 and right.through == 0.0
     assert right.on > through.on + 0.05
 
@@ -113,12 +113,19 @@ def test_one_free_direction_is_uncertain() -> None:
     seen = cloud[np.abs(cloud[:, 0] - 10.0) < 4.0]
     view = SpatialView(sensor_m=np.array([10.0, 1.0, 1.0]), points_m=seen)
     fit = register_in_space([view], MapSurface(PointMap.of(cloud, 0.05)), SE2())
-    assert fit is not None
+    assert isinstance(fit, SpatialFit)
     sigma = np.sqrt(np.diag(fit.covariance_at(np.eye(4))))
     assert sigma[0] > 10.0 * max(sigma[1:3])
 
 
-def test_nothing_is_said_where_there_is_no_map() -> None:
+def test_nothing_is_known_where_there_is_no_map() -> None:
     query, T_room_odom, *_ = asked(HEIGHTS_M[0])
-    assert register_in_space(query.views, MapSurface(twin_map()), SE2(100.0, 0.0, 0.0) @ T_room_odom) is None
-    assert register_in_space([], MapSurface(twin_map()), T_room_odom) is None
+    away = SE2(100.0, 0.0, 0.0) @ T_room_odom
+    assert register_in_space(query.views, MapSurface(twin_map()), away) == "unknown"
+    assert register_in_space([], MapSurface(twin_map()), T_room_odom) == "unknown"
+
+
+@pytest.mark.parametrize("off", [SE2(0.65, 0.0, 0.0), SE2(0.0, -0.65, 0.0)], ids=["along x", "along y"])
+def test_a_pose_beside_the_right_one_is_left(off: SE2) -> None:
+    query, T_room_odom, *_ = asked(HEIGHTS_M[0])
+    assert register_in_space(query.views, MapSurface(twin_map()), off @ T_room_odom) == "left"

@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, invert_pose
-from pc2grid.matching.icp_in_space import MapSurface, register_in_space
+from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_space
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import Health, PointMap
 from signature.localization.answer import Verdict
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import (
     SPACE,
-    agreement_in_space,
-    masses_in_space,
+    log_odds_in_space,
+    masses_of,
     settle_in_space,
 )
 from signature.localization.posterior import NO_EVIDENCE
@@ -110,7 +110,7 @@ def test_furniture_does_not_tell_twins_apart() -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M, cupboard=True)
     points = MapSurface(furnished_map())
     fits = [register_in_space(query.views, points, h.fit.T_map_query) for h in verdict.hypotheses]
-    assert fits[0] is not None and fits[1] is not None
+    assert isinstance(fits[0], SpatialFit) and isinstance(fits[1], SpatialFit)
     assert fits[1].on - fits[0].on > 0.05
     assert fits[1].compared.patches_over(fits[0].compared) == 0
     settled, _ = settle_in_space(verdict, query, lambda _: points, accept=0.9)
@@ -149,11 +149,29 @@ def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: Map
 def test_a_place_that_is_not_compared_keeps_its_odds(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     fit = register_in_space(query.views, points, verdict.hypotheses[0].fit.T_map_query)
-    assert fit is not None
-    masses, best = masses_in_space((0.3, 0.3), {1: fit})
-    factor = math.exp(SPACE.weight * agreement_in_space(fit))
+    assert isinstance(fit, SpatialFit)
+    masses, best = masses_of((0.3, 0.3), {1: fit})
+    factor = math.exp(log_odds_in_space(fit))
     assert best == 1 and masses[1] / masses[0] == pytest.approx(factor)
     assert masses[0] / (1.0 - masses.sum()) == pytest.approx(0.3 / 0.4)
+
+
+def test_a_place_that_icp_leaves_is_turned_down(points: MapSurface) -> None:
+    """0.65 m beside the right one; what it tells is the same wherever the place is."""
+    query, verdict = ask(HEIGHTS_M[0], 0.65)
+    settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    assert settled.status == "not_found" and in_space is None
+    odds = 0.95 / 0.05 * math.exp(SPACE.left)
+    assert settled.confidence == pytest.approx(odds / (1.0 + odds))
+
+
+def test_what_stands_in_the_way_contradicts_more_than_what_is_gone(points: MapSurface) -> None:
+    query, verdict = ask(HEIGHTS_M[0], 0.0)
+    fit = register_in_space(query.views, points, verdict.hypotheses[0].fit.T_map_query)
+    assert isinstance(fit, SpatialFit)
+    gone = replace(fit, on=fit.on - 0.1, through=fit.through + 0.1)
+    stands = replace(fit, on=fit.on - 0.1, before=fit.before + 0.1)
+    assert log_odds_in_space(fit) > log_odds_in_space(gone) > log_odds_in_space(stands)
 
 
 def test_a_place_that_is_turned_down_is_not_kept_for_one_that_is_not_compared() -> None:

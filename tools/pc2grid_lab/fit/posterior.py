@@ -43,10 +43,10 @@ KINDS = {
     "blanked": "place blanked",
 }
 """What is printed of the places of `recorded_queries`."""
-_LAPSE = 0.1
+LAPSE = 0.1
 """Share of the truths that are taken to be none: a query whose map is wrong, or whose place no equation would
 find, does not decide the fit."""
-_PENALTY = 1e-3
+PENALTY = 1e-3
 """Weight of the squared bias, fit and lead in the loss: keeps them finite where the answers can be told apart
 without error. By hand; with a tenth of it, what is judged on buildings that were left out is too sure."""
 
@@ -94,8 +94,12 @@ def known_of(rows: Iterable[dict[str, Any]]) -> Iterator[Known]:
 
 def _first_right(errors: Sequence[tuple[float, float]]) -> int | None:
     """The number of the first place that is right, by metres and radians from the truth."""
-    right = (error_m <= RIGHT_M and error_rad <= RIGHT_RAD for error_m, error_rad in errors)
-    return next((k for k, is_right in enumerate(right) if is_right), None)
+    return next((k for k, error in enumerate(errors) if is_right(error)), None)
+
+
+def is_right(error: Sequence[float]) -> bool:
+    """Whether a place is right, by metres and radians from the truth."""
+    return error[0] <= RIGHT_M and error[1] <= RIGHT_RAD
 
 
 def fit(answers: Sequence[Known]) -> PosteriorParameters:
@@ -111,8 +115,8 @@ def fit(answers: Sequence[Known]) -> PosteriorParameters:
     likelihood = _Likelihood.of(answers)
 
     def loss(x: F64) -> float:
-        p = (1.0 - _LAPSE) * likelihood.of_truth(x) + _LAPSE
-        return float(-weights @ np.log(p) + 0.5 * _PENALTY * x @ x)
+        p = (1.0 - LAPSE) * likelihood.of_truth(x) + LAPSE
+        return float(-weights @ np.log(p) + 0.5 * PENALTY * x @ x)
 
     start = np.array([POSTERIOR.bias, POSTERIOR.fit, POSTERIOR.lead])
     bounds = [(None, None), (0.0, None), (0.0, None)]
