@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import compress
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -19,6 +20,7 @@ from pc2grid.io.atomic import replace_file, require_writable
 from pc2grid.model import OccupancyGrid, Trajectory
 from signature.database import open_database
 from signature.database.protocol import Label
+from signature.localization.ambiguous_line import AmbiguousLine, ambiguous_line
 from signature.localization.answer_json import AnswerDocument, document
 from signature.localization.answer_json import Status as Status
 from signature.localization.hypotheses import Hypothesis
@@ -260,6 +262,16 @@ class Answer:
     def slipped(self) -> float:
         """Probability that the query lay at the best place until it was carried away or tracking slipped."""
         return self.masses[0] * self.evidence.slipped() if self.masses else 0.0
+
+    @property
+    def line(self) -> AmbiguousLine | None:
+        """The line on which an ambiguous base is likely to be; None: there is none."""
+        if self.status != "ambiguous" or not self.masses:
+            return None
+        firsts = [self.hypotheses[self.places.index(place)] for place in range(len(self.masses))]
+        here = [h.session_index == firsts[0].session_index for h in firsts]
+        bases = [h.fit.T_map_query @ self.T_odom_base for h in compress(firsts, here)]
+        return ambiguous_line(bases, list(compress(self.masses, here)))
 
     @property
     def label(self) -> Label:

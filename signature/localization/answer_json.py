@@ -128,11 +128,30 @@ class PoseInSpace(TypedDict):
     before: float
 
 
+class Point(TypedDict):
+    """A point of a map, metres."""
+
+    x: float
+    y: float
+
+
+class AmbiguousLine(TypedDict):
+    """Likely places that lie on one line, all with the heading `yaw`. begin, end: the places at its ends, in
+    the frame of the best hypothesis. probability: that the base is at one of these places."""
+
+    begin: Point
+    end: Point
+    yaw: float
+    length_m: float
+    probability: float
+
+
 class Result(Labelled):
     """What is found. frame: of the building, in which the poses are if the session was joined with others;
     null: the map frame of the session. T_map_odom puts the query's own frame into it. confidence: the
     probability that the best hypothesis is right. hypotheses: best first. prior: null if nothing was known
-    beforehand. in_space: null if the map or the query has no points."""
+    beforehand. in_space: null if the map or the query has no points. line: null unless the answer is
+    ambiguous, and most of the probability lies on one."""
 
     status: Status
     session: str | None
@@ -142,6 +161,7 @@ class Result(Labelled):
     confidence: float
     hypotheses: list[Hypothesis]
     history: list[Moment]
+    line: AmbiguousLine | None
     prior: PriorUse | None
     in_space: PoseInSpace | None
     timing_ms: dict[str, float]
@@ -193,6 +213,7 @@ def document(answer: answer.Answer) -> AnswerDocument:
             for h, submap_id, place in zip(answer.hypotheses, answer.submap_ids, answer.places, strict=True)
         ],
         "history": [_moment(moment) for moment in answer.history],
+        "line": _line(answer),
         "prior": None if answer.prior is None else {"status": answer.prior, "excluded": excluded},
         "in_space": in_space_document(answer),
         "query": {"path_m": answer.path_m, "stamp_ns": answer.stamp_ns},
@@ -201,6 +222,21 @@ def document(answer: answer.Answer) -> AnswerDocument:
     }
     made: AnswerDocument = plain(AnswerDocument, about)
     return made
+
+
+def _line(answer: answer.Answer) -> AmbiguousLine | None:
+    """The line of an ambiguous answer."""
+    line = answer.line
+    if line is None:
+        return None
+    (x, y), (to_x, to_y) = line.begin_m, line.end_m
+    return {
+        "begin": {"x": x, "y": y},
+        "end": {"x": to_x, "y": to_y},
+        "yaw": line.yaw_rad,
+        "length_m": line.length_m,
+        "probability": line.probability,
+    }
 
 
 def stamped_pose(answer: answer.Answer) -> StampedPose | None:

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame
+    from signature.localization.ambiguous_line import AmbiguousLine
     from signature.localization.answer import Answer
     from signature.localization.hypotheses import Hypothesis
 
@@ -428,7 +429,19 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
     for h in answer.hypotheses[:5]:
         pose = h.fit.T_map_query @ answer.T_odom_base
         lines.append(f"  {_named(answer, h)}: x {pose.x:.2f} m, y {pose.y:.2f} m, score {h.fit.score:.2f}")
+    if answer.line is not None:
+        lines.append(_on_line(answer.line))
     return "\n".join(lines) + _in_space(answer)
+
+
+def _on_line(line: AmbiguousLine) -> str:
+    """What is known of a base that is somewhere on a line."""
+    (x, y), (to_x, to_y) = line.begin_m, line.end_m
+    return (
+        f"  on one line of {line.length_m:.1f} m with probability {probability(line.probability)}:"
+        f" from x {x:.1f} m, y {y:.1f} m to x {to_x:.1f} m, y {to_y:.1f} m,"
+        f" yaw {math.degrees(line.yaw_rad):.0f} deg"
+    )
 
 
 def _in_space(answer: Answer) -> str:

@@ -388,6 +388,9 @@ def _draw_rivals(axes: Any, answer: Answer, session: str) -> None:
     if shown:
         label = "other hypotheses"
         axes.plot(*zip(*shown, strict=True), "s", color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)
+    if answer.line is not None:
+        ends = zip(answer.line.begin_m, answer.line.end_m, strict=True)
+        axes.plot(*ends, "--", color=PURPLE, lw=1.2, label="line of likely places")
 
 
 def _outline(whole: Any, close: Any) -> None:

@@ -11,6 +11,7 @@ import pytest
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan, Submap
+from pc2grid_cli.relocalize import as_text
 from signature.config import Config, SignatureConfig
 from signature.database import Label
 from signature.describe import Signature, describe
@@ -89,6 +90,12 @@ def test_two_identical_rooms_are_ambiguous_with_both_named() -> None:
     places = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
     for expected in (truth, SE2(truth.x + 6, truth.y, truth.yaw)):
         assert any(math.dist((p.x, p.y), (expected.x, expected.y)) < 0.25 for p in places)
+    line, document = answer.line, answer.to_json()["line"]
+    assert line is not None and document is not None
+    assert line.length_m == document["length_m"] == pytest.approx(6.0, abs=0.1)
+    assert abs(math.remainder(line.yaw_rad - truth.yaw, 2 * math.pi)) < math.radians(3.0)
+    assert line.probability > 0.9
+    assert "on one line of 6.0 m with probability > 0.9" in as_text(answer)
 
 
 def test_a_symmetric_room_reports_both_headings() -> None:
