@@ -65,14 +65,15 @@ def row(error_m: float, *, at: str = "a") -> dict[str, object]:
 
 
 def test_the_place_that_counts_is_where_icp_ends() -> None:
-    near, far = compared_of([row(0.1), row(0.6)])
+    rows = [row(0.1), row(0.6) | {"start": "two 0.0"}]
+    near, far = compared_of(rows + rows[:1])  # a window that is asked twice counts once
     assert near.right == {1} and far.right == frozenset()
     assert np.isnan(near.terms[0]).all() and near.terms[1, 0] == 0.5
     assert near.masses(TRUTH)[1] > near.in_plane[1]
 
 
 def test_it_prints_what_is_located(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [row(0.1 if at == of else 9.0, at=at) | {"log": of} for of in "abc" for at in "abc"]
+    rows = [row(0.1 if at == of else 9.0, at=at) | {"log": of, "start": of} for of in "abc" for at in "abc"]
     file = tmp_path / "evidence.json"
     file.write_text(json.dumps(rows))
     in_space.main([file])

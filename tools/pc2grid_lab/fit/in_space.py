@@ -58,7 +58,8 @@ class Compared:
 
 def compared_of(rows: Iterable[dict[str, Any]]) -> Iterator[Compared]:
     """The queries whose places were compared in space, each once in a map."""
-    once = {(row["start"], row["travel_m"], str(row["evidence"])): row for row in rows if row.get("in_space")}
+    compared = (row for row in rows if row.get("in_space"))
+    once = {(row["start"], row["map"], str(row["evidence"])): row for row in compared}
     for row in once.values():
         places = [Evidence(**told) for told in row["evidence"]]
         terms, errors = np.full((len(places), 4), np.nan), dict(enumerate(row["errors"]))
