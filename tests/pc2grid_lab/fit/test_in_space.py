@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pc2grid_lab.fit import in_space
-from pc2grid_lab.fit.in_space import Compared, compared_of, fit, left_out
+from pc2grid_lab.fit.in_space import Compared, compared_of, fit, left_out, shuffled
 from signature.localization.in_space import masses_in_space
 from signature.localization.posterior import Evidence
 
@@ -56,6 +56,12 @@ def test_a_query_is_judged_without_its_building() -> None:
         if q.building == "c"
     )
     assert np.abs(fit(some) - of_others).max() > 1.0
+
+
+def test_shuffled_rays_do_not_tell_places_apart() -> None:
+    some = queries(300)
+    right = [sum(int(q.masses(TRUTH).argmax()) in q.right for q in given) for given in (some, shuffled(some))]
+    assert right[0] > 1.3 * right[1]
 
 
 def row(error_m: float, *, at: str = "a") -> dict[str, object]:

@@ -3,8 +3,9 @@
     python -m pc2grid_lab.fit.in_space EVIDENCE.json ...
 
 Each file is one that `recorded_queries` has written. Prints for the masses in the plane, the parameters in
-use, those fitted, and those fitted without the buildings of query and map, how many answers would be located,
-rightly and wrongly, by building; and the parameters for `signature.localization.in_space`.
+use, these with the rays of places drawn at random, those fitted, and those fitted without the buildings of
+query and map, how many answers would be located, rightly and wrongly, by building; and the parameters for
+`signature.localization.in_space`.
 
 Queries whose place was found and all others weigh the same in the fit, as in `posterior`.
 """
@@ -14,7 +15,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -96,6 +97,19 @@ def left_out(queries: Sequence[Compared]) -> list[F64]:
     return [q.masses(models[q.buildings]) for q in queries]
 
 
+def shuffled(queries: Sequence[Compared]) -> list[Compared]:
+    """The control that must fail: each place gets what the points tell for a place drawn at random."""
+    rng = np.random.default_rng(0)
+    every = np.concatenate([q.terms for q in queries])
+    every = every[np.isfinite(every).all(axis=1)]
+
+    def drawn(terms: F64) -> F64:
+        compared = np.isfinite(terms).all(axis=1, keepdims=True)
+        return np.where(compared, every[rng.integers(len(every), size=len(terms))], np.nan)
+
+    return [replace(q, terms=drawn(q.terms)) for q in queries]
+
+
 def print_judged(queries: Sequence[Compared], name: str, masses: Iterable[F64]) -> None:
     """Print what is located by masses (P,), rightly and wrongly, by building of the query."""
     asked, right, wrong = Counter[str](), Counter[str](), Counter[str]()
@@ -114,6 +128,7 @@ def main(files: list[Path]) -> None:
     fitted = fit(queries)
     print_judged(queries, "in the plane", (q.in_plane for q in queries))
     print_judged(queries, "in use", (q.masses(_IN_USE) for q in queries))
+    print_judged(queries, "in use, shuffled", (q.masses(_IN_USE) for q in shuffled(queries)))
     print_judged(queries, "fitted", (q.masses(fitted) for q in queries))
     print_judged(queries, "fitted without the building", left_out(queries))
     print("on, through, before, left:", *(f"{value:.1f}" for value in fitted))
