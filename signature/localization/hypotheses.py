@@ -37,9 +37,10 @@ class HypothesisParameters:
     refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
     same_m, same_rad : two hypotheses nearer than this are one.
     map_m, map_rad : standard deviations of where a map shows what is around a place: half a cell, and over
-        the range of a laser as an angle. They are added to those of the alignment, which are of some
-        millimetres: without them the errors of 148 right answers to real recordings are 2.2 times what is
-        stated (median), with them 1.0.
+        the range of a laser as an angle. They are added to those of the alignment, in the plane and in space,
+        which are of some millimetres: without them the errors of 148 right answers to real recordings in the
+        plane are 2.2 times what is stated (median), with them 1.0; those of 32 in space, by cameras and by
+        lidars, 2.4 and 5.9 times, with them 0.6 and 0.9.
     """
 
     few_points: int = 128

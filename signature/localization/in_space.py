@@ -34,6 +34,7 @@ from pc2grid.geometry import SE2
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, Unfit, register_in_space
 from signature.database import SubmapDatabase
 from signature.localization.answer import PoseInSpace, SpaceStatus, Status, Verdict
+from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.query import QueryInSpace
 
 
@@ -158,12 +159,13 @@ def terms_in_space(fit: SpatialFit | Unfit) -> tuple[float, float, float, float]
 
 def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
     u = log_odds_in_space(fit)
+    of_map = np.repeat((HYPOTHESES.map_m, HYPOTHESES.map_rad), 3)
     status: SpaceStatus = "agrees" if u >= 0.0 else "unsure"
     return PoseInSpace(
         # Like one that ICP leaves.
         status="contradicts" if u <= SPACE.left else status,
         T_map_base=fit.T_map_query @ T_odom_base,
-        covariance=fit.covariance_at(T_odom_base),
+        covariance=fit.covariance_at(T_odom_base) + np.diag(np.square(of_map)),
         rmse_m=fit.rmse_m,
         rays=fit.rays,
         on=fit.on,

@@ -13,7 +13,7 @@ from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_sp
 from pc2grid.matching.two_way_score import Fit
 from pc2grid.model import Health, PointMap
 from signature.localization.answer import Verdict
-from signature.localization.hypotheses import Hypothesis
+from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.in_space import (
     SPACE,
     log_odds_in_space,
@@ -121,8 +121,12 @@ def test_a_located_pose_is_refined_and_becomes_surer(points: MapSurface) -> None
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     first = verdict.hypotheses[0]
     moved = replace(first, fit=replace(first.fit, T_map_query=first.fit.T_map_query @ SE2(0.1, -0.05, 0.03)))
-    settled, _ = settle_in_space(replace(verdict, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
+    settled, at = settle_in_space(replace(verdict, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
     assert settled.status == "located" and settled.confidence > 0.99
+    # Not surer than the map.
+    assert at is not None
+    for covariance in (at.covariance, settled.hypotheses[0].fit.covariance):
+        assert np.sqrt(np.diag(covariance)[:2]).min() > HYPOTHESES.map_m
     error = base_of(verdict, query).inverse() @ base_of(settled, query)
     assert np.hypot(error.x, error.y) < 0.02
 
