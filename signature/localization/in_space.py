@@ -34,7 +34,7 @@ from pc2grid.geometry import SE2
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, Unfit, register_in_space
 from signature.database import SubmapDatabase
 from signature.localization.answer import PoseInSpace, SpaceStatus, Status, Verdict
-from signature.localization.hypotheses import HYPOTHESES
+from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.query import QueryInSpace
 
 
@@ -106,8 +106,7 @@ def _compared(
     best, masses = 0, np.array(verdict.masses)
     for place in range(min(len(masses), SPACE.places)):
         h = verdict.hypotheses[verdict.places.index(place)]
-        surface = surface_of(h.session_index)
-        fit = "unknown" if surface is None else register_in_space(query.views, surface, h.fit.T_map_query)
+        fit = fit_in_space(query, surface_of(h.session_index), h)
         if log_odds_in_space(fit):
             fits[place] = fit
             masses, best = masses_of(verdict.masses, fits)
@@ -116,6 +115,11 @@ def _compared(
         if best in fits and masses[best] >= accept * (1.0 + masses[best] * left):
             break
     return fits, masses, best
+
+
+def fit_in_space(query: QueryInSpace, surface: MapSurface | None, place: Hypothesis) -> SpatialFit | Unfit:
+    """The fit of a query at a place. surface : the points of its map; None: there are none."""
+    return "unknown" if surface is None else register_in_space(query.views, surface, place.fit.T_map_query)
 
 
 def masses_of(masses: Sequence[float], fits: Mapping[int, SpatialFit | Unfit]) -> tuple[F64, int]:

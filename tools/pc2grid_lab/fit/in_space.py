@@ -60,6 +60,7 @@ class Compared:
 def compared_of(rows: Iterable[dict[str, Any]]) -> Iterator[Compared]:
     """The queries whose places were compared in space, each once in a map."""
     compared = (row for row in rows if row.get("in_space"))
+    # Two maps of one building have one name, but other evidence.
     once = {(row["start"], row["map"], str(row["evidence"])): row for row in compared}
     for row in once.values():
         places = [Evidence(**told) for told in row["evidence"]]

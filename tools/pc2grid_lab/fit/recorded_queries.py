@@ -25,7 +25,6 @@ import typer
 from pc2grid.errors import Pc2GridError
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
-from pc2grid.matching.icp_in_space import register_in_space
 from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.answers import unseen_by
@@ -37,7 +36,7 @@ from pc2grid_lab.experiments.recordings.run import Folder
 from signature.config import Config
 from signature.database import open_database
 from signature.localization.hypotheses import Hypothesis
-from signature.localization.in_space import SPACE, terms_in_space
+from signature.localization.in_space import SPACE, fit_in_space, terms_in_space
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import evidence_of, tail_of
 from signature.localization.query import Query, QueryInSpace, QueryMap
@@ -130,9 +129,8 @@ def _in_space(
     index: MapIndex, query: QueryInSpace, place: Hypothesis, truth: Mapping[str, SE2]
 ) -> dict[str, Any] | None:
     """What the points tell for a place, and how far it is then from the truth; None: nothing."""
-    surface = index.surface(place.session_index)
     assert query.T_odom_base is not None
-    fit = "unknown" if surface is None else register_in_space(query.views, surface, place.fit.T_map_query)
+    fit = fit_in_space(query, index.surface(place.session_index), place)
     if fit == "unknown":
         return None
     T_map_query = place.fit.T_map_query if fit == "left" else SE2.from_matrix(fit.T_map_query)
