@@ -4,8 +4,6 @@
 PYTHON ?=
 BIN = .venv/bin
 READY = .venv/.ready
-# Two workers on two cores: the numeric libraries must not each start as many threads as there are cores.
-ONE_THREAD = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1
 # Hundreds of processes are started: without byte code, each compiles 200 modules, 0.4 s.
 BYTE_CODE = PYTHONDONTWRITEBYTECODE=
 PYTEST_ARGS ?=
@@ -34,11 +32,11 @@ demo: $(READY)
 	$(BIN)/pc2grid demo --out demo_out --force
 
 test: $(READY)
-	$(BYTE_CODE) $(ONE_THREAD) $(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
+	$(BYTE_CODE) $(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
 
 nightly: $(READY)
-	$(BYTE_CODE) $(ONE_THREAD) $(BIN)/python -m pytest -q -n auto --dist loadfile -m nightly $(PYTEST_ARGS)
-	$(ONE_THREAD) PC2GRID_FUZZ=1000 $(BIN)/python -m pytest -q -n auto --dist worksteal $(FUZZED) $(PYTEST_ARGS)
+	$(BYTE_CODE) $(BIN)/python -m pytest -q -n auto --dist loadfile -m nightly $(PYTEST_ARGS)
+	PC2GRID_FUZZ=1000 $(BIN)/python -m pytest -q -n auto --dist worksteal $(FUZZED) $(PYTEST_ARGS)
 
 check: $(READY)
 	$(BIN)/ruff check .
@@ -56,7 +54,7 @@ real: $(READY)
 # Half a million small files: in memory, where there is a place for that.
 FUZZ_FOLDER = $(shell test -w /dev/shm && echo --basetemp=/dev/shm/pc2grid-fuzz -o tmp_path_retention_policy=failed)
 FUZZED = tests/pc2grid/io/test_fuzz.py tests/test_fuzz_inputs.py
-FUZZ = $(ONE_THREAD) PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto --dist worksteal --timeout 1200 -m "" $(PYTEST_ARGS)
+FUZZ = PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto --dist worksteal --timeout 1200 -m "" $(PYTEST_ARGS)
 
 fuzz: $(READY)
 	$(FUZZ) $(FUZZ_FOLDER) $(FUZZED)

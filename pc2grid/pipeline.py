@@ -37,6 +37,7 @@ from pc2grid.model import (
 from pc2grid.observer import Observer
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.submaps.partition import divide
+from pc2grid.threads import one_blas_thread, one_blas_thread_each
 from pc2grid.time_span import TimeSpan
 
 if TYPE_CHECKING:
@@ -63,6 +64,12 @@ def follow(
     >>> poses[0].shape, float(poses[0][0, 3])
     ((4, 4), 0.0)
     """
+    return one_blas_thread_each(_followed(scans, config, observer))
+
+
+def _followed(
+    scans: Iterable[Scan], config: Config, observer: Observer
+) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
     tracker = Tracker(config.registration, config.projection)
     rest = iter(scans)
     beginning = begin(rest)
@@ -102,6 +109,7 @@ def build_map(
     )
 
 
+@one_blas_thread
 def build_maps(
     log: Log,
     config: Config = Config(),
@@ -175,6 +183,7 @@ def longest_of(maps: Sequence[SessionMap]) -> SessionMap:
     return dataclasses.replace(longest, session=maps[0].session, report=report)
 
 
+@one_blas_thread
 def map_scans(
     scans: Iterable[Scan],
     config: Config = Config(),

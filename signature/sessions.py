@@ -19,6 +19,7 @@ from pc2grid.model import PointMap, ReadReport, SessionMap, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.pipeline import build_maps, longest_of
 from pc2grid.submaps.partition import divide
+from pc2grid.threads import one_blas_thread
 from pc2grid.time_span import TimeSpan
 from signature.config import Config
 from signature.database import Label, Provenance
@@ -114,6 +115,7 @@ def build_session(
     return longest_of(maps), origin
 
 
+@one_blas_thread
 def build_sessions(
     path: str | Path,
     name: str,
@@ -191,6 +193,7 @@ def _points(drawn: DrawnMap, config: Config) -> PointMap | None:
     return PointMap.of(cloud.points_m(), cloud.edge_m, cloud.corner_m)
 
 
+@one_blas_thread
 def describe_all(session_map: SessionMap, config: Config, observer: Observer = Observer()) -> list[Signature]:
     """Signatures of all submaps of a session, in the order of the submaps."""
     signatures = []

@@ -13,6 +13,7 @@ from typing import Literal
 
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
+from pc2grid.threads import one_blas_thread
 from signature.localization.answer import Answer, Moment, Verdict
 from signature.localization.belief import Masses
 from signature.localization.decision import PriorOf, decide, judge, with_slip
@@ -107,6 +108,7 @@ def _in_map(verdict: Verdict, session_index: int | None) -> Verdict:
     return replace(verdict, hypotheses=tuple(h for _, h in ordered))
 
 
+@one_blas_thread
 def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     """Find where a drawn map, for example a nav2 map or a part of one, lies in the building.
 

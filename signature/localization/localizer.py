@@ -16,6 +16,7 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, RegisteredScan
+from pc2grid.threads import one_blas_thread
 from signature.localization.answer import Answer, Moment
 from signature.localization.answering import Clock, answer_query
 from signature.localization.belief import Belief, State
@@ -96,6 +97,7 @@ class Localizer:
         """Whether scans must be given with their points."""
         return self.index.surface_of is not None
 
+    @one_blas_thread
     def add(
         self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True
     ) -> Estimate | None:
@@ -145,6 +147,7 @@ class Localizer:
             self._last = self.query.part, path_m, hypotheses
         return is_time
 
+    @one_blas_thread
     def answer(self) -> Answer:
         """Where the query is, by the scans so far; what comes later does not depend on whether it was asked.
 

@@ -16,6 +16,7 @@ from pc2grid.matching.icp_in_space import MapSurface
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from pc2grid.observer import Observer
+from pc2grid.threads import one_blas_thread
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import Hypothesis, align, distinct, fitted
@@ -97,6 +98,7 @@ class MapIndex:
         )
 
     @staticmethod
+    @one_blas_thread
     def of(database: SubmapDatabase, config: Config, observer: Observer = Observer()) -> MapIndex:
         """Everything that is in a database.
 

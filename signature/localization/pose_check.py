@@ -29,6 +29,7 @@ from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.map_pose import MapPose
 from pc2grid.matching.two_way_score import score_fit
 from pc2grid.model import Health, RegisteredScan
+from pc2grid.threads import one_blas_thread
 from signature.localization.answer import Answer
 from signature.localization.belief import kept
 from signature.localization.hypotheses import Hypothesis
@@ -131,6 +132,7 @@ def check_pose(
     return judge_pose(localizer, T_map_base, session)
 
 
+@one_blas_thread
 def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None) -> PoseCheck:
     """Whether a pose at the query's last scan is right. Raises the errors of `check_pose`."""
     index, seen = localizer.index, localizer.query.map()

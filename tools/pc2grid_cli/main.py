@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 import pc2grid
+from pc2grid import threads
 from pc2grid_cli import console
 from pc2grid_cli.command_line import MARKUP, group
 
@@ -110,6 +111,7 @@ app.add_typer(
 def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for them in all packages
+    threads.use_one()
     # Imports make more than 100,000 objects, which stay. Python's collector of cycles would walk through them
     # again and again, also at the end.
     gc.set_threshold(_NEW_OBJECTS)

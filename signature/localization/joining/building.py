@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from pc2grid.observer import Observer
+from pc2grid.threads import one_blas_thread
 from signature.database.protocol import BuildingFrame
 from signature.database.rows import no_session
 from signature.localization.joining.pairing import Names, SessionPair, compare_pairs
@@ -35,6 +36,7 @@ class Joined:
     frames: Mapping[str, BuildingFrame]
 
 
+@one_blas_thread
 def join_sessions(
     database: SubmapDatabase,
     *,

@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import cv2
 import numpy as np
 
+from pc2grid import threads
 from pc2grid.io.atomic import replace_file
 
 T = TypeVar("T")
@@ -57,9 +58,7 @@ def in_processes(
             found.append(function(*arguments))
             advance(len(found) / len(given))
         return found
-    # One thread in each process, because the processes run in parallel; libraries read this when loaded.
-    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+    threads.use_one()  # the processes run in parallel; they read it when they load their libraries
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,))
     return run_in(pool, function, given, advance)

@@ -64,13 +64,10 @@ def python_module(name: str, *arguments: str | Path, limit_s: float = 1800.0) ->
 
 def run(command: Sequence[str], *, limit_s: float = math.inf) -> Finished:
     """Run a command that prints a JSON document; its paths are absolute."""
-    # Byte code is kept, as it is where pc2grid is installed, and one thread is used, so that the processor
-    # time does not depend on the number of cores.
+    # Byte code is kept, as it is where pc2grid is installed.
     environment = {
         **{name: value for name, value in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"},
         "PYTHONPATH": os.pathsep.join(map(str, (ROOT, ROOT / "tools"))),
-        "OMP_NUM_THREADS": "1",
-        "OPENBLAS_NUM_THREADS": "1",
     }
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         # `python -c` imports from the current folder first.

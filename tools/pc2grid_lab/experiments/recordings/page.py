@@ -57,8 +57,8 @@ def _about(table: Table) -> list[str]:
     form = "The quick form of `compare recordings`" if table.quick else "`pc2grid compare recordings`"
     return [
         f"{form}: every recording of a folder goes through `convert`, and parts of them through",
-        "`relocalize`, each as a process of its own with one thread. The next run is compared with this page",
-        "(`real.json`). Times are processor time, user and system, with the start of the program.",
+        "`relocalize`, each as a process of its own with default threads. The next run is compared with this",
+        "page (`real.json`). Times are processor time, user and system, with the start of the program.",
         "",
         f"Program {table.program} ({table.commit}), {table.cpu_s / 60:.0f} minutes of processor time.",
     ]
