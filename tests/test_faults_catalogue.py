@@ -717,22 +717,27 @@ def yaml_without_end(folder: Path) -> str:
     return "convert m.yaml -o x.submaps"
 
 
-def image_of(pixels: np.ndarray) -> Callable[[Path], str]:
+def image_of(pixels: np.ndarray, old: str = "", new: str = "") -> Callable[[Path], str]:
     def make(folder: Path) -> str:
         import cv2
 
-        (folder / "m.yaml").write_text(YAML.replace("m.pgm", "m.png"))
+        (folder / "m.yaml").write_text(YAML.replace("m.pgm", "m.png").replace(old, new, 1))
         (folder / "m.png").write_bytes(bytes(cv2.imencode(".png", pixels)[1]))
         return "convert m.yaml -o x.submaps"
 
-    make.__name__ = f"image_of_{pixels.dtype}_{pixels.ndim}"
+    make.__name__ = f"image_of_{pixels.dtype}_{pixels.shape[2]}_{pixels[0, 0, 0]}_{new[:9]}"
     return make
 
 
-fault(46, 1, errors.MapFileError, "m.png: a colour image")(
-    image_of(np.full((9, 9, 3), (9, 99, 200), np.uint8))
-)
-fault(46, 1, errors.MapFileError, "m.png: pixels of 16 bits")(image_of(np.zeros((9, 9), np.uint16)))
+def room(wall: int, floor: int, *more: int) -> np.ndarray:
+    """A room of 4 m; `more` are further channels."""
+    pixels = np.full((84, 84), wall, np.uint8)
+    pixels[2:-2, 2:-2] = floor
+    return np.dstack([pixels, pixels, pixels, *(np.full_like(pixels, value) for value in more)])
+
+
+fault(46, 0, None, "m: 16 m2 free")(image_of(room(0, 254)))
+fault(46, 0, None, "m: 16 m2 free")(image_of(room(0, 254).astype(np.uint16) * 257))
 
 
 fault(46, 1, errors.MapFileError, "m.pgm: a Git LFS pointer", "git lfs pull")(map_with("", "", POINTER))

@@ -17,14 +17,14 @@ from typing import Annotated, Literal
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from pc2grid.arrays import hand_over
+from pc2grid.arrays import F64, hand_over
 from pc2grid.errors import MapFileError
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
-from pc2grid.io.map_image import MAX_CELLS, GreyImage, encode_image, read_image
+from pc2grid.io.map_image import MAX_CELLS, MapImage, encode_image, read_image
 from pc2grid.io.messages.types import FARTHEST_M
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, MapOf, OccupancyGrid
 
@@ -52,9 +52,14 @@ def is_map_file(path: Path) -> bool:
 def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning) -> OccupancyGrid:
     """Read a `map.yaml` with its image, as nav2_map_server's map_io does, but for two differences.
 
-    Trinary: above `occupied_thresh` 100, below `free_thresh` 0, else -1; but grey 205, which map savers write
-    for unknown, stays -1 beside lighter pixels. Scale: linear between the thresholds, not opaque -1. Raw: the
-    pixel value if 0..100, else -1. A map whose origin is rotated is turned into the axes of its frame.
+    The shade of a pixel, 0 (black) to 1, is the mean of its colours; a colour of 16 bits is a share of 65535,
+    and one of a PGM a share of its white. Trinary: above `occupied_thresh` 100, below `free_thresh` 0, else
+    -1, and alpha is one of the colours; but grey 205, which map savers write for unknown, stays -1 beside
+    lighter pixels. Scale: linear between the thresholds, not opaque -1. Raw: 255 shades if 0..100, else -1. A
+    map whose origin is rotated is turned into the axes of its frame.
+
+    This is `loadMapFromFile` of nav2 until Humble. Since Jazzy's 1.3.7 it weighs colours by their luminance,
+    and alpha is a mask: what is not opaque is -1, in trinary maps, too.
 
     warn : gets a sentence for the user on each of these differences.
 
@@ -69,18 +74,13 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
     if ".." in Path(keys.image).parts:
         warn(f"{yaml_path}: image: {keys.image} leaves the folder of the map")
     image = read_image(yaml_path.parent / keys.image)  # an absolute name stays absolute, as in nav2
-    table = _cell_of(image, keys)
-    if keys.mode == "trinary" and _frees_unknown(image, table):
+    cells = _cells(image, keys)
+    if _frees_unknown(image, keys):
         warn(
             f"{yaml_path}: free_thresh {keys.free_thresh:g} would make grey {_UNKNOWN_GREY} free, which map "
             f"savers write for unknown: it stays unknown; free_thresh: {_FREE_THRESH} says so in the .yaml"
         )
-        table[_UNKNOWN_GREY] = UNKNOWN
-    cells = np.empty(image.values.shape, np.int8)
-    for row, target in enumerate(
-        cells[::-1]
-    ):  # row by row: the index takes eight times the memory of a pixel
-        target[:] = table[image.values[row], 0 if image.alpha is None else image.alpha[row]]
+        cells[image.colours[::-1] == _unknown_shade(image)] = UNKNOWN
     x_m, y_m, yaw_rad = keys.origin
     grid = OccupancyGrid(cells=hand_over(cells), resolution_m=keys.resolution, origin_m=(x_m, y_m))
     if abs(yaw_rad) <= _LEAST_YAW_RAD:
@@ -92,11 +92,57 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
     return _turned(yaml_path, grid, yaw_rad)
 
 
-def _frees_unknown(image: GreyImage, table: NDArray[np.int8]) -> bool:
+def _unknown_shade(image: MapImage) -> int:
+    """Return the integer that stands for the grey 205 in `colours`."""
+    return image.white * _UNKNOWN_GREY // 255
+
+
+def _frees_unknown(image: MapImage, keys: _Keys) -> bool:
     """Whether the thresholds make unknown pixels free, in an image that has lighter ones for free space."""
-    if image.alpha is not None or table[_UNKNOWN_GREY] != FREE:
+    if keys.mode != "trinary" or image.alpha is not None:
         return False
-    return bool((image.values == _UNKNOWN_GREY).any() and image.values.max() > _UNKNOWN_GREY)
+    unknown = _unknown_shade(image)
+    if _cell_of(np.array([unknown / image.white]), keys)[0] != FREE:
+        return False
+    return bool((image.colours == unknown).any() and image.colours.max() > unknown)
+
+
+def _cells(image: MapImage, keys: _Keys) -> NDArray[np.int8]:
+    """Return (H, W) the cells of a map, row 0 with the smallest y."""
+    shades, white = _shades(image, keys)
+    table = _cell_of(np.arange(white + 1) / white, keys)
+    cells = np.empty(shades.shape, np.int8)
+    # Row by row: the index takes eight times the memory of a pixel.
+    for target, row in zip(cells[::-1], shades, strict=True):
+        target[:] = table[row]
+    if keys.mode == "scale" and image.alpha is not None:
+        cells[image.alpha[::-1] < image.opaque] = UNKNOWN
+    return cells
+
+
+def _shades(image: MapImage, keys: _Keys) -> tuple[NDArray[np.unsignedinteger], int]:
+    """Return (H, W) the shades of the pixels as integers, and which of them is white; 0 is black."""
+    if keys.mode == "trinary" and image.alpha is not None:
+        return image.colours + image.alpha, image.white + image.opaque
+    return image.colours, image.white
+
+
+def _cell_of(shade: F64, keys: _Keys) -> NDArray[np.int8]:
+    """Return the cells of shades, 0 (black) .. 1."""
+    occupied_thresh, free_thresh = keys.occupied_thresh, keys.free_thresh
+    occupancy = shade if keys.negate else 1.0 - shade
+    cells = np.full(shade.shape, UNKNOWN, dtype=np.int8)
+    if keys.mode == "raw":
+        value = np.round(shade * 255.0)
+        cells[value <= 100] = value[value <= 100].astype(np.int8)
+        return cells
+    if keys.mode == "scale":
+        span = (occupied_thresh - free_thresh) or 1.0
+        between = (occupancy >= free_thresh) & (occupancy <= occupied_thresh)
+        cells[between] = np.rint((occupancy[between] - free_thresh) / span * 100.0).astype(np.int8)
+    cells[occupancy > occupied_thresh] = OCCUPIED
+    cells[occupancy < free_thresh] = FREE
+    return cells
 
 
 def _turned(path: Path, grid: OccupancyGrid, yaw_rad: float) -> OccupancyGrid:
@@ -127,30 +173,6 @@ def _turned(path: Path, grid: OccupancyGrid, yaw_rad: float) -> OccupancyGrid:
     cells[row, column] = OCCUPIED
     x_m, y_m = np.array(grid.origin_m) + low * grid.resolution_m
     return OccupancyGrid(cells=cells, resolution_m=grid.resolution_m, origin_m=(float(x_m), float(y_m)))
-
-
-def _cell_of(image: GreyImage, keys: _Keys) -> NDArray[np.int8]:
-    """The cell for every value and opacity that a pixel of the image can have."""
-    mode, occupied_thresh, free_thresh = keys.mode, keys.occupied_thresh, keys.free_thresh
-    opacity = np.ones(1) if image.alpha is None else np.arange(256) / 255.0
-    grey, alpha = np.meshgrid(np.arange(256) / 255.0, opacity, indexing="ij")
-    if mode == "trinary" and image.alpha is not None:
-        grey = (3.0 * grey + alpha) / 4.0  # nav2 includes the alpha channel in the mean of the colours
-    occupancy = grey if keys.negate else 1.0 - grey
-    cells = np.full(grey.shape, UNKNOWN, dtype=np.int8)
-    if mode == "raw":
-        value = np.round(grey * 255.0)
-        cells[value <= 100] = value[value <= 100].astype(np.int8)
-        return cells
-    if mode == "scale":
-        span = (occupied_thresh - free_thresh) or 1.0
-        between = (occupancy >= free_thresh) & (occupancy <= occupied_thresh)
-        cells[between] = np.rint((occupancy[between] - free_thresh) / span * 100.0).astype(np.int8)
-    cells[occupancy > occupied_thresh] = OCCUPIED
-    cells[occupancy < free_thresh] = FREE
-    if mode == "scale":
-        cells[alpha < 1.0] = UNKNOWN
-    return cells
 
 
 def save_map(
@@ -204,6 +226,10 @@ def save_map(
 _Coordinate = Annotated[float, Field(ge=-FARTHEST_M, le=FARTHEST_M)]
 
 
+def _lower(mode: object) -> object:
+    return mode.lower() if isinstance(mode, str) else mode
+
+
 class _Keys(BaseModel):
     """The keys of a map.yaml. Other programs write further ones into it."""
 
@@ -214,7 +240,7 @@ class _Keys(BaseModel):
     negate: bool
     occupied_thresh: float = Field(ge=0, le=1)
     free_thresh: float = Field(ge=0, le=1)
-    mode: MapMode = "trinary"
+    mode: Annotated[MapMode, BeforeValidator(_lower)] = "trinary"
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:

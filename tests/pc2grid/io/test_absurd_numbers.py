@@ -114,7 +114,7 @@ def test_a_flipped_bit_anywhere_in_a_png_changes_no_pixel(tmp_path: Path) -> Non
             lying_png(20_000, 20_000, bits=1, data=zlib.compress(bytes(2501 * 20_000))),
             "the limit is 100000000",
         ),
-        (lying_png(4, 4, bits=16), "a damaged image|16 bits"),
+        (lying_png(6, 6, bits=16), "a damaged image"),
         (lying_png(4, 4, colour=5), "its header makes no sense"),
         (MAGIC + struct.pack(">I", 2**31) + b"IHDR", "it is cut off"),
         (b"\xff\xd8\xff\xe0 a photo", "not the image of a map"),
@@ -124,7 +124,7 @@ def test_a_flipped_bit_anywhere_in_a_png_changes_no_pixel(tmp_path: Path) -> Non
         (b"P2 9000 9000 255\n1 2 3", "cannot hold"),
         (b"P2 2 2 255\n1 2 3 -4\n", "a damaged image"),
         (b"P2 2 2 255\n1 2 3\n", "a damaged image"),
-        (b"P2 2 2 9\n1 2 3 9\n", "a PGM whose white is 9, not 255"),
+        (b"P2 2 2 99999\n1 2 3 9\n", "its white is 99999"),
     ],
 )  # fmt: skip
 def test_images_that_lie_are_refused_before_they_are_decoded(
@@ -177,9 +177,9 @@ def test_colour_and_transparency(tmp_path: Path) -> None:
     path = map_with(tmp_path, bytes(cv2.imencode(".png", image)[1]), mode="scale", free_thresh=0)
     # Shade 254 is 1/255 of the way from free to occupied at 0.65.
     assert load_map(path).cells.tolist() == [[1, 100, 1], [-1, 1, 1]]
-    image[0, 0] = 0, 254, 254, 255
-    with pytest.raises(MapFileError, match="a colour image"):
-        load_map(map_with(tmp_path, bytes(cv2.imencode(".png", image)[1])))
+    image[0, 0] = 0, 254, 254, 255  # a shade of 0.75, with alpha as a fourth colour
+    path = map_with(tmp_path, bytes(cv2.imencode(".png", image)[1]))
+    assert load_map(path).cells.tolist() == [[0, 100, 0], [-1, 0, 0]]
 
 
 # --- depth images -------------------------------------------------------------------------------------
