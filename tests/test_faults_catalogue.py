@@ -736,8 +736,17 @@ def room(wall: int, floor: int, *more: int) -> np.ndarray:
     return np.dstack([pixels, pixels, pixels, *(np.full_like(pixels, value) for value in more)])
 
 
+EXCHANGED = "m.yaml: walls and floor look exchanged: "
 fault(46, 0, None, "m: 16 m2 free")(image_of(room(0, 254)))
 fault(46, 0, None, "m: 16 m2 free")(image_of(room(0, 254).astype(np.uint16) * 257))
+fault(46, 0, None, EXCHANGED + "negate: 1 takes dark for free")(image_of(room(254, 0)))
+fault(46, 0, None, EXCHANGED, "mode: raw")(image_of(room(100, 0)))
+fault(46, 0, None, "m.yaml: no cell is occupied", "occupied_thresh is 0.9: save the image without alpha")(
+    image_of(room(0, 254, 255), "0.65", "0.9")
+)
+fault(46, 0, None, "m.yaml: no cell is occupied", "mode: raw takes values of 0 to 100 for percent")(
+    image_of(room(0, 254), "image", "mode: Raw\nimage")
+)
 
 
 fault(46, 1, errors.MapFileError, "m.pgm: a Git LFS pointer", "git lfs pull")(map_with("", "", POINTER))

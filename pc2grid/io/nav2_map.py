@@ -10,23 +10,24 @@ import json
 import logging
 import math
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Annotated, Literal
 
+import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 from typing_extensions import Self
 
-from pc2grid.arrays import F64, hand_over
+from pc2grid.arrays import F64, BoolGrid, hand_over
 from pc2grid.errors import MapFileError
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
 from pc2grid.io.map_image import MAX_CELLS, MapImage, encode_image, read_image
 from pc2grid.io.messages.types import FARTHEST_M
-from pc2grid.model import FREE, OCCUPIED, UNKNOWN, MapOf, OccupancyGrid
+from pc2grid.model import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_FROM, UNKNOWN, MapOf, OccupancyGrid
 
 MapMode = Literal["trinary", "scale", "raw"]
 
@@ -41,6 +42,10 @@ _FREE_GREY, _UNKNOWN_GREY, _OCCUPIED_GREY = 254, 205, 0
 _DIGITS, _ROUNDED = 12, 2
 _LEAST_YAW_RAD = 1e-9
 _ROUNDED_CELLS = 1e-6  # a corner of a rotated map so near to a corner of a cell is there
+# Half a corridor is wider than this, half a wall is not. In eight real maps a tenth of the floor is .8 m and
+# more from all else, and nine tenths of the walls, up to .4 m thick, are .4 m and less from it.
+_WIDE_M, _MOST = 0.5, 0.9
+_RAW = "the image has the values of a raw map, 0 to 100 and 255: mode: raw"
 _log = logging.getLogger(__name__)
 
 
@@ -61,7 +66,8 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
     This is `loadMapFromFile` of nav2 until Humble. Since Jazzy's 1.3.7 it weighs colours by their luminance,
     and alpha is a mask: what is not opaque is -1, in trinary maps, too.
 
-    warn : gets a sentence for the user on each of these differences.
+    warn : gets a sentence for the user on each of these differences, and on a map that cannot be meant so: no
+        cell is occupied, or walls and floor are exchanged.
 
     Raises MapFileError naming the key or the image that is wrong.
 
@@ -81,6 +87,8 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
             f"savers write for unknown: it stays unknown; free_thresh: {_FREE_THRESH} says so in the .yaml"
         )
         cells[image.colours[::-1] == _unknown_shade(image)] = UNKNOWN
+    for sentence in _doubts(image, keys, cells):
+        warn(f"{yaml_path}: {sentence}")
     x_m, y_m, yaw_rad = keys.origin
     grid = OccupancyGrid(cells=hand_over(cells), resolution_m=keys.resolution, origin_m=(x_m, y_m))
     if abs(yaw_rad) <= _LEAST_YAW_RAD:
@@ -173,6 +181,83 @@ def _turned(path: Path, grid: OccupancyGrid, yaw_rad: float) -> OccupancyGrid:
     cells[row, column] = OCCUPIED
     x_m, y_m = np.array(grid.origin_m) + low * grid.resolution_m
     return OccupancyGrid(cells=cells, resolution_m=grid.resolution_m, origin_m=(float(x_m), float(y_m)))
+
+
+# --- maps that cannot be meant as they are read -------------------------------------------------------
+
+
+def _doubts(image: MapImage, keys: _Keys, cells: NDArray[np.int8]) -> Iterator[str]:
+    """Yield sentences on a map that says something else than what was drawn."""
+    if keys.mode == "trinary" and image.alpha is not None:
+        masked = _cells(image._replace(alpha=None), keys)
+        masked[image.alpha[::-1] < image.opaque] = UNKNOWN
+        if others := np.count_nonzero(masked != cells):
+            yield (
+                f"alpha counts as a colour, as in nav2 until Humble; since Jazzy it is a mask, which reads "
+                f"{others} of {cells.size} cells otherwise: save the image without alpha"
+            )
+    if not (cells >= OCCUPIED_FROM).any():
+        yield f"no cell is occupied, so nothing can be located in it: {_why_empty(image, keys)}"
+    elif not _plausible(cells, keys.resolution):
+        raw = _looks_raw(image)
+        change = {"mode": "raw"} if raw else {"negate": not keys.negate}
+        if _plausible(_cells(image, keys.model_copy(update=change)), keys.resolution):
+            negated = f"negate: {1 - keys.negate} takes {'light' if keys.negate else 'dark'} for free"
+            yield f"walls and floor look exchanged: {_RAW if raw else negated}"
+
+
+def _why_empty(image: MapImage, keys: _Keys) -> str:
+    """Return why no cell is occupied, and what to change."""
+    if keys.mode == "raw":
+        return "mode: raw takes values of 0 to 100 for percent, mode: trinary takes dark for occupied"
+    if _looks_raw(image):
+        return _RAW
+    shades, white = _shades(image, keys)
+    if keys.mode == "scale" and image.alpha is not None:
+        shades = shades[image.alpha == image.opaque]
+        if not shades.size:
+            return "all of the image is transparent, which mode: scale takes for unknown"
+    occupancy = int(shades.max()) / white if keys.negate else 1.0 - int(shades.min()) / white
+    hint = "save the image without alpha, or lower it" if white > image.white else "lower it, or draw walls"
+    return (
+        f"its {'lightest' if keys.negate else 'darkest'} pixel is occupied by {occupancy:.2g}, "
+        f"occupied_thresh is {keys.occupied_thresh:g}: {hint}"
+    )
+
+
+def _looks_raw(image: MapImage) -> bool:
+    """Return whether the image has the values of a raw map: floor, walls, and 255 for unknown."""
+    present = np.zeros(image.white + 1, bool)
+    for row in image.colours:
+        present[row] = True
+    values = np.round(np.flatnonzero(present) * 255.0 / image.white)
+    percents = values[values <= 100]
+    return bool(
+        ((values <= 100) | (values == 255)).all()
+        and (percents < FREE_BELOW).any()
+        and (percents >= OCCUPIED_FROM).any()
+    )
+
+
+def _plausible(cells: NDArray[np.int8], resolution_m: float) -> bool:
+    """Return whether a floor is wide, and either the walls are thin or all around the floor is solid."""
+    free, occupied = (cells >= 0) & (cells < FREE_BELOW), cells >= OCCUPIED_FROM
+    if not occupied.any() or not _wide(free, resolution_m):
+        return False
+    if not _wide(occupied, resolution_m):
+        return True
+    edge = np.concatenate((free[0], free[-1], free[:, 0], free[:, -1]))
+    if edge.mean() > 1.0 - _MOST:
+        return False
+    _, _, stats, _ = cv2.connectedComponentsWithStats(free.view(np.uint8))
+    return bool(stats[1:, cv2.CC_STAT_AREA].max() >= _MOST * np.count_nonzero(free))
+
+
+def _wide(cells: BoolGrid, resolution_m: float) -> bool:
+    """Return whether many of the cells are far from all others, as those of a floor and not of a wall."""
+    away = cv2.distanceTransform(cells.view(np.uint8), cv2.DIST_L1, 3, dstType=cv2.CV_8U)
+    least = min(1 + math.ceil(_WIDE_M / resolution_m), 255)
+    return bool(np.count_nonzero(away >= least) > (1.0 - _MOST) * np.count_nonzero(cells))
 
 
 def save_map(

@@ -1,25 +1,30 @@
-"""Images of nav2 maps as nav2 reads them, against its rules by hand."""
+"""Images of nav2 maps as nav2 reads them, against its rules by hand; and maps that cannot be meant."""
 
 from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 import tempfile
 import zlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from pc2grid.errors import MapFileError
-from pc2grid.io.nav2_map import load_map
+from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.simulate import office_floorplan
+from tests.helpers.field import DATA
 
 KEYS: dict[str, Any] = {
     "resolution": 0.05,
@@ -187,3 +192,136 @@ def test_a_yaw_that_is_no_number_is_named(tmp_path: Path) -> None:
     for nan in ("nan", ".nan"):
         with pytest.raises(MapFileError, match=r"m\.yaml: origin: input should be a finite number"):
             load_map(map_of(tmp_path, png(GREYS), origin=f"[0, 0, {nan}]"))
+
+
+def test_alpha_is_said_where_versions_of_nav2_differ(tmp_path: Path) -> None:
+    said: list[str] = []
+    opaque = np.full_like(GREYS, 255)
+    load_map(map_of(tmp_path, png(np.dstack([GREYS] * 3 + [opaque]))), said.append)
+    assert len(said) == 1 and "reads 1 of 6 cells otherwise: save the image without alpha" in said[0]
+    black_and_white = np.where(GREYS > 0, 255, 0).astype(np.uint8)
+    load_map(map_of(tmp_path, png(np.dstack([black_and_white] * 3 + [opaque]))), said.append)
+    assert len(said) == 1
+
+
+# --- maps that cannot be meant ------------------------------------------------------------------------
+
+
+def rooms() -> np.ndarray:
+    """(140, 200) the greys of a floor of 9 x 6 m, rooms along a corridor, walls of .1 m, unknown outside."""
+    greys = np.full((140, 200), 205, np.uint8)
+    greys[10:130, 10:190] = 0
+    for top, low in ((12, 55), (57, 83), (85, 128)):
+        for left in (12, 72, 132) if top != 57 else (12,):
+            greys[top:low, left : left + (56 if top != 57 else 176)] = 254
+    for door in (30, 90, 150):
+        greys[54:58, door : door + 18] = greys[82:86, door : door + 18] = 254
+    return greys
+
+
+def solid() -> np.ndarray:
+    """The same in black and white, all solid around the floor."""
+    return np.where(rooms() == 254, 255, 0).astype(np.uint8)
+
+
+def lines() -> np.ndarray:
+    """The same as black lines on white."""
+    return np.where(rooms() == 0, 0, 255).astype(np.uint8)
+
+
+def percents() -> np.ndarray:
+    """The same with the values of a raw map."""
+    return np.select([rooms() == 254, rooms() == 0], [np.uint8(0), np.uint8(100)], np.uint8(255))
+
+
+def doubts(path: Path) -> list[str]:
+    said: list[str] = []
+    load_map(path, said.append)
+    return said
+
+
+EXCHANGED = "walls and floor look exchanged: "
+
+
+@pytest.mark.parametrize(
+    ("image", "keys", "words"),
+    [
+        (lambda: 255 - rooms(), {}, EXCHANGED + "negate: 1 takes dark for free"),
+        (lambda: 255 - solid(), {}, EXCHANGED + "negate: 1"),
+        (lambda: 255 - lines(), {"mode": "scale"}, EXCHANGED + "negate: 1"),
+        (lambda: 255 - np.dstack([rooms()] * 3), {}, EXCHANGED + "negate: 1"),
+        (lambda: (255 - rooms()).astype(np.uint16) * 257, {}, EXCHANGED + "negate: 1"),
+        (rooms, {"negate": 1}, EXCHANGED + "negate: 0 takes light for free"),
+        (solid, {"negate": "true"}, EXCHANGED + "negate: 0"),
+        (percents, {}, EXCHANGED + "the image has the values of a raw map, 0 to 100 and 255: mode: raw"),
+        (lambda: percents()[10:130, 10:190], {}, EXCHANGED + "the image has the values of a raw map"),
+        (lambda: np.where(percents() == 100, 82, percents()), {}, EXCHANGED + "the image has the values of"),
+        (rooms, {"mode": "raw"}, "no cell is occupied, .*: mode: raw takes values of 0 to 100 for percent"),
+        (lambda: percents().astype(np.uint16), {"mode": "raw"}, "no cell is occupied"),
+        (lambda: np.maximum(rooms(), 100), {}, "no cell is occupied.* by 0.61, occupied_thresh is 0.65: lo"),
+        (lambda: 255 - np.maximum(rooms(), 100), {"negate": 1}, "lightest pixel is occupied by 0.61"),
+        (lambda: np.full_like(rooms(), 254), {}, "no cell is occupied"),
+        (lambda: np.dstack([rooms()] * 3 + [np.zeros_like(rooms())]), {"mode": "scale"}, "transparent"),
+        (
+            lambda: np.dstack([solid()] * 3 + [np.full_like(solid(), 255)]),
+            {"occupied_thresh": 0.9},
+            "no cell is occupied.* by 0.75, occupied_thresh is 0.9: save the image without alpha, or lower",
+        ),
+    ],
+)  # fmt: skip
+def test_maps_that_cannot_be_meant_are_said(
+    tmp_path: Path, image: Callable[[], np.ndarray], keys: dict[str, Any], words: str
+) -> None:
+    said = doubts(map_of(tmp_path, png(image()), **keys))
+    assert re.search(rf"m\.yaml: .*{words}", said[-1])
+    assert sum("no cell is occupied" in sentence or EXCHANGED in sentence for sentence in said) == 1
+
+
+def scattered() -> np.ndarray:
+    """Solid blocks, as of a town, in a free field."""
+    greys = np.full((300, 300), 254, np.uint8)
+    for at in (30, 120, 210):
+        greys[at : at + 60, 40:90] = greys[at : at + 40, 150:260] = 0
+    return greys
+
+
+@pytest.mark.parametrize(
+    ("image", "keys"),
+    [
+        (rooms, {}),
+        (lambda: 255 - rooms(), {"negate": 1}),
+        (solid, {}),
+        (lambda: 255 - solid(), {"negate": "true"}),
+        (lines, {}),
+        (rooms, {"mode": "scale"}),
+        (percents, {"mode": "raw"}),
+        (scattered, {}),
+        (rooms, {"resolution": 0.2}),
+        (rooms, {"resolution": 0.01}),
+        (lambda: np.kron(rooms(), np.ones((6, 6), np.uint8)), {"resolution": 0.05 / 6}),
+    ],
+)
+def test_maps_that_can_be_meant_are_not_doubted(
+    tmp_path: Path, image: Callable[[], np.ndarray], keys: dict[str, Any]
+) -> None:
+    assert not doubts(map_of(tmp_path, png(image()), **keys))
+
+
+def test_plans_of_the_simulator_are_not_doubted(tmp_path: Path) -> None:
+    for seed in range(6):
+        path, _ = save_map(office_floorplan(seed=seed), tmp_path / "plan")
+        assert not doubts(path)
+
+
+REAL = sorted((*DATA.glob("maps/*.yaml"), *DATA.glob("laser/*/*.yaml")))
+
+
+@pytest.mark.skipif(not REAL, reason="PC2GRID_DATA has no maps")
+def test_real_maps_are_doubted_only_where_they_are_negated(tmp_path: Path) -> None:
+    for path in REAL:
+        assert not doubts(path), path
+        keys = yaml.safe_load(path.read_text())
+        image = cv2.imread(str(path.parent / keys.pop("image")), cv2.IMREAD_GRAYSCALE)
+        assert image is not None
+        said = doubts(map_of(tmp_path, png(255 - image), **keys))
+        assert [EXCHANGED in sentence for sentence in said] == [True], path
