@@ -131,7 +131,8 @@ def relocalize(
     """
     if prior is not None and is_drawn_map(Path(query)):
         raise ConfigError("prior: there is no robot in a map")
-    with open_places(database, config) as opened:
+    observer = observer or ProgressBars()
+    with open_places(database, config, observer.on_warning) as opened:
         found = find(
             Path(query),
             opened,
@@ -140,7 +141,7 @@ def relocalize(
             recover=recover,
             prior=lambda log, span: prior,
             until_located=until_located,
-            observer=observer or ProgressBars(),
+            observer=observer,
         )
     accept = config.relocalize.accept
     asked = Asked(poses=found.poses, about=found.about, database=str(database), accept=accept)
@@ -148,11 +149,13 @@ def relocalize(
 
 
 @contextlib.contextmanager
-def open_places(place: str | Path, config: Config = Config()) -> Iterator[SubmapDatabase]:
+def open_places(
+    place: str | Path, config: Config = Config(), warn: Callable[[str], object] = lambda sentence: None
+) -> Iterator[SubmapDatabase]:
     """Where to look: a database, or a map, which becomes a database for as long as it is used.
 
     place : file or postgresql:// URL of a database; or the map.yaml of a nav2 map, a point cloud or a mesh.
-    config : how a map is read and divided.
+    config : how a map is read and divided. warn : gets what the user should know of a map.
 
     Raises the errors of `signature.open_database`, and MapFileError for a map.
 
@@ -164,7 +167,8 @@ def open_places(place: str | Path, config: Config = Config()) -> Iterator[Submap
         if not is_url(place) and is_drawn_map(Path(place)):
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
             file = folder / f"{Path(place).stem}.submaps"
-            convert(place, file, config, observer=Observer())
+            for sentence in convert(place, file, config, observer=Observer()).report.warnings:
+                warn(sentence)
             place = file
         yield stack.enter_context(open_database(place))
 

@@ -15,6 +15,7 @@ from pc2grid.config import ReadConfig
 from pc2grid.display import CENTRE_GREEN
 from pc2grid.errors import ConfigError, DatabaseError, OutputError
 from pc2grid.io.nav2_map import save_map
+from pc2grid.observer import Observer
 from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.config import Config
 from signature.database import Label, open_database
@@ -50,6 +51,19 @@ def test_a_map_is_found_in_a_map(building: Path) -> None:
     height, width = image.shape[:2]
     # The part that was asked for is 11 m x 9 m of the office, of 20 m x 15 m.
     assert 0.3 < np.ptp(green[:, 0]) / height < 0.8 and 0.3 < np.ptp(green[:, 1]) / width < 0.8
+
+
+def test_what_is_doubted_of_a_map_is_said_to_who_looks_in_it(building: Path, tmp_path: Path) -> None:
+    save_map(replace(office(), cells=np.where(office().occupied, 0, office().cells)), tmp_path / "empty")
+    said: list[str] = []
+
+    class Told(Observer):
+        def on_warning(self, text: str) -> None:
+            said.append(text)
+
+    answer = relocalize(building / "part.yaml", tmp_path / "empty.yaml", observer=Told())
+    assert answer.status == "not_found"
+    assert len(said) == 1 and "empty.yaml: no cell is occupied" in said[0]
 
 
 def test_an_answer_is_drawn_saved_and_shown_as_a_page(building: Path, tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ def searched(
 
     Yields it, and what is damaged in it and left out, of which the user is warned.
     """
-    with open_places(database) as opened:
+    with open_places(database, warn=console.warn) as opened:
         if building is not None or floor is not None:
             opened.keep_only(building=building, floor=floor)
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
