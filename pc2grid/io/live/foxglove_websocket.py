@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
+import ssl
 import struct
 import threading
 import time
@@ -128,10 +129,10 @@ class _Link:
             except (OSError, TimeoutError) as error:
                 problem = error
                 break
-        raise LiveError(
-            f"{self._url}: no connection: {problem}",
-            hint="on the robot: ros2 launch foxglove_bridge foxglove_bridge_launch.xml",
-        )
+        hint = "on the robot: ros2 launch foxglove_bridge foxglove_bridge_launch.xml"
+        if isinstance(problem, ssl.SSLCertVerificationError):
+            hint = "SSL_CERT_FILE=ROBOT.pem in the environment names the certificate that is trusted"
+        raise LiveError(f"{self._url}: no connection: {problem}", hint=hint)
 
     def _run(self) -> None:
         pause_s = self._parameters.least_pause_s

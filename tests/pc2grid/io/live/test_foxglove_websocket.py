@@ -1,16 +1,18 @@
-"""A robot behind a websocket gives the scans that its recording gives, whatever happens to the connection."""
+"""A robot behind Foxglove's own server gives the scans that its recording gives, whatever happens to the
+connection."""
 
 from __future__ import annotations
 
+import json
 import socket
+import threading
 import time
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Iterator
+from importlib.resources import files
 from pathlib import Path
 
 import numpy as np
 import pytest
-from rosbags.typesys import Stores, get_typestore
 
 from pc2grid.config import ReadConfig
 from pc2grid.errors import LiveError, NoScans
@@ -22,9 +24,8 @@ from pc2grid.io.live.live_log import LiveLog, LiveParameters
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.model import OccupancyGrid, Scan
 from tests.helpers.recordings import laser_drive, write_mcap
-from tests.helpers.robot import SUBPROTOCOLS, Recorded, Robot
+from tests.helpers.robot import LONG_S, SUBPROTOCOLS, Channel, Frame, Proxy, Recorded, Robot
 
-websockets = pytest.importorskip("websockets", reason="needs the extra [live]")
 PATIENT = InboxParameters(most_lag_s=1e6)
 QUICK = ConnectionParameters(first_s=0.3, least_pause_s=0.001, most_pause_s=0.01)
 
@@ -45,31 +46,92 @@ def expected(recording: Path) -> list[Scan]:
         return list(log.scans())
 
 
-def connect(robot: Robot, config: ReadConfig | None = None) -> LiveLog:
-    config = config or ReadConfig()
-    return LiveLog(FoxgloveWebsocket(robot.url, config, QUICK, PATIENT), config)
+def connect(peer: Robot | Proxy, inbox: InboxParameters = PATIENT) -> LiveLog:
+    return LiveLog(FoxgloveWebsocket(peer.url, ReadConfig(), QUICK, inbox), ReadConfig())
 
 
-def until(done: Callable[[], bool], timeout_s: float = 60.0) -> Callable[[], bool]:
+def until(done: Callable[[], bool]) -> Callable[[], bool]:
     """True once `done` is, or when that takes far too long."""
-    end_s = time.monotonic() + timeout_s
+    end_s = time.monotonic() + LONG_S
     return lambda: done() or time.monotonic() > end_s
 
 
-@pytest.mark.parametrize("subprotocol", SUBPROTOCOLS)
-def test_the_same_bytes_give_the_same_scans(
-    recorded: Recorded, expected: list[Scan], subprotocol: str
-) -> None:
+def wait(done: Callable[[], bool]) -> None:
+    over = until(done)
+    while not over():
+        time.sleep(0.001)
+    assert done()
+
+
+def found_by(live: LiveLog, count: int) -> list[Scan]:
+    """The first `count` scans."""
     found: list[Scan] = []
-    with Robot(recorded, speed=30.0, subprotocol=subprotocol).running() as robot, connect(robot) as live:
-        live.on_poll = until(lambda: len(found) >= len(expected) - 1)
-        found.extend(live.scans())
-        assert live.feed.counts.dropped == 0
-    # The last scan waits for odometry after it, which does not come.
-    for a, b in zip(found, expected[: len(expected) - 1], strict=True):
+    live.on_poll = until(lambda: len(found) >= count)
+    found.extend(live.scans())
+    return found
+
+
+def assert_equal(found: list[Scan], expected: list[Scan]) -> None:
+    for a, b in zip(found, expected, strict=True):
         assert a.stamp_ns == b.stamp_ns
         np.testing.assert_array_equal(a.points_m, b.points_m)
         np.testing.assert_array_equal(a.T_odom_base, b.T_odom_base)
+
+
+def test_the_same_bytes_give_the_same_scans(recorded: Recorded, expected: list[Scan]) -> None:
+    with Robot(recorded) as robot, connect(robot) as live:
+        robot.wait_for_client()
+        robot.play()
+        # The last scan waits for odometry after it, which does not come.
+        assert_equal(found_by(live, len(expected) - 1), expected[:-1])
+        assert live.feed.counts.dropped == 0
+
+
+def test_a_bridge_of_before_version_3_2(recorded: Recorded, expected: list[Scan]) -> None:
+    with Robot(recorded) as robot, Proxy(robot, subprotocol=SUBPROTOCOLS[1]) as proxy, connect(proxy) as live:
+        robot.wait_for_client()
+        robot.play()
+        assert_equal(found_by(live, 10), expected[:10])
+
+
+def test_a_robot_behind_tls(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a certificate that it signed itself, which has to be named."""
+    fixtures = files("foxglove") / "tests" / "fixtures"
+    certificate, key = ((fixtures / f"tls_{name}.pem").read_bytes() for name in ("cert", "key"))
+    monkeypatch.delenv("SSL_CERT_FILE", raising=False)
+    with Robot(recorded, tls=(certificate, key)) as robot:
+        with pytest.raises(LiveError, match="certificate verify failed") as error:
+            connect(robot)
+        assert "SSL_CERT_FILE" in (error.value.hint or "")
+        monkeypatch.setenv("SSL_CERT_FILE", str(fixtures / "tls_cert.pem"))
+        with connect(robot) as live:
+            robot.wait_for_client()
+            robot.play()
+            assert len(found_by(live, 10)) == 10
+
+
+def test_a_robot_that_restarts_is_followed_again(recorded: Recorded, expected: list[Scan]) -> None:
+    """Its topics have other numbers then. It is told the map again, and nothing else."""
+    half = len(recorded.messages) // 2
+    grid = OccupancyGrid(cells=np.zeros((2, 3), np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
+    with Robot(recorded) as first:
+        live = connect(first)
+        first.wait_for_client()
+        with Nav2Publisher(live.feed) as publisher:
+            publisher.map(7, grid)
+            publisher.initialpose(8, SE2(1.0, 2.0, 0.5), np.eye(3))
+        first.wait(lambda: len(first.told()) == 2)
+        first.play(recorded.messages[:half])
+        wait(lambda: live.feed.counts.arrived == half)
+    with live, Robot(recorded, port=first.port) as second:
+        numbers = [{channel.id() for channel in robot.channels.values()} for robot in (first, second)]
+        assert numbers[0].isdisjoint(numbers[1])
+        second.wait_for_client()
+        second.play(recorded.messages[half:])
+        assert_equal(found_by(live, len(expected) - 1), expected[:-1])
+        assert live.feed.counts.reconnected == 1
+    second.wait(lambda: not second.clients)
+    assert [topic for topic, _ in second.told()] == ["/map"]
 
 
 def test_a_hundred_lost_connections_are_made_again(tmp_path: Path) -> None:
@@ -77,9 +139,26 @@ def test_a_hundred_lost_connections_are_made_again(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", laser_drive(300))
     with open_log(path) as log:
         expected = list(log.scans())
-    # Slow enough that a busy machine is connected again before the next messages are sent.
-    with Robot(Recorded.read(path), speed=5.0, cut_after=4).running() as robot, connect(robot) as live:
-        live.on_poll = until(robot.finished.is_set)
+    recorded = Recorded.read(path)
+    messages = [m for m in recorded.messages if not m[0].latched]
+    with Robot(recorded) as robot, Proxy(robot) as proxy, connect(proxy) as live:
+
+        def send(block: list[tuple[Channel, int, bytes]], cuts: int) -> None:
+            """Half of the messages arrive; the others are sent while nobody is connected."""
+            robot.wait(lambda: min(map(robot.subscriptions.count, ("/scan", "/odom"))) > cuts)
+            arrived = live.feed.counts.arrived
+            robot.play(block[:4])
+            wait(lambda: live.feed.counts.arrived >= arrived + 4)
+            proxy.cut()
+            robot.play(block[4:])
+
+        def drive() -> None:
+            for cuts, begin in enumerate(range(0, len(messages), 8)):
+                send(messages[begin : begin + 8], cuts)
+
+        driven = threading.Thread(target=drive)
+        driven.start()
+        live.on_poll = until(lambda: not driven.is_alive())
         found = [scan for _ in range(200) if not live.ended for scan in live.scans()]
         assert live.feed.counts.reconnected >= 100
         assert "the connection is lost" in " ".join(live.feed.news.take())
@@ -95,28 +174,58 @@ def test_a_hundred_lost_connections_are_made_again(tmp_path: Path) -> None:
             assert abs(scan.T_odom_base[0, 3] - truth[0, 3]) < 0.06  # interpolated over what was lost
 
 
+def test_a_network_that_falls_behind_loses_messages_but_not_the_connection(recorded: Recorded) -> None:
+    """The server leaves out the oldest of what waits to be sent."""
+    sent = {(channel.topic, time_ns): data for channel, time_ns, data in recorded.messages}
+    last = max(sent, key=lambda which: which[1])
+    arrived: dict[tuple[str, int], bytes] = {}
+    with Robot(recorded, backlog=4) as robot:
+        feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK)
+        robot.wait_for_client()
+        robot.play()
+        while last not in arrived:
+            got = feed.receive(LONG_S)
+            assert got is not None
+            arrived[got.message.channel.topic, got.message.log_time_ns] = bytes(got.message.data)
+        feed.close()
+    assert len(arrived) < len(sent)
+    assert arrived.items() <= sent.items()
+    times_ns = [time_ns for _, time_ns in arrived]
+    assert times_ns == sorted(times_ns)
+    assert feed.counts.reconnected == 0
+
+
+def test_a_computer_that_falls_behind_drops_scans_but_no_odometry(
+    recorded: Recorded, expected: list[Scan]
+) -> None:
+    half = len(recorded.messages) // 2
+    with Robot(recorded) as robot, connect(robot, InboxParameters(most_lag_s=0.0, catch_up_s=0.0)) as live:
+        robot.wait_for_client()
+        robot.play(recorded.messages[:half])
+        scans = live.scans()
+        found = [next(scans)]  # and now it is busy with it
+        robot.play(recorded.messages[half:])
+        wait(lambda: live.feed.counts.arrived == len(recorded.messages))
+        live.on_poll = until(lambda: live.newest_odometry()[0] == recorded.messages[-1][1])
+        found.extend(scans)
+    by_stamp = {scan.stamp_ns: scan for scan in expected}
+    assert_equal(found, [by_stamp[scan.stamp_ns] for scan in found])
+    assert found[-1].stamp_ns == expected[-1].stamp_ns  # the newest is not dropped
+    assert live.feed.counts.dropped == len(expected) - len(found) > half // 3  # a third of them are scans
+
+
 def test_what_is_published_is_what_an_independent_decoder_reads(recorded: Recorded) -> None:
-    store = get_typestore(Stores.ROS2_HUMBLE)
     cells = np.array([[0, 100, -1], [100, 0, 0]], np.int8)
     grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(-1.0, 2.0))
-    with Robot(recorded, speed=30.0).running() as robot:
+    with Robot(recorded) as robot:
         feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK)
         with Nav2Publisher(feed) as publisher:
             publisher.initialpose(1_500_000_000, SE2(1.0, 2.0, 0.5), np.diag([0.01, 0.02, 0.03]))
             publisher.map(7, grid)
             publisher.start_tf("odom", SE2(3.0, 4.0, -1.0), lambda: 10**9)
-            wait = until(lambda: len(robot.published) >= 5)
-            while not wait():
-                time.sleep(0.01)
-            publisher.stop_tf()
-            count = len(robot.published)
-            robot.cut()
-            wait = until(lambda: len(robot.published) > count)
-            while not wait():
-                time.sleep(0.01)
+            robot.wait(lambda: len(robot.told()) >= 5)
         feed.close()
-    decoded = [(t, store.deserialize_cdr(data, kind)) for t, kind, data in robot.published]
-    (topic, pose), (map_topic, drawn), *rest = decoded
+    (topic, pose), (map_topic, drawn), *rest = robot.told()
     assert (topic, map_topic) == ("/initialpose", "/map")
     assert pose.header.frame_id == "map"
     assert (pose.header.stamp.sec, pose.header.stamp.nanosec) == (1, 500_000_000)
@@ -124,16 +233,15 @@ def test_what_is_published_is_what_an_independent_decoder_reads(recorded: Record
     assert pose.pose.pose.orientation.z == pytest.approx(np.sin(0.25))
     assert pose.pose.covariance.reshape(6, 6)[5, 5] == 0.03
     np.testing.assert_array_equal(drawn.data.reshape(2, 3), cells)
+    assert {topic for topic, _ in rest} == {"/tf"}
     edge = rest[0][1].transforms[0]
     assert (edge.header.frame_id, edge.child_frame_id) == ("map", "odom")
     assert (edge.transform.translation.x, edge.transform.translation.y) == (3.0, 4.0)
     assert (edge.header.stamp.sec, edge.header.stamp.nanosec) == (1, 500_000_000)  # half a second ahead
-    # After the connection was lost, the map is sent again, and nothing else.
-    assert [topic for topic, _ in decoded[count:]] == ["/map"]
 
 
 def test_a_robot_that_takes_no_messages_is_named(recorded: Recorded) -> None:
-    with Robot(recorded, capabilities=()).running() as robot:
+    with Robot(recorded, capabilities=()) as robot:
         feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK)
         with pytest.raises(LiveError, match="does not take messages") as error:
             Nav2Publisher(feed).announce("/initialpose")
@@ -144,10 +252,11 @@ def test_a_robot_that_takes_no_messages_is_named(recorded: Recorded) -> None:
 
 def test_a_topic_that_never_speaks_is_named(recorded: Recorded) -> None:
     quick = LiveParameters(silent_s=0.2, poll_s=0.05)
-    robot = Robot(recorded, speed=30.0, begin_topic="/odom", silent=frozenset({"/scan"}))
-    with robot.running():
+    with Robot(recorded) as robot:
         feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK)
         with LiveLog(feed, ReadConfig(), quick) as live:
+            robot.wait_for_client()
+            robot.play(m for m in recorded.messages if m[0].topic != "/scan")
             news: list[str] = []
             live.on_poll = until(lambda: bool(news.extend(feed.news.take()) or news))
             with pytest.raises(NoScans, match="/scan: no message yet"):
@@ -156,14 +265,20 @@ def test_a_topic_that_never_speaks_is_named(recorded: Recorded) -> None:
 
 
 def test_a_topic_that_is_published_twice_is_named(recorded: Recorded, expected: list[Scan]) -> None:
-    scan = next(c for c in recorded.channels if c.topic == "/scan")
-    twice = replace(recorded, channels=(*recorded.channels, replace(scan, id=99)))
-    found: list[Scan] = []
-    with Robot(twice, speed=30.0).running() as robot, connect(robot) as live:
-        live.on_poll = until(lambda: len(found) >= 20)
-        found.extend(live.scans())
+    """Foxglove's server makes one topic of two that have the same type."""
+
+    def twice(frame: Frame) -> Iterator[Frame]:
+        yield frame
+        document = json.loads(frame) if isinstance(frame, str) else {}
+        if document.get("op") == "advertise":
+            scan = next(c for c in document["channels"] if c["topic"] == "/scan")
+            yield json.dumps(document | {"channels": [scan | {"id": 10_000}]})
+
+    with Robot(recorded) as robot, Proxy(robot, twice) as proxy, connect(proxy) as live:
+        robot.wait_for_client()
+        robot.play()
+        assert_equal(found_by(live, 20), expected[:20])
         assert any("/scan: published twice" in sentence for sentence in live.feed.news.take())
-    assert [s.stamp_ns for s in found] == [s.stamp_ns for s in expected[: len(found)]]
 
 
 def test_nobody_there_is_said_at_once() -> None:
