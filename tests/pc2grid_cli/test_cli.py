@@ -258,6 +258,7 @@ def test_interrupted_convert_leaves_nothing(house: Path, tmp_path: Path, number:
     _, said = process.communicate(timeout=60)
     assert process.returncode == code, said
     assert "Traceback" not in said
+    assert ("interrupted: each file is complete, or as it was before" in said) == (number == signal.SIGINT)
     assert list(tmp_path.iterdir()) == []
 
 

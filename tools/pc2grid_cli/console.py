@@ -127,6 +127,8 @@ class Console:
         try:
             result = command()
             sys.stdout.flush()
+            if result == INTERRUPTED:  # what typer makes of KeyboardInterrupt
+                raise KeyboardInterrupt
             return result if isinstance(result, int) else OK
         except BaseException as error:
             return self._ended_by(error, stop.number)
