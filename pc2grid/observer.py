@@ -6,12 +6,19 @@ anybody is interested. A subclass overrides the methods that it needs.
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, ProgressColumn
+
     from pc2grid.model import RegisteredScan
+
+_UPDATE_EVERY_S = 0.1
+"""How often at most what shows progress is told of it, as often as rich draws; stages report each scan."""
 
 
 class Observer:
@@ -60,24 +67,12 @@ class ProgressBars(Observer):
 
     @contextmanager
     def _bar(self, what: str) -> Iterator[None]:
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TimeElapsedColumn
+        from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TimeElapsedColumn
 
-        console = Console(stderr=True)
-        columns = (
-            "{task.description}",
-            SpinnerColumn(),
-            BarColumn(),
-            TaskProgressColumn(),
-            TimeElapsedColumn(),
-        )
-        shown = console.is_terminal or console.is_jupyter
-        if not shown:
-            yield
-            return
-        with Progress(*columns, console=console, transient=True, redirect_stderr=False) as bars:
+        columns = (SpinnerColumn(), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
+        with bars_on_stderr("{task.description}", *columns) as bars:
             task = bars.add_task(what, total=1.0)
-            self._update = lambda share: bars.update(task, completed=share)
+            self._update = seldom(lambda share: bars.update(task, completed=share))
             yield
         self._update = None
 
@@ -89,3 +84,38 @@ class ProgressBars(Observer):
         """Moves the bar."""
         if self._update is not None:
             self._update(share)
+
+
+def bars_on_stderr(*columns: str | ProgressColumn) -> Progress:
+    """Return bars that are shown, and at the end wiped away, where stderr is a terminal or a notebook.
+
+    Of what is printed meanwhile they take over only what goes to a terminal, too, to write it above the bars:
+    else they would swallow the result of a program whose output goes to a file.
+    """
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console, on_terminal = Console(stderr=True), sys.stderr.isatty()
+    return Progress(
+        *columns,
+        console=console,
+        transient=True,
+        redirect_stdout=sys.stdout.isatty(),
+        redirect_stderr=on_terminal,
+        disable=not (on_terminal or console.is_jupyter),
+        get_time=time.monotonic,
+    )
+
+
+def seldom(update: Callable[[float], None]) -> Callable[[float], None]:
+    """Return `update` as one that may be called for each scan: it works ten times a second at most."""
+    last_s = -_UPDATE_EVERY_S
+
+    def at_most(share: float) -> None:
+        nonlocal last_s
+        now_s = time.monotonic()
+        if now_s - last_s >= _UPDATE_EVERY_S:
+            last_s = now_s
+            update(share)
+
+    return at_most

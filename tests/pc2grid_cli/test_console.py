@@ -12,9 +12,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.progress import Progress
 
 import pc2grid
 from pc2grid.io.nav2_map import save_map
+from pc2grid.observer import Observer, ProgressBars
 from pc2grid_cli import console, main
 from tests.helpers.interruptible import interruptible
 from tests.helpers.simulated_drives import office
@@ -48,9 +50,10 @@ def on_a_terminal(code: str, *arguments: str, **environment: str) -> str:
 PROGRAM = "from pc2grid_cli.main import main; main()"
 WORKING = """
 import time, types
+from pc2grid import observer
 from pc2grid_cli import console
 begin, real = time.monotonic(), time.monotonic
-console.time = types.SimpleNamespace(monotonic=lambda: 20 * (real() - begin))  # a clock in a hurry
+observer.time = types.SimpleNamespace(monotonic=lambda: 20 * (real() - begin))  # a clock in a hurry
 with console.Console().progress("work", 100.0) as update:
     for tenth in range(11):
         time.sleep(0.06)
@@ -179,12 +182,17 @@ def test_compiling_is_noted_once(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err.count("compiling what") == 1
 
 
-def test_who_interrupts_is_told_what_is_kept(capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted() -> None:
-        raise KeyboardInterrupt
-
-    assert console.Console().run(interrupted) == 130
-    assert "interrupted: each file is complete, or as it was before" in capsys.readouterr().err
+@pytest.mark.parametrize("observer", [console.Console().observer(), ProgressBars()])
+def test_progress_is_updated_ten_times_a_second(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However often it is reported: for a laser that is converted, at each scan."""
+    clock, updated = [0.0], []
+    monkeypatch.setattr(console.time, "monotonic", lambda: clock[0])
+    monkeypatch.setattr(Progress, "update", lambda bars, task, **what: updated.append(what))
+    with observer.step("work"):
+        for number in range(2000):
+            clock[0] = number * 0.001
+            observer.on_progress(number / 2000)
+    assert 15 <= sum("completed" in what for what in updated) <= 21
 
 
 def test_the_version_needs_no_command(

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from pc2grid.errors import one_line
-from pc2grid.observer import Observer
+from pc2grid.observer import Observer, bars_on_stderr, seldom
 
 if TYPE_CHECKING:
     from rich.progress import Task
@@ -60,19 +60,11 @@ class Console:
         if self.quiet:
             yield lambda share: None
             return
-        from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn
+        from rich.progress import BarColumn, TextColumn
 
-        last_s, on_terminal = time.monotonic(), sys.stderr.isatty()
-        columns = (
-            TextColumn("{task.description}"),
-            BarColumn(),
-            TextColumn("{task.percentage:>3.0f}%{task.fields[pace]}"),
-        )
-        stderr = Console(stderr=True)
-        with Progress(
-            *columns, console=stderr, transient=True, disable=not on_terminal, get_time=time.monotonic
-        ) as bar:
+        percent = TextColumn("{task.percentage:>3.0f}%{task.fields[pace]}")
+        last_s = time.monotonic()
+        with bars_on_stderr("{task.description}", BarColumn(), percent) as bar:
             bar.add_task(what, pace="", total=1.0)
             (task,) = bar.tasks
 
@@ -80,11 +72,11 @@ class Console:
                 nonlocal last_s
                 bar.update(task.id, completed=share)
                 bar.update(task.id, pace=_pace(task, recorded_s))
-                if not on_terminal and time.monotonic() - last_s >= _LINE_EVERY_S:
+                if bar.disable and time.monotonic() - last_s >= _LINE_EVERY_S:
                     last_s = time.monotonic()
                     print(f"pc2grid: {what}: {share:.0%}{task.fields['pace']}", file=sys.stderr)
 
-            yield update
+            yield seldom(update)
 
     def compiling_begins(self) -> None:
         """Tell the user, once, that functions are compiled."""
