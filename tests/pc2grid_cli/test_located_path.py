@@ -83,7 +83,7 @@ def scans_and_config(folder: Path) -> tuple[Any, Any]:
 def test_a_recording_is_followed_as_a_robot_is(folder: Path) -> None:
     """What `watch` says on the way is the history of the answer of `relocalize`."""
     words = (folder / "drive.mcap", "-d", folder / "b.submaps", "--json")
-    said = [json.loads(line) for line in run("watch", *words, "--keep").splitlines()]
+    said = [json.loads(line) for line in run("watch", *words).splitlines()]
     history = json.loads(run("relocalize", *words))["history"]
     assert len(said) >= 10
     for told, moment in zip(said, history, strict=False):

@@ -73,7 +73,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Expected]:
         simulate_session(folder / f"{name}.mcap", sensor="lidar", grid=office(), config=config)
     database, settings = folder / "monday.submaps", ("--set", "projection.points_voxel_m=0.1")
     run("convert", folder / "monday.mcap", "-o", database, *settings)
-    said = run("watch", folder / "long.mcap", "-d", folder / "monday.submaps", "--json", "--keep")
+    said = run("watch", folder / "long.mcap", "-d", folder / "monday.submaps", "--json")
     last: Expected = json.loads(said.splitlines()[-1])
     cut(folder / "long.mcap", folder / "tuesday.mcap", last["stamp_ns"])
     return folder, last

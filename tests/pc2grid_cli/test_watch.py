@@ -21,6 +21,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app, main
+from pc2grid_lab.experiments.recordings.carried_away import Part, write_joined
 from signature.localization.resets import ResetPolicy
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
@@ -72,7 +73,7 @@ def answer_of(looks: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
 @pytest.fixture(scope="module")
 def expected(folder: Path) -> list[tuple[Any, ...]]:
     """The answer for the finished file, in a process of its own."""
-    words = ["watch", "tuesday.mcap", "-d", "plan.submaps", "--json", "--keep"]
+    words = ["watch", "tuesday.mcap", "-d", "plan.submaps", "--json"]
     run = subprocess.run(
         [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
         cwd=folder,
@@ -98,7 +99,7 @@ def test_a_robot_is_located_where_it_is(here: Path, capsys: pytest.CaptureFixtur
 def test_every_scan_of_a_recording_is_used_and_it_says_the_same_each_time(
     here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
 ) -> None:
-    code, looks, _ = watch(capsys, "tuesday.mcap", "--keep")
+    code, looks, _ = watch(capsys, "tuesday.mcap")
     assert code == 0
     assert answer_of(looks) == expected
     with open_log("tuesday.mcap") as log:
@@ -106,14 +107,14 @@ def test_every_scan_of_a_recording_is_used_and_it_says_the_same_each_time(
         assert looks[-1]["scans"] == sum(scan.stamp_ns <= looks[-1]["stamp_ns"] for scan in log.scans())
     assert first_ns < looks[0]["stamp_ns"]
     assert {(look["dropped"], look["reconnected"], look["lag_s"]) for look in looks} == {(0, 0, 0.0)}
-    _, again, _ = watch(capsys, "tuesday.mcap", "--keep")
+    _, again, _ = watch(capsys, "tuesday.mcap")
     assert [look | {"elapsed_s": 0.0} for look in again] == [look | {"elapsed_s": 0.0} for look in looks]
 
 
 def test_a_recording_in_real_time_is_a_robot_that_gives_the_same_answer(
     here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
 ) -> None:
-    code, looks, err = watch(capsys, "tuesday.mcap", "--real-time")
+    code, looks, err = watch(capsys, "tuesday.mcap", "--real-time", "--first")
     assert code == 0, err
     assert answer_of(looks) == expected[: len(looks)]
 
@@ -124,7 +125,7 @@ def test_a_websocket_gives_the_same_answer_and_initialpose(
     located_ns, second_ns = (stamp_ns for stamp_ns, *_ in expected[:2])
     # A busy computer leaves out the first search once the robot has driven on to the second one.
     with Robot(Recorded.read(here / "tuesday.mcap")) as robot, robot.playing(end_ns=second_ns):
-        code, looks, err = watch(capsys, robot.url, "--publish", "initialpose", "--publish-map")
+        code, looks, err = watch(capsys, robot.url, "--publish", "initialpose", "--publish-map", "--first")
         robot.wait(lambda: not robot.clients)
     assert code == 0, err
     assert answer_of(looks) == expected[:1]
@@ -140,18 +141,44 @@ def test_a_websocket_gives_the_same_answer_and_initialpose(
     assert np.array_equal(decoded["/map"].data.reshape(office().cells.shape), as_mapped(office()).told())
 
 
+def started(*words: str) -> subprocess.Popen[bytes]:
+    """The program in a process of its own, which Ctrl-C stops."""
+    return subprocess.Popen(
+        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        preexec_fn=interruptible,
+    )
+
+
+def test_a_robot_that_is_located_is_told_so_once_and_followed_on(
+    here: Path, expected: list[tuple[Any, ...]]
+) -> None:
+    second_ns = expected[1][0]
+    with Robot(Recorded.read(here / "tuesday.mcap")) as robot, robot.playing(end_ns=second_ns):
+        program = started("watch", robot.url, "-d", "plan.submaps", "--publish", "initialpose")
+        try:
+            assert program.stdout is not None
+            lines = [program.stdout.readline().decode()]
+            robot.play(m for m in robot.recorded.messages if m[1] >= second_ns)
+            lines.append(program.stdout.readline().decode())
+            program.send_signal(signal.SIGINT)
+            _, err = program.communicate(timeout=LONG_S)
+        finally:
+            program.kill()
+    assert all("located in plan: x " in line for line in lines), lines
+    assert [line.endswith(", published /initialpose\n") for line in lines] == [True, False]
+    assert [topic for topic, _ in robot.told()] == ["/initialpose"]
+    assert program.returncode == 130
+    assert b"interrupted: each file is complete, or as it was before" in err
+
+
 def test_map_to_odom_is_published_until_the_program_is_stopped(
     here: Path, expected: list[tuple[Any, ...]]
 ) -> None:
     second_ns = expected[1][0]
     with Robot(Recorded.read(here / "tuesday.mcap")) as robot, robot.playing(end_ns=second_ns):
-        words = ["watch", robot.url, "-d", "plan.submaps", "--publish", "tf", "--json"]
-        program = subprocess.Popen(
-            [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            preexec_fn=interruptible,
-        )
+        program = started("watch", robot.url, "-d", "plan.submaps", "--publish", "tf", "--json")
         try:
             assert program.stdout is not None
             lines = [program.stdout.readline()]
@@ -183,10 +210,26 @@ def test_what_is_not_located_ends_with_4(here: Path, capsys: pytest.CaptureFixtu
     assert all(look["pose"] is None and look["map"] is None for look in looks)
 
 
-def test_words_for_people(here: Path) -> None:
-    result = CliRunner().invoke(app, ["watch", "tuesday.mcap", "-d", "plan.submaps"])
+def test_the_first_answer_is_enough_if_it_is_asked_for(
+    here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
+) -> None:
+    code, looks, _ = watch(capsys, "tuesday.mcap", "--first")
+    assert code == 0
+    states = [state for _, _, state, *_ in expected]
+    assert answer_of(looks) == expected[: states.index("located") + 1] != expected
+
+
+def test_a_robot_that_was_carried_away_is_told_so_in_words(here: Path, tmp_path: Path) -> None:
+    """Along the corridor of the office, with wheels that do not turn."""
+    config = SimulationConfig(length_m=4.0, seed=5, clutter=0, start_m=(2.0, 7.0))
+    simulate_session(tmp_path / "there.mcap", sensor="laser", grid=office(), config=config)
+    write_joined(Part(here / "tuesday.mcap"), Part(tmp_path / "there.mcap"), tmp_path / "carried.mcap")
+    result = CliRunner().invoke(app, ["watch", str(tmp_path / "carried.mcap"), "-d", "plan.submaps"])
     assert result.exit_code == 0
-    assert "located in plan: x " in result.stdout
+    said = [line.partition(" m: ")[2] for line in result.stdout.splitlines()]
+    lost = next(number for number, line in enumerate(said) if line.startswith("lost, no place fits"))
+    assert all(line.startswith("located in plan: x ") for line in said[:lost])
+    assert said[lost + 1].startswith("recovered in plan: x ") and said[-1].startswith("located in plan: x ")
 
 
 @pytest.mark.parametrize(
@@ -198,6 +241,9 @@ def test_words_for_people(here: Path) -> None:
         (["tuesday.mcap", "--publish", "tf"], 2, "takes no messages"),
         (["tuesday.mcap", "--topic", "/points"], 1, "no topic /points"),
         (["plan.submaps"], 1, "not a recording"),
+        (["tuesday.mcap", "--first", "--check-topic", "/tf"], 2, "--check-topic goes on until it is stopped"),
+        (["ws://robot:1", "--first", "--publish", "tf"], 2, "--publish tf goes on until it is stopped"),
+        (["tuesday.mcap", "--keep"], 2, "--first"),
         (["tuesday.mcap", "--real-time", "--publish", "tf"], 2, "takes no messages"),
     ],
 )

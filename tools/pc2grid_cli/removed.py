@@ -32,6 +32,7 @@ REMOVED = {
     "pc2grid compare signatures": "`pc2grid compare recordings DATA --shortlist shuffled`: without them",
     "pc2grid compare real": "its rows are those of `pc2grid compare recordings DATA --only 'other sensor'`",
     "pc2grid watch --last": "a finished recording is followed whole, and ws://ROBOT:8765 while it runs",
+    "pc2grid watch --keep": "`pc2grid watch` goes on to the end; `--first` stops when it is located",
     "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",
     "pc2grid convert --update": "`--join` puts what is new into the frame of the other sessions",
 }

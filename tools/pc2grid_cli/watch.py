@@ -95,14 +95,12 @@ _Source = Annotated[
         help="a robot with foxglove_bridge, or a finished recording, of which every scan is used",
     ),
 ]
-_Keep = Annotated[
-    bool, typer.Option("--keep", help="go on when it is located, and say when it is somewhere else")
-]
+_First = Annotated[bool, typer.Option("--first", help="stop when it is located for the first time")]
 _Publish = Annotated[
     Publish,
     typer.Option(
         "--publish",
-        help="tell the robot: /initialpose when it is located; or the transform map -> odom, with --keep",
+        help="tell the robot: /initialpose when it is located, first and again; or the transform map -> odom",
     ),
 ]
 _PublishMap = Annotated[bool, typer.Option("--publish-map", help="also /map, the map in which it is located")]
@@ -116,7 +114,7 @@ _RealTime = Annotated[
     ),
 ]
 _Timeout = Annotated[
-    float | None, typer.Option("--timeout", min=0.0, metavar="S", help="give up after so many seconds")
+    float | None, typer.Option("--timeout", min=0.0, metavar="S", help="stop after so many seconds")
 ]
 _AsJson = Annotated[bool, typer.Option("--json", help="a JSON document on each line, one a search")]
 
@@ -130,7 +128,7 @@ def watch_command(
     near: options.Near = None,
     check_topic: options.CheckTopic = None,
     session: options.KnownSession = None,
-    keep: _Keep = False,
+    first: _First = False,
     publish: _Publish = "none",
     publish_map: _PublishMap = False,
     map_frame: _MapFrame = "map",
@@ -145,8 +143,8 @@ def watch_command(
     assume_identity: options.AssumeIdentity = False,
     json: _AsJson = False,
 ) -> None:
-    """Find where a running robot is, while it drives, or was while it was recorded. Exit code 4: it was not
-    located.
+    """Find where a running robot is, while it drives, or was while it was recorded: each metre, until it is
+    stopped or to the end of the recording. Exit code 4: at last it was not located.
 
     With --check-topic, say after each metre whether it is where it believes to be. Exit code 4: at last it
     was not.
@@ -159,6 +157,9 @@ def watch_command(
     )
     known = KnownPose(near=near, check_topic=check_topic, session=session)
     prior = known.at_start()
+    if first and (publish == "tf" or check_topic is not None):
+        goes_on = "--publish tf" if publish == "tf" else "--check-topic"
+        raise ConfigError(f"--first: {goes_on} goes on until it is stopped", hint="leave --first out")
     if publish != "none" or publish_map:
         _check_publishes(source, check_topic)
     terminal = console.of(context)
@@ -173,7 +174,7 @@ def watch_command(
         else:
             frames = opened.frames() if frame == "building" else {}
             with _robot(drive, opened, publish, publish_map, map_frame, frames) as robot:
-                good = _search(following, robot, prior, keep or publish == "tf", as_json=json)
+                good = _search(following, robot, prior, first=first, as_json=json)
         _summarize(drive, terminal)
     if not good:
         raise typer.Exit(console.UNSURE)
@@ -218,12 +219,10 @@ class _Following:
         run(drive, follower, self.config, poll, observer=self.terminal.observer())
 
 
-def _search(
-    following: _Following, robot: _Robot, prior: Prior | None, forever: bool, *, as_json: bool
-) -> bool:
-    """Follow the robot until it is located; whether it is.
+def _search(following: _Following, robot: _Robot, prior: Prior | None, *, first: bool, as_json: bool) -> bool:
+    """Follow the robot; whether it is located at last.
 
-    prior : where the robot is at the beginning, as far as it is known. forever : go on when it is located.
+    prior : where the robot is at the beginning, as far as it is known. first : stop when it is located.
     """
     drive, config = following.drive, following.config
     index = MapIndex.of(following.database, config, following.terminal.observer())
@@ -238,7 +237,7 @@ def _search(
             document = _document(estimate, drive, robot, published)
             console.print_result(document if as_json else as_text(estimate, published), indent=None)
             located = estimate.answer.status == "located"
-            return located and not forever
+            return located and first
 
         following.run(follower, use)
     return located

@@ -124,7 +124,7 @@ def _watched(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
             source.parent.mkdir(parents=True, exist_ok=True)
             joined = write_joined(*_parts(catalogue, folder, one), source)
             put_down_ns, shift_ns = joined.put_down_ns, joined.shift_ns
-        done = pc2grid("-q", "watch", source, "-d", folder.map(one.map), "--keep", "--json")
+        done = pc2grid("-q", "watch", source, "-d", folder.map(one.map), "--json")
         looks = done.document if isinstance(done.document, list) else [done.document]
         document = {"looks": looks, "put_down_ns": put_down_ns, "shift_ns": shift_ns}
         return done if done.failed else replace(done, document=document)
