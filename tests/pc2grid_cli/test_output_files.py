@@ -32,6 +32,7 @@ EXPORT, LOCATE = "export none.submaps", "relocalize none.mcap -d none.submaps"
         (f"{EXPORT} --plot taken.png", "taken.png: exists already"),
         (f"{EXPORT} --plot folder", "folder: is a folder"),
         (f"{LOCATE} --trajectory way.csv", "way.csv: --trajectory"),
+        (f"{LOCATE} --csv answers.json", "answers.json: --csv does not write the format .json"),
         (f"{LOCATE} -o answer.bag", "answer.bag: --output"),
         (f"{LOCATE} --initialpose pose.png", "pose.png: --initialpose"),
         (f"{LOCATE} --plot nowhere/a.png", "a.png: cannot write: no folder nowhere"),

@@ -20,9 +20,10 @@ SUFFIXES: dict[str, tuple[str, ...]] = {
     "initialpose": (".json", ".yaml", ".yml"),
     "plot": (".png",),
     "report": (".html", ".htm"),
+    "csv": (".csv",),
 }
 """By option: the suffixes of the files that it writes."""
-_OF_OTHERS = {suffix for known in SUFFIXES.values() for suffix in known} | {".bag", ".db3", ".rrd", ".csv"}
+_OF_OTHERS = {suffix for known in SUFFIXES.values() for suffix in known} | {".bag", ".db3", ".rrd"}
 """Suffixes of formats that a database or the stem of a map must not be named after."""
 
 

@@ -29,7 +29,7 @@ from pc2grid_cli.known_pose import KnownPose
 from pc2grid_cli.locate import in_map, searched
 from pc2grid_cli.nav2_pose import write_initialpose
 from pc2grid_cli.output_files import check_file, files_of
-from pc2grid_cli.windows import Window, find_all, show, windows_of
+from pc2grid_cli.windows import Window, find_all, show, windows_of, write_csv, write_places
 from signature.database.maintenance import is_database
 from signature.files import find
 from signature.localization.answer_json import QueryRecording, Result, Sessions
@@ -64,7 +64,9 @@ class Relocalize(Result):
     map_sigma_m: float | None
 
 
-_OF_ANSWER = ("trajectory", "initialpose", "output")
+_OF_ONE = {"initialpose", "output", "report"}
+"""The options that take one query."""
+_OF_ANSWER = {"trajectory", "initialpose", "output"}
 """The options whose files only an answer can fill."""
 _Logs = Annotated[
     list[Path],
@@ -92,6 +94,17 @@ _InitialPose = Annotated[
     Path | None,
     typer.Option("--initialpose", metavar="OUT.json", help="the pose as nav2 takes it"),
 ]
+_Csv = Annotated[
+    Path | None, typer.Option("--csv", metavar="OUT.csv", help="a line for each query, with its pose")
+]
+_Trajectory = Annotated[
+    Path | None,
+    typer.Option(
+        "--trajectory",
+        metavar="OUT.tum",
+        help="poses of the base, for evo; of several queries, where each was located",
+    ),
+]
 _Output = Annotated[
     Path | None,
     typer.Option("--output", "-o", metavar="OUT.mcap", help="map, pose, path for Foxglove, rerun"),
@@ -115,7 +128,8 @@ def relocalize_command(
     start: options.Start = 0.0,
     duration: options.Duration = None,
     every: _Every = None,
-    trajectory: options.TrajectoryFile = None,
+    trajectory: _Trajectory = None,
+    csv: _Csv = None,
     initialpose: _InitialPose = None,
     output: _Output = None,
     plot: options.Plot = None,
@@ -131,14 +145,17 @@ def relocalize_command(
 ) -> None:
     """Find where a recording was made. Exit code 4: there is no confident single answer.
 
-    Of several recordings, and with --every, each query has a line: of a table, or with --json a document.
+    Of several recordings, and with --every, each query has a line: of a table, of --csv, or with --json a
+    document.
 
     With --near or --near-pose, places elsewhere are no answers. With --check or --check-topic, no place is
     found, but a pose is judged: fine, lost, or unsure; exit code 4 unless it is fine.
 
     Example: pc2grid relocalize tuesday.mcap --database building.submaps
     """
-    wanted = files_of(trajectory=trajectory, initialpose=initialpose, output=output, plot=plot, report=report)
+    wanted = files_of(
+        trajectory=trajectory, csv=csv, initialpose=initialpose, output=output, plot=plot, report=report
+    )
     known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
     several = every is not None or len(logs) > 1
     _check_options(logs, database, wanted, force, known, several=several)
@@ -154,10 +171,11 @@ def relocalize_command(
             judged = check_log(logs[0], opened, settings, known, span=windows[0].span, **given)
             code = report_check(*judged, as_json=json)
         elif several:
-            code = _tell_all(find_all(windows, opened, settings, known, **given), told, plot)
+            found_in_turn = find_all(windows, opened, settings, known, **given)
+            code = _tell_all(found_in_turn, told, wanted, console.of(context))
         else:
             found = find(logs[0], opened, settings, span=windows[0].span, prior=known.prior, **given)
-            code = _tell_one(found, told, wanted, force, settings, console.of(context))
+            code = _tell_one(windows[0], found, told, wanted, force, settings, console.of(context))
     raise typer.Exit(code)
 
 
@@ -176,7 +194,7 @@ def _check_options(
         check_file(option, path, force)
     if several:
         hint = "leave it out, or give one recording and no --every"
-        _refuse(outputs.keys() - {"plot"}, "is of one query", hint)
+        _refuse(outputs.keys() & _OF_ONE, "is of one query", hint)
     for log in logs:
         if is_drawn_map(log):
             hint = "--json and --output have its pose"
@@ -234,6 +252,7 @@ class _Told:
 
 
 def _tell_one(
+    window: Window,
     found: Found,
     told: _Told,
     outputs: Mapping[str, Path],
@@ -243,29 +262,40 @@ def _tell_one(
 ) -> int:
     """Print the answer to one query, and write what shows it; returns the exit code."""
     stated = answer_in_building(found.answer, told.frames)
-    located, missed = in_map(found.poses, found.answer), list[Path]()
+    located = in_map(found.poses, found.answer)
     # Printed first: a file that cannot be written must not cost the answer.
     text = as_text(stated, is_map=found.drawn is not None)
     text += _about_map(map_sigma_m(found.answer, told.database))
     console.print_result(told.document(found, stated) if told.as_json else text)
-    if located is None:
-        missed = [outputs[option] for option in _OF_ANSWER if option in outputs]
-        outputs = {option: path for option, path in outputs.items() if option not in _OF_ANSWER}
+    outputs = _fillable(outputs, located=located is not None)
+    if "csv" in outputs:
+        write_csv(outputs["csv"], [(window, stated)])
     _write(outputs, told.database, found, stated, located, force, settings)
     for path in outputs.values():
         terminal.note(f"wrote {path}")
     _warn_of_missing_points(found, told.database)
     _warn_of_unjoined(found.answer, told.database)
-    for path in missed:
-        console.warn(f"{path}: not written, there is no answer to put into it")
     for warning in found.about["warnings"]:
         console.warn(warning)
     _warn_of_prior(stated)
     return told.code([found])
 
 
-def _tell_all(found_in_turn: Generator[tuple[Window, Found | None]], told: _Told, plot: Path | None) -> int:
-    """Print the answers to several queries, and draw them; returns the exit code.
+def _fillable(outputs: Mapping[str, Path], *, located: bool) -> Mapping[str, Path]:
+    """The files that can be written, by option. Of those that lack an answer the user is warned."""
+    missed = set() if located else outputs.keys() & _OF_ANSWER
+    for option in sorted(missed):
+        console.warn(f"{outputs[option]}: not written, there is no answer to put into it")
+    return {option: path for option, path in outputs.items() if option not in missed}
+
+
+def _tell_all(
+    found_in_turn: Generator[tuple[Window, Found | None]],
+    told: _Told,
+    outputs: Mapping[str, Path],
+    terminal: console.Console,
+) -> int:
+    """Print the answers to several queries, and write what shows them; returns the exit code.
 
     The documents are printed one by one, the table at the end, also if the work is interrupted."""
     rows: list[tuple[Window, Answer | None]] = []
@@ -282,8 +312,16 @@ def _tell_all(found_in_turn: Generator[tuple[Window, Found | None]], told: _Told
             rows.append((window, stated))
             if told.as_json:
                 console.print_result(told.document(found, stated), indent=None)
-    if plot is not None:
-        draw_answers(plot, told.database, all_found)
+    answers = [answer for _, answer in rows if answer is not None]
+    outputs = _fillable(outputs, located=any(answer.status == "located" for answer in answers))
+    if "csv" in outputs:
+        write_csv(outputs["csv"], rows)
+    if "trajectory" in outputs:
+        write_places(outputs["trajectory"], [(f.poses, a) for f, a in zip(all_found, answers, strict=True)])
+    if "plot" in outputs:
+        draw_answers(outputs["plot"], told.database, all_found)
+    for path in outputs.values():
+        terminal.note(f"wrote {path}")
     for warning in dict.fromkeys(f"{f.about['source']}: {w}" for f in all_found for w in f.about["warnings"]):
         console.warn(warning)
     return told.code(all_found, failed=len(all_found) < len(rows))

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,19 +15,32 @@ import numpy as np
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, LogError, one_line
 from pc2grid.io import open_log
+from pc2grid.io.atomic import replace_file
+from pc2grid.io.trajectory import stamp_text, write_trajectory
 from pc2grid.mapping.drawn_map import is_drawn_map
+from pc2grid.model import Trajectory
 from pc2grid.observer import Observer
 from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli.known_pose import KnownPose
+from pc2grid_cli.locate import in_map
 from signature.files import find, query_config
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.report import Found
 
 if TYPE_CHECKING:
+    from pc2grid.arrays import F64
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.localization.answer import Answer
+
+_COLUMNS = (
+    "recording", "start_s", "time_s", "status", "session", "frame", "x_m", "y_m", "yaw_rad", "confidence",
+    "sigma_x_m", "sigma_y_m", "sigma_yaw_rad",
+)  # fmt: skip
+"""Of --csv. start_s: of the query, after the start of its recording. time_s: of its last scan, as in TUM."""
+_DIGITS = 6
+"""Of numbers in --csv: micrometres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,3 +140,41 @@ def show(answers: Sequence[tuple[Window, Answer | None]]) -> None:
         where = one_line(answer.frame or answer.session or "")
         table.add_row(name, answer.status.replace("_", " "), where, start_s, *at, *sure)
     tables.show(table)
+
+
+def write_csv(path: Path, answers: Sequence[tuple[Window, Answer | None]]) -> None:
+    """Write a line for each query; what is not known of it is empty. Raises OutputError."""
+    with replace_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_COLUMNS)
+        for window, answer in answers:
+            row: list[object] = [window.path.name, window.span.start_s]
+            if answer is None:
+                writer.writerow([*row, "", "failed", *[""] * 9])
+                continue
+            pose, covariance = answer.T_map_base, answer.covariance
+            at = ("", "", "") if pose is None else (pose.x, pose.y, pose.yaw)
+            sigmas = ("", "", "") if covariance is None else np.sqrt(np.diag(covariance)).tolist()
+            where = (answer.session or "", answer.frame or answer.session or "")
+            time_s = stamp_text(answer.stamp_ns) if answer.stamp_ns else ""  # no time passes in a map
+            row += [time_s, answer.status, *where, *at, answer.confidence, *sigmas]
+            writer.writerow([round(cell, _DIGITS) if isinstance(cell, float) else cell for cell in row])
+
+
+def write_places(path: Path, found: Sequence[tuple[Trajectory, Answer]]) -> None:
+    """Write where queries were located, in the order of time, as a trajectory. Raises OutputError.
+
+    found : the poses of each query, and its answer. A trajectory is in one frame: answers in another one than
+    most are left out, and warned of.
+    """
+    located: dict[str, dict[int, F64]] = defaultdict(dict)
+    for poses, answer in found:
+        placed = in_map(poses, answer)
+        if placed is not None:
+            located[answer.frame or answer.session or ""][answer.stamp_ns] = placed.T_session_base[-1]
+    frame = max(located, key=lambda name: len(located[name]))
+    for other in located.keys() - {frame}:
+        console.warn(f"{path}: is in the frame of {frame}; {len(located[other])} poses in {other} left out")
+    stamps_ns = sorted(located[frame])
+    T = np.array([located[frame][stamp_ns] for stamp_ns in stamps_ns])
+    write_trajectory(path, Trajectory(stamps_ns=np.array(stamps_ns), T_session_base=T))
