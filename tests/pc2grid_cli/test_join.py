@@ -94,7 +94,9 @@ def test_answers_are_in_the_frame_of_the_building_unless_that_of_the_session_is_
 
 
 def test_one_map_of_the_building_is_exported() -> None:
-    run("export joined.submaps --map whole --cloud whole.ply")
+    run("export joined.submaps --map whole --cloud whole.ply --plot whole.png")
+    image = cv2.imread("whole.png")
+    assert image is not None and image.std() > 5.0
     whole = load_map(Path("whole.yaml"))
     assert whole.free_m2 > 1.3 * load_map(Path("west.yaml")).free_m2
     assert whole.is_free(19.0, 7.0) and whole.is_free(1.0, 7.0)
@@ -103,6 +105,17 @@ def test_one_map_of_the_building_is_exported() -> None:
     with pytest.raises(DatabaseError, match="holds 2 sessions") as refused:
         run("export b.submaps --map no")
     assert "db join" in str(refused.value.hint)
+    with pytest.raises(DatabaseError, match="--g2o is of one session") as refused:
+        run("export joined.submaps --map no --g2o no.g2o")
+    assert "db join" not in str(refused.value.hint)
+
+
+def test_info_says_what_is_joined_and_in_which_frame() -> None:
+    assert document("db info b.submaps")["joined"] == [] and "joined" not in run("info b.submaps")
+    told = document("db info joined.submaps")["joined"]
+    assert [(s["session"], s["frame"]) for s in told] == [("west", "west"), ("east", "west")]
+    for command in ("info", "db info"):
+        assert run(f"{command} joined.submaps").endswith("  joined, in the frame of west: west, east\n")
 
 
 def test_what_is_added_to_a_joined_database_is_joined() -> None:

@@ -12,7 +12,14 @@ from pc2grid.display import counted
 from pc2grid.errors import DatabaseError, one_line
 from pc2grid_cli import console
 from pc2grid_cli.options import DATABASE, AsJson, Database, Force, WrittenDatabase
-from pc2grid_cli.session_documents import OfDatabase, StoredInfo, stored_document
+from pc2grid_cli.session_documents import (
+    JoinedSession,
+    OfDatabase,
+    StoredInfo,
+    buildings,
+    joined_document,
+    stored_document,
+)
 from signature.database import Problem, SessionInfo, open_database
 from signature.database.maintenance import check, copy, merge, remove, rename, shown, split
 from signature.localization.answer_json import plain
@@ -21,9 +28,10 @@ _Sessions = Annotated[list[str], typer.Argument(metavar="SESSION...", help="whic
 
 
 class DbInfo(OfDatabase):
-    """`pc2grid db info --json`."""
+    """`pc2grid db info --json`. joined: where those of the sessions lie that are joined in a building."""
 
     sessions: list[StoredInfo]
+    joined: list[JoinedSession]
 
 
 class DbCheck(OfDatabase):
@@ -46,10 +54,15 @@ def db_info_command(database: Database, json: AsJson = False) -> None:
     Example: pc2grid db info building.submaps
     """
     with open_database(database) as opened:
-        sessions, where = opened.sessions(), opened.location
-    about: DbInfo = {"database": where, "sessions": [stored_document(session) for session in sessions]}
+        sessions, frames, where = opened.sessions(), opened.frames(), opened.location
+    about: DbInfo = {
+        "database": where,
+        "sessions": [stored_document(session) for session in sessions],
+        "joined": [joined_document(name, frame) for name, frame in frames.items()],
+    }
     submaps = counted(sum(session.submaps for session in sessions), "submap")
     lines = [f"{where}: {counted(len(sessions), 'session')}, {submaps}", *map(_line, sessions)]
+    lines += [f"  joined, in the frame of {name}: {', '.join(of)}" for name, of in buildings(frames).items()]
     console.print_result(plain(DbInfo, about) if json else "\n".join(map(one_line, lines)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -37,7 +37,7 @@ from pc2grid_cli.session_documents import OfDatabase
 from signature.database import open_database
 from signature.localization.answer_json import plain
 from signature.localization.joining.building_map import floors_of, map_of
-from signature.localization.shown.picture import draw_session
+from signature.localization.shown.picture import draw_building, draw_session
 from signature.localization.shown.report import write_report
 
 if TYPE_CHECKING:
@@ -117,9 +117,9 @@ def export_command(
 ) -> None:
     """Write a session's map, trajectory or picture, or a page that shows all sessions.
 
-    Of sessions that are joined (`db join`), --map and --cloud write one map of all that are on a floor,
-    unless --session names one. Maps, clouds and trajectories are in the frame of the building; pictures,
-    pages, graphs and the files of other viewers show a session in its own map frame.
+    Of sessions that are joined (`db join`), --map, --cloud and --plot show all that are on a floor as one,
+    unless --session names one. Maps, clouds and trajectories are in the frame of the building; pages,
+    graphs, the picture of a session and the files of other viewers are in the session's own map frame.
 
     Example: pc2grid export building.submaps --map building --trajectory building.tum
     """
@@ -190,28 +190,33 @@ def _write(
 ) -> str | None:
     """Write all files. Returns the session that was written; None if it was a whole building, or none."""
     floors, of_sessions = floors_of(database, frames), outputs.keys() - {"report"}
-    name = None
-    if of_sessions and session is None and of_sessions <= {"map", "cloud"} and len(floors) == 1:
+    name, of_one = None, of_sessions - {"map", "cloud", "plot"}
+    if of_sessions and session is None and not of_one and len(floors) == 1:
         _write_building(outputs, as_told, database, floors[0], frames, terminal)
     elif of_sessions:
-        name = _session_name(database, session)
+        name = session or _only_session(database, of_one, joined=bool(floors))
         _write_session(outputs, as_told, database, name, frames.get(name), terminal)
     if "report" in outputs:
         write_report(outputs["report"], database)
     return name
 
 
-def _session_name(database: SubmapDatabase, named: str | None) -> str:
-    """The session to write. Raises DatabaseError if none is named and there is not exactly one."""
-    if named is not None:
-        return named
+def _only_session(database: SubmapDatabase, of_one: Collection[str], *, joined: bool) -> str:
+    """The session to write if none is named. Raises DatabaseError if there is not exactly one.
+
+    of_one : the options that write a session and no building. joined : whether sessions are.
+    """
     names = [info.name for info in database.sessions()]
-    if len(names) != 1:
-        raise DatabaseError(
-            f"{database.location}: holds {len(names)} sessions: {', '.join(names) or 'none'}",
-            hint="choose one with --session; for one map of all: `pc2grid db join`, --building, --floor",
-        )
-    return names[0]
+    if len(names) == 1:
+        return names[0]
+    why, hint = "", "for one map of all: `pc2grid db join`, --building, --floor"
+    if joined:
+        why = f"; --{min(of_one)} is of one session" if of_one else "; several floors are joined"
+        hint = "of a floor, --map, --cloud and --plot alone show all: --building, --floor"
+    raise DatabaseError(
+        f"{database.location}: holds {len(names)} sessions: {', '.join(names) or 'none'}{why}",
+        hint=f"choose one with --session; {hint}",
+    )
 
 
 def _write_building(
@@ -222,7 +227,7 @@ def _write_building(
     frames: Mapping[str, BuildingFrame],
     terminal: console.Console,
 ) -> None:
-    """Write the map and the cloud of the sessions of a floor, in the frame of their building."""
+    """Write the map, the cloud and the picture of the sessions of a floor, in the frame of their building."""
     others = [info.name for info in database.sessions() if info.name not in frames]
     if others:
         console.warn(f"not joined, and left out: {', '.join(others)}")
@@ -230,6 +235,9 @@ def _write_building(
         _write_map(outputs["map"], database, names, frames, as_told.of)
     if "cloud" in outputs:
         _write_cloud(outputs["cloud"], database, names, frames, terminal)
+    if "plot" in outputs:
+        maps = {name: (database.grid(name), frames[name]) for name in names}
+        draw_building(outputs["plot"], frames[names[0]].name, maps)
 
 
 def _write_session(

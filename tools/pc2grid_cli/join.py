@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -16,7 +15,7 @@ from pc2grid.geometry import SE2
 from pc2grid_cli import console
 from pc2grid_cli.options import AsJson, Database, Force, Plot
 from pc2grid_cli.output_files import check_file
-from pc2grid_cli.session_documents import JoinedSession, OfDatabase, joined_document
+from pc2grid_cli.session_documents import JoinedSession, OfDatabase, buildings, joined_document
 from pc2grid_cli.tables import show, table
 from signature.bend import largest_m
 from signature.database import SubmapDatabase, maintenance, open_database
@@ -25,9 +24,6 @@ from signature.localization.joining.building import Joined, join_sessions
 from signature.localization.joining.join import JoinStatus
 from signature.localization.joining.pairing import SessionPair
 from signature.localization.shown.picture import draw_building
-
-if TYPE_CHECKING:
-    from signature.database.protocol import BuildingFrame
 
 _SAID = {"joined": "joined", "ambiguous": "ambiguous", "different": "not the same building"}
 
@@ -117,7 +113,7 @@ def report(found: Joined, names: list[str], *, dry_run: bool = False) -> None:
     for pair in found.pairs:
         pairs.add_row(*map(one_line, _row(pair)))
     show(pairs)
-    for name, sessions in _buildings(found).items():
+    for name, sessions in buildings(found.frames).items():
         show(f"in the frame of {one_line(name)}:")
         for session, at in sessions.items():
             T = at.T_building_session
@@ -151,22 +147,14 @@ def _sigma_m(covariance: Sequence[Sequence[float]]) -> float:
     return math.sqrt(max(covariance[0][0], covariance[1][1]))
 
 
-def _buildings(found: Joined) -> dict[str, dict[str, BuildingFrame]]:
-    """The joined sessions by the frame of their building."""
-    buildings: dict[str, dict[str, BuildingFrame]] = defaultdict(dict)
-    for session, at in found.frames.items():
-        buildings[at.name][session] = at
-    return buildings
-
-
 def draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
     """A picture of the building with most sessions; none if nothing is joined."""
-    buildings = _buildings(found)
-    if not buildings:
+    known = buildings(found.frames)
+    if not known:
         console.warn(f"{path}: not written, no two sessions are joined")
         return
-    name = max(buildings, key=lambda name: len(buildings[name]))
-    draw_building(path, name, {s: (database.grid(s), at) for s, at in buildings[name].items()})
+    name = max(known, key=lambda name: len(known[name]))
+    draw_building(path, name, {s: (database.grid(s), at) for s, at in known[name].items()})
 
 
 def _document(where: str, found: Joined, names: list[str], dry_run: bool) -> DbJoin:

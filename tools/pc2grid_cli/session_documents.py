@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import statistics
+from collections import defaultdict
+from collections.abc import Mapping
 from typing import Any
 
 from pc2grid.geometry import SE2
@@ -140,6 +142,14 @@ def joined_document(session: str, frame: BuildingFrame) -> JoinedSession:
         "covariance": frame.covariance,
         "bent_m": round(largest_m(frame.bend), 3),
     }
+
+
+def buildings(frames: Mapping[str, BuildingFrame]) -> dict[str, dict[str, BuildingFrame]]:
+    """The joined sessions by the frame of their building. frames : by session."""
+    found: dict[str, dict[str, BuildingFrame]] = defaultdict(dict)
+    for session, at in frames.items():
+        found[at.name][session] = at
+    return found
 
 
 def precision_summary(precision: Precision | None) -> PrecisionSummary | None:
