@@ -1,5 +1,5 @@
 # pc2grid: every target makes .venv and installs into it when that has not happened yet.
-# Only make, a POSIX shell and python3 >= 3.10 with venv are needed; `make help` lists the targets.
+# Only make and a POSIX shell are needed, and where apt is not: a Python 3.10 to 3.13 with venv. `make help` lists the targets.
 
 PYTHON ?=
 BIN = .venv/bin
@@ -8,7 +8,7 @@ READY = .venv/.ready
 BYTE_CODE = PYTHONDONTWRITEBYTECODE=
 PYTEST_ARGS ?=
 
-.PHONY: help demo test nightly check real fuzz pictures modules docs clean
+.PHONY: help browser demo test nightly check real fuzz pictures modules docs clean
 .DEFAULT_GOAL = help
 
 help:
@@ -28,13 +28,17 @@ $(READY): pyproject.toml constraints.txt tools/setup.sh
 	@PYTHON='$(PYTHON)' sh tools/setup.sh
 	@touch $(READY)
 
+# Tests look at pages in chromium; the demo does without it.
+browser:
+	@sh tools/setup.sh browser
+
 demo: $(READY)
 	$(BIN)/pc2grid demo --out demo_out --force
 
-test: $(READY)
+test: $(READY) browser
 	$(BYTE_CODE) $(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
 
-nightly: $(READY)
+nightly: $(READY) browser
 	$(BYTE_CODE) $(BIN)/python -m pytest -q -n auto --dist loadfile -m nightly $(PYTEST_ARGS)
 	PC2GRID_FUZZ=1000 $(BIN)/python -m pytest -q -n auto --dist worksteal $(FUZZED) $(PYTEST_ARGS)
 
@@ -56,7 +60,7 @@ FUZZ_FOLDER = $(shell test -w /dev/shm && echo --basetemp=/dev/shm/pc2grid-fuzz 
 FUZZED = tests/pc2grid/io/test_fuzz.py tests/test_fuzz_inputs.py
 FUZZ = PC2GRID_FUZZ=20000 $(BIN)/python -m pytest -q -n auto --dist worksteal --timeout 1200 -m "" $(PYTEST_ARGS)
 
-fuzz: $(READY)
+fuzz: $(READY) browser
 	$(FUZZ) $(FUZZ_FOLDER) $(FUZZED)
 	$(FUZZ) tests/signature/database/test_faults.py tests/signature/database/test_durability.py \
 		tests/pc2grid_cli/test_view.py -k fuzz

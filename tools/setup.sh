@@ -1,9 +1,9 @@
 #!/bin/sh
 # Make .venv and install pc2grid with its tools for developers into it. Called by the Makefile.
 #
-# open3d needs five libraries of the system, even without a screen. Where they are missing, root gets
-# them from apt; anyone else is told the one line to type. The same holds for chromium, in which tests look at
-# pages; without it they are skipped.
+# What is missing of Python and of the five libraries that open3d needs, even without a screen, root gets from
+# apt; anyone else is told the one line to type. The same holds for chromium, in which tests look at pages:
+# `setup.sh browser` brings it, and nothing else. Without it they are skipped.
 set -eu
 
 fail() {
@@ -44,6 +44,15 @@ apt_get() { # package names
 
 has_browser() { command -v chromium >/dev/null 2>&1 || command -v chromium-browser >/dev/null 2>&1; }
 
+if [ "${1:-}" = browser ]; then
+    if ! has_browser && has_apt && is_root; then
+        echo "setup: tests look at pages in chromium; installing it"
+        apt_get chromium || :
+    fi
+    has_browser || echo "setup: no chromium, so tests of pages are skipped; on Debian: sudo apt-get install chromium" >&2
+    exit 0
+fi
+
 missing_libraries() { # prints the packages that hold what cannot be loaded
     "$1" - <<'END'
 import ctypes
@@ -65,13 +74,12 @@ END
 }
 
 python=$(find_python)
-if [ -z "$python" ] && [ -z "${PYTHON:-}" ] && fits python3; then
-    apt_install "python3 has no venv" python3-venv
-    python=$(find_python)
-fi
 if [ -z "$python" ]; then
     [ -z "${PYTHON:-}" ] || fail "PYTHON=$PYTHON is not a Python 3.10 to 3.13 with venv"
-    fail "no Python 3.10 to 3.13 with venv found" "make PYTHON=/path/to/python3.11 ... uses the one you name"
+    wanted="no Python 3.10 to 3.13 with venv found (make PYTHON=/path/to/python3.11 ... uses the one you name)"
+    apt_install "$wanted" python3 python3-venv
+    python=$(find_python)
+    [ -n "$python" ] || fail "$wanted"
 fi
 
 # Run a command while a line says how long it has taken and how much is installed.
@@ -95,12 +103,6 @@ watched() { # command and arguments
 packages=$(missing_libraries "$python")
 # shellcheck disable=SC2086  # one word per package
 [ -z "$packages" ] || apt_install "open3d needs libraries that are missing here" $packages
-
-if ! has_browser && has_apt && is_root; then
-    echo "setup: tests look at pages in chromium; installing it"
-    apt_get chromium || :
-fi
-has_browser || echo "setup: no chromium, so tests of pages are skipped; on Debian: sudo apt-get install chromium" >&2
 
 .venv/bin/python -c 'import pip' >/dev/null 2>&1 || watched "$python" -m venv --clear .venv
 echo "setup: installing into .venv with $(.venv/bin/python --version) (the first time takes some minutes)"
