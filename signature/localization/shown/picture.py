@@ -38,10 +38,15 @@ MISSED_COLOUR = ORANGE
 """Of the map's wall points where the query saw free ground."""
 _SUPPORT_LABELS = {
     "FITS": "query's wall: fits the map",
-    "CONTRADICTED": "query's wall: free in the map",
+    "CONTRADICTED": "query's wall: on free ground of the map",
     "UNKNOWN": "query's wall: unknown to the map",
 }
-_SHADES = {"unknown": 222, "undecided": 238, "free": 255, "wall": 38}
+_MISSED_LABEL = "map's wall: the query saw free ground"
+UNKNOWN, FREE, FURNITURE, WALL = range(4)
+"""What a cell of a map is drawn as, the more important the higher."""
+PALETTE = np.array([(222, 222, 222), (255, 255, 255), (165, 182, 208), (38, 38, 38)], np.uint8)
+"""Red, green and blue of each. All that is drawn over furniture can be seen on its light blue."""
+_FURNITURE_LABEL = "map's furniture: an obstacle, no wall"
 _WIDTH_IN, _GAP_IN = 10.0, 0.55
 _MARGIN = 0.03
 """Around a map, as a share of its longer side; an arrow at its edge must not be cut."""
@@ -102,13 +107,12 @@ def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...
     )
 
 
-def shades(grid: OccupancyGrid) -> U8:
-    """Grey values (H, W) of a grid: free white, walls dark, undecided and unknown cells light grey."""
-    grey = np.full(grid.cells.shape, _SHADES["undecided"], np.uint8)
-    grey[grid.cells < 0] = _SHADES["unknown"]
-    grey[grid.free] = _SHADES["free"]
-    grey[grid.occupied] = _SHADES["wall"]
-    return grey
+def drawn_as(grid: OccupancyGrid) -> U8:
+    """Return as what each cell (H, W) is drawn: the map that nav2 gets, but furniture differs from walls."""
+    kinds = np.full(grid.cells.shape, UNKNOWN, np.uint8)
+    for cells, kind in ((grid.free, FREE), (grid.things, FURNITURE), (grid.occupied, WALL)):
+        kinds[cells] = kind
+    return kinds
 
 
 def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
@@ -133,7 +137,7 @@ def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid,
     after = {session: at.apply(before[session]) for session, (_, at) in maps.items()}
     figure, panels = _panels(*(_around_walls(walls.values()) for walls in (before, after)))
     for axes, walls in zip(panels, (before, after), strict=True):
-        axes.set_facecolor(_grey("free"))
+        axes.set_facecolor(_colour(FREE))
         colours = itertools.cycle((BLUE, ORANGE, GREEN, VERMILLION, PURPLE, GREY))
         # Each thinner than the one below it, so that both colours are visible where walls coincide.
         for k, ((session, points_m), colour) in enumerate(zip(walls.items(), colours, strict=False)):
@@ -284,7 +288,7 @@ def _panels(whole: _Box, *more: _Box) -> tuple[Any, list[Any]]:
         axes.set_xlim(box.left, box.right)
         axes.set_ylim(box.bottom, box.top)
         axes.set_aspect("equal")
-        axes.set_facecolor(_grey("unknown"))
+        axes.set_facecolor(_colour(UNKNOWN))
         axes.tick_params(labelsize=8, color=GREY, labelcolor="#444444")
         for spine in axes.spines.values():
             spine.set_color(GREY)
@@ -297,21 +301,21 @@ def _panels(whole: _Box, *more: _Box) -> tuple[Any, list[Any]]:
     return figure, panels
 
 
-def _grey(name: str) -> str:
-    return f"#{_SHADES[name]:02x}{_SHADES[name]:02x}{_SHADES[name]:02x}"
+def _colour(kind: int) -> str:
+    """Return the colour of a kind of cell as matplotlib takes it."""
+    return f"#{bytes(PALETTE[kind]).hex()}"
 
 
 def _draw_map(axes: Any, grid: OccupancyGrid) -> None:
     (x0, y0), (height, width) = grid.origin_m, np.array(grid.cells.shape) * grid.resolution_m
     axes.imshow(
-        shades(grid),
+        PALETTE[drawn_as(grid)],
         origin="lower",
         extent=(x0, x0 + width, y0, y0 + height),
-        cmap="gray",
-        vmin=0,
-        vmax=255,
         interpolation="nearest",
     )
+    if grid.things.any():
+        axes.plot([], [], "s", color=_colour(FURNITURE), label=_FURNITURE_LABEL)
 
 
 def _draw_submaps(axes: Any, database: SubmapDatabase, session: str) -> None:
@@ -342,7 +346,7 @@ def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_s
             color=MISSED_COLOUR,
             ms=1.8 * point_size,
             mew=0.6 * point_size,
-            label="map's wall: the query saw free ground",
+            label=_MISSED_LABEL,
         )
 
 

@@ -22,7 +22,7 @@ import numpy as np
 from pc2grid._version import __version__
 from pc2grid.io.atomic import replace_file
 from pc2grid.matching.agreement import Support
-from signature.localization.shown.picture import agreements, shades
+from signature.localization.shown.picture import FURNITURE, PALETTE, UNKNOWN, agreements, drawn_as
 from signature.localization.shown.signatures_compared import why_here
 from signature.localization.shown.submap_sources import similar_places, sources
 
@@ -312,17 +312,15 @@ def deviation(covariance: F64, resolution_m: float, radius_m: float) -> tuple[fl
 def _picture(grid: OccupancyGrid) -> dict[str, Any]:
     """The known part of a grid as a PNG, unknown cells transparent. Large grids are reduced so that walls
     stay."""
-    shade = shades(grid)
+    kinds = drawn_as(grid)
     known = np.argwhere(grid.cells >= 0)
     (r0, c0), (r1, c1) = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), (1, 1))
-    shade, unknown = shade[r0:r1, c0:c1], (grid.cells < 0)[r0:r1, c0:c1]
-    n = -(-max(shade.shape) // _LARGEST_PIXELS)
+    kinds = kinds[r0:r1, c0:c1]
+    n = -(-max(kinds.shape) // _LARGEST_PIXELS)
     for axis in (0, 1):
-        blocks = np.arange(0, shade.shape[axis], n)
-        # Unknown cells are the lightest here, so that they do not hide what is known in their block.
-        shade = np.minimum.reduceat(np.where(unknown, 255, shade), blocks, axis=axis)
-        unknown = np.minimum.reduceat(unknown, blocks, axis=axis)
-    pixels = np.dstack((shade, shade, shade, np.where(unknown, 0, 255))).astype(np.uint8)
+        kinds = np.maximum.reduceat(kinds, np.arange(0, kinds.shape[axis], n), axis=axis)
+    opaque = np.where(kinds == UNKNOWN, 0, 255).astype(np.uint8)
+    pixels = np.dstack((PALETTE[kinds][..., ::-1], opaque))  # OpenCV has blue first
     # Row 0 of a grid is its lowest, row 0 of a picture its highest.
     data = cv2.imencode(".png", np.ascontiguousarray(pixels[::-1]))[1].tobytes()
     size = grid.resolution_m * n
@@ -330,8 +328,9 @@ def _picture(grid: OccupancyGrid) -> dict[str, Any]:
         "png": "data:image/png;base64," + base64.b64encode(data).decode(),
         "x": round(float(grid.origin_m[0] + c0 * grid.resolution_m), 4),
         "y": round(float(grid.origin_m[1] + r0 * grid.resolution_m), 4),
-        "w": round(shade.shape[1] * size, 4),
-        "h": round(shade.shape[0] * size, 4),
+        "w": round(kinds.shape[1] * size, 4),
+        "h": round(kinds.shape[0] * size, 4),
+        "furniture": PALETTE[FURNITURE].tolist() if grid.things.any() else None,
     }
 
 

@@ -19,17 +19,24 @@ from signature.database.protocol import BuildingFrame
 from signature.files import find
 from signature.localization.shown.picture import (
     BLUE,
+    FREE,
+    FURNITURE,
     GREEN,
     ORANGE,
+    PALETTE,
     PURPLE,
+    UNKNOWN,
     VERMILLION,
+    WALL,
     draw_answer,
     draw_building,
     draw_session,
+    drawn_as,
 )
 from signature.localization.shown.report import Found
 from signature.sessions import add_sessions, provenance
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
+from tests.helpers.nav2_map import as_mapped, nav2_map
 from tests.helpers.session_maps import session, way
 from tests.helpers.simulated_drives import cut, office, plan
 
@@ -89,11 +96,34 @@ def test_walls_have_the_colour_of_what_the_map_says_about_them(
     assert drawn[GREEN] > 5 * drawn[VERMILLION]
     assert {
         "query's wall: fits the map",
-        "query's wall: free in the map",
+        "query's wall: on free ground of the map",
         "query's wall: unknown to the map",
         "map's wall: the query saw free ground",
     } <= set(labels)
     assert len(labels) == len(set(labels))
+
+
+def test_the_picture_is_the_map_that_nav2_gets_and_tells_furniture_apart(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    grid = as_mapped(office())
+    save_map(grid, tmp_path / "map")
+    cells, *_ = nav2_map(tmp_path / "map.yaml")
+    drawn = drawn_as(grid)
+    for told, kinds in ((0, {FREE}), (-1, {UNKNOWN}), (100, {WALL, FURNITURE})):
+        assert set(drawn[cells == told]) == kinds
+    assert set(drawn[grid.things]) == {FURNITURE}
+
+    origin = provenance(Path("office.mcap"), "a" * 64, Config())
+    for name, there in (("bare", False), ("furnished", True)):
+        made = session(name, grid if there else office(), way())
+        add_sessions(tmp_path / f"{name}.submaps", [(made, origin)], Config())
+        labels = labels_of(monkeypatch)
+        with open_database(tmp_path / f"{name}.submaps") as opened:
+            draw_session(tmp_path / f"{name}.png", opened, name)
+        assert ("map's furniture: an obstacle, no wall" in labels) == there
+        colour = "#" + bytes(PALETTE[FURNITURE].tolist()).hex()
+        assert (pixels_of(tmp_path / f"{name}.png", colour) > 100) == there
 
 
 def test_a_map_as_the_query_has_no_last_scan_and_no_path(
@@ -106,7 +136,7 @@ def test_a_map_as_the_query_has_no_last_scan_and_no_path(
     assert not [label for label in labels if "last scan" in label or "query: path" in label]
     # A part of the very map is contradicted nowhere, so the legend does not name this.
     assert (
-        "query's wall: free in the map" not in labels
+        "query's wall: on free ground of the map" not in labels
         and "map's wall: the query saw free ground" not in labels
     )
 

@@ -28,6 +28,7 @@ from signature.localization.shown.report import Found, contents, write_report
 from signature.sessions import add_sessions, provenance
 from signature.similarity import distances
 from tests.helpers.browser import DESK, PHONE, Browser
+from tests.helpers.nav2_map import as_mapped
 from tests.helpers.session_maps import LOOPS, session, way
 from tests.helpers.simulated_drives import cut, office, plan
 
@@ -98,6 +99,28 @@ def test_the_picture_lies_where_the_grid_lies(database: SubmapDatabase) -> None:
     assert (image["x"], image["y"], image["w"], image["h"]) == (0.0, 0.0, 20.0, 14.0)
     # The highest row of the picture is the one with the largest y.
     assert np.array_equal(pixels[::-1, :, 0] < 60, grid.occupied)
+
+
+def test_furniture_is_in_the_picture_and_in_the_legend(tmp_path: Path, browser: Browser) -> None:
+    """Also where there are so many cells that several of them are drawn as one."""
+    few = as_mapped(office())
+    many = replace(few, cells=np.kron(few.cells, np.ones((8, 8), np.int8)), resolution_m=few.resolution_m / 8)
+    for name, grid, there in (("bare", office(), False), ("few", few, True), ("many", many, True)):
+        made = replace(session("s", office(), way()), grid=grid)
+        add_sessions(
+            tmp_path / f"{name}.submaps", [(made, provenance(Path("x.mcap"), "a" * 64, Config()))], Config()
+        )
+        with open_database(tmp_path / f"{name}.submaps") as opened:
+            write_report(tmp_path / "page.html", opened)
+            image = contents(opened)["sessions"][0]["image"]
+        raw = np.frombuffer(base64.b64decode(image["png"].split(",")[1]), np.uint8)
+        pixels = cv2.imdecode(raw, cv2.IMREAD_UNCHANGED)
+        assert max(pixels.shape) <= 3000 and (image["furniture"] is not None) == there
+        shown = looked_at(browser, tmp_path / "page.html")
+        assert (">map's furniture: an obstacle, no wall<" in shown) == there
+        if there:
+            light_blue = (pixels[..., 2::-1] == image["furniture"]).all(axis=-1)
+            assert light_blue.mean() == pytest.approx(few.things.mean(), rel=0.1)
 
 
 def test_loops_join_the_places_that_they_are_between(database: SubmapDatabase) -> None:
