@@ -3,7 +3,7 @@
 A descriptor is a `Method`: `fit` takes the submaps of a map and returns an object whose `similarities`
 compares a query with each of them. Queries are cut near a submap's centre and turned at random, with
 obstacles that are not in the map. `pc2grid compare paper` runs the same experiment on the paper's maps. Both
-need the laboratory, `pc2grid_lab`, which a clone has: `pip install -e .` there.
+need the package `pc2grid_lab`, which only a clone of the repository has: `pip install -e .` there.
 
 python examples/own_descriptor.py map.yaml
 """

@@ -73,7 +73,8 @@ def test_the_wheel_alone_simulates_and_says_what_compare_needs(
     assert pc2grid("demo", "--help").returncode == 0
     refused = pc2grid("compare", "recordings", ".")
     assert refused.returncode == 2 and "Traceback" not in refused.stderr
-    assert "not installed" in refused.stderr and "pip install -e ." in refused.stderr
+    assert "pip install -e ." in refused.stderr
+    assert "recordings: not installed; only a clone of the repository has this command" in refused.stderr
     assert "compare-paper" not in pc2grid("config", "schema").stdout
 
 

@@ -104,8 +104,8 @@ class LateCommand(TyperCommand):
             if error.name != LABORATORY:
                 raise
             raise ConfigError(
-                f"pc2grid compare {self.name}: the laboratory is not installed; it is no part of the package",
-                hint="in a clone of pc2grid's repository: pip install -e .",
+                f"pc2grid compare {self.name}: not installed; only a clone of the repository has this command",
+                hint="in the clone: pip install -e .",
             ) from None
         app = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
         app.command(self.name, cls=Command)(getattr(module, function))
