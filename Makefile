@@ -81,7 +81,7 @@ modules: $(READY)
 
 docs: $(READY)
 	@$(BIN)/python -c "from pc2grid.extras import require; require({'docs': 'make docs'})"
-	$(BIN)/python -m mkdocs build
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 clean:
 	rm -rf .venv demo_out dist build site .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache
