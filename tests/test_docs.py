@@ -37,6 +37,7 @@ import pc2grid
 import signature
 from pc2grid_cli import demo
 from pc2grid_cli.main import app
+from signature.localization.shown.picture import MISSED_LABEL, SUPPORT_LABELS
 from tests.helpers import doc_files
 from tests.helpers.nav2_map import nav2_map
 
@@ -299,6 +300,10 @@ def test_the_first_screen_says_what_this_is() -> None:
     text = (ROOT / "README.md").read_text()
     lines = text.splitlines()
     assert any(line.startswith("pc2grid ") for line in lines[:15])
+    # What sets everything up on a fresh machine: the main job, and the tests. CI runs both.
+    setting_up = {"make demo", "make test"}
+    assert setting_up <= set(commands_of(blocks("README.md", "sh")[0][1]))
+    assert setting_up <= set((ROOT / ".ci" / "run").read_text().splitlines())
     assert len(lines) <= 120 and len(text.split()) <= 1300
     first = " ".join(text.partition("\n## ")[0].split())
     abstract = " ".join(yaml.safe_load((ROOT / "CITATION.cff").read_text())["abstract"].split())
@@ -306,6 +311,16 @@ def test_the_first_screen_says_what_this_is() -> None:
     assert f'the paper "{title}"' in first and "![" in first
     for name in ("Boundary distances", "Free-space path lengths", "Reflection symmetry"):
         assert f"- **{name}**: " in first
+
+
+def test_the_caption_of_the_picture_has_the_words_of_its_legend() -> None:
+    first = " ".join((ROOT / "README.md").read_text().partition("\n## ")[0].split())
+    (caption,) = re.findall(r"\*`demo_out/answer\.png`: (.+?)\*", first)
+    assert f"Green, {SUPPORT_LABELS['FITS']};" in caption
+    for colour, kind in (("red", "CONTRADICTED"), ("blue", "UNKNOWN")):
+        of_what, _, said = SUPPORT_LABELS[kind].partition(": ")
+        assert of_what == "query's wall" and f"{colour}: {said}" in caption
+    assert f"Orange crosses, {MISSED_LABEL}." in caption
 
 
 # --- examples/ --------------------------------------------------------------------------------------------

@@ -74,7 +74,7 @@ def test_the_wheel_alone_simulates_and_says_what_compare_needs(
     refused = pc2grid("compare", "recordings", ".")
     assert refused.returncode == 2 and "Traceback" not in refused.stderr
     assert "pip install -e ." in refused.stderr
-    assert "recordings: not installed; only a clone of the repository has this command" in refused.stderr
+    assert "recordings: not installed; only a clone of the repository has it" in refused.stderr
     assert "compare-paper" not in pc2grid("config", "schema").stdout
 
 

@@ -6,9 +6,11 @@ import json
 import re
 import subprocess
 import sys
+from importlib.metadata import distributions
 from pathlib import Path
 
 import pytest
+from packaging.specifiers import SpecifierSet
 from typer.testing import CliRunner
 
 import pc2grid
@@ -31,6 +33,16 @@ def test_constraints_are_plain_versions() -> None:
     lines = [text for text in (ROOT / "constraints.txt").read_text().splitlines() if not text.startswith("#")]
     assert len(lines) > 20
     assert [text for text in lines if not line.match(text)] == []
+
+
+def test_constraints_do_not_ask_for_a_later_patch_of_python() -> None:
+    """The Python 3.11 of Debian 12 is 3.11.2: with a version that needs 3.11.5 nothing could be installed."""
+    first = f"{sys.version_info.major}.{sys.version_info.minor}.0"
+    pinned = re.findall(r"^([a-z0-9-]+)==([^;\s]+)", (ROOT / "constraints.txt").read_text(), re.MULTILINE)
+    here = {(dist.metadata["Name"].lower().replace("_", "-"), dist.version): dist for dist in distributions()}
+    asked = {pin: here[pin].metadata["Requires-Python"] for pin in pinned if pin in here}
+    assert len(asked) > 20
+    assert [pin for pin, needs in asked.items() if needs and first not in SpecifierSet(needs)] == []
 
 
 def test_scripts_are_posix_shell() -> None:

@@ -104,7 +104,7 @@ class LateCommand(TyperCommand):
             if error.name != LABORATORY:
                 raise
             raise ConfigError(
-                f"pc2grid compare {self.name}: not installed; only a clone of the repository has this command",
+                f"pc2grid compare {self.name}: not installed; only a clone of the repository has it",
                 hint="in the clone: pip install -e .",
             ) from None
         app = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)

@@ -36,12 +36,12 @@ SUPPORT_COLOURS = {"FITS": GREEN, "CONTRADICTED": VERMILLION, "UNKNOWN": BLUE}
 """Of the query's wall points, by the name of their `pc2grid.matching.agreement.Support`."""
 MISSED_COLOUR = ORANGE
 """Of the map's wall points where the query saw free ground."""
-_SUPPORT_LABELS = {
+SUPPORT_LABELS = {
     "FITS": "query's wall: fits the map",
     "CONTRADICTED": "query's wall: on free ground of the map",
     "UNKNOWN": "query's wall: unknown to the map",
 }
-_MISSED_LABEL = "map's wall: the query saw free ground"
+MISSED_LABEL = "map's wall: the query saw free ground"
 UNKNOWN, FREE, FURNITURE, WALL = range(4)
 """What a cell of a map is drawn as, the more important the higher."""
 PALETTE = np.array([(222, 222, 222), (255, 255, 255), (165, 182, 208), (38, 38, 38)], np.uint8)
@@ -337,7 +337,7 @@ def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_s
     for kind in (Support.FITS, Support.CONTRADICTED, Support.UNKNOWN):
         chosen = points_m[compared.support == kind]
         if len(chosen):
-            label = _SUPPORT_LABELS[kind.name]
+            label = SUPPORT_LABELS[kind.name]
             axes.plot(*chosen.T, ".", color=SUPPORT_COLOURS[kind.name], ms=3 * point_size, mew=0, label=label)
     if len(compared.missed_m):
         axes.plot(
@@ -346,7 +346,7 @@ def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_s
             color=MISSED_COLOUR,
             ms=1.8 * point_size,
             mew=0.6 * point_size,
-            label=_MISSED_LABEL,
+            label=MISSED_LABEL,
         )
 
 
