@@ -59,7 +59,9 @@ class ReadConfig(Section):
     max_chunk_bytes: int = Field(256 << 20, gt=0, description="a chunk that expands to more is refused")
     max_record_bytes: int = Field(1 << 30, gt=0, description="a larger record of a log is refused")
     unit_m: float = Field(1.0, gt=0, le=1e4, description="unit of a cloud or mesh; 0.001: millimetres")
-    up: Literal["x", "y", "z"] = Field("z", description="axis of a cloud or mesh that points up")
+    up: Literal["x", "y", "z", "-x", "-y", "-z"] = Field(
+        "z", description="axis of a cloud or mesh that points up; -y: y points down, as in a camera"
+    )
     floor_z: float | None = Field(
         None, description="height of a cloud's floor, m, after unit_m and up; null: found as a level plane"
     )

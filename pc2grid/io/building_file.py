@@ -38,11 +38,17 @@ _SPACING_SAMPLE = 2000
 _SAMPLES_PER_M2 = 1600.0  # of the surface of a mesh: one every 2.5 cm
 _DIGEST_BYTES = 1 << 20
 _LOCAL_MAPS = Path("local_maps", "plys")
-# Rotations of the axis that points up to z; the two others keep their order.
-_UP: dict[str, F64] = {
+_ROUNDED_M = 0.1
+"""Steps of coordinates above which walls are not drawn: two cells. Rounded to 0.06 m a building keeps 94 to
+99 % of its free area, to 0.12 m 64 to 97 %, to 0.5 m none."""
+# Rotations of the axis that points up to z.
+UPRIGHT: dict[str, F64] = {
+    "z": np.eye(3),
     "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
-    "z": np.eye(3),
+    "-x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]),
+    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "-z": np.array([[1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, -1.0]]),
 }
 
 Kind = Literal["cloud", "mesh"]
@@ -77,26 +83,56 @@ def building_points(
     check : gets the vertices (V, 3) of a mesh, metres, z up, before it is sampled; may raise. A mesh in
         millimetres has a million times as many points.
 
-    Raises MapFileError if there is no such file, or it cannot be read or is damaged.
+    Raises MapFileError if there is no such file, it cannot be read, is damaged, or its coordinates are too
+    large for float32.
 
     >>> from pc2grid.io.export.cloud import write_cloud
     >>> write_cloud("corner.ply", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     >>> sum(len(block) for block in building_points(Path("corner.ply"), ReadConfig()))
     2
     """
-    turn = _UP[config.up] * config.unit_m
+    turn = UPRIGHT[config.up] * config.unit_m
     for file in _files(path):
         try:
             if kind_of(file) == "mesh":
                 vertices, triangles = load_mesh(file)
+                _check_rounding(file, vertices, config.unit_m)
                 vertices = vertices @ turn.T
                 check(vertices)
                 yield from sampled(vertices, triangles)
                 continue
             for block in _cloud_blocks(file):
+                _check_rounding(file, block, config.unit_m)
                 yield block if config.up == "z" and config.unit_m == 1.0 else block @ turn.T
         except LogError as error:  # of the reader of clouds, which also reads recordings
             raise MapFileError(f"{file}: {error.message}", hint=error.hint) from error
+
+
+def axis_of_file(direction: F64, up: str) -> str:
+    """The axis of a file nearest to a direction (3,) in its points as they are read with `read.up`.
+
+    >>> axis_of_file(np.array([0.1, 0.0, -1.0]), up="y")
+    '-y'
+    """
+    in_file = UPRIGHT[up].T @ direction
+    axis = int(np.abs(in_file).argmax())
+    return ("-" if in_file[axis] < 0.0 else "") + "xyz"[axis]
+
+
+def _check_rounding(path: Path, points: F64, unit_m: float) -> None:
+    """Raise MapFileError if float32 has rounded the coordinates (N, 3) of a file more than walls allow."""
+    if not len(points):
+        return
+    typical = np.median(points, axis=0)
+    step_m = float(np.spacing(np.float32(np.abs(typical).max()))) * unit_m
+    if step_m > _ROUNDED_M and np.array_equal(points, points.astype(np.float32)):
+        shift = " ".join(f"{0.0 - round(v, -3):.0f}" for v in typical)
+        raise MapFileError(
+            f"{path}: float32 cannot hold these coordinates: near {np.abs(typical).max():.0f} they are"
+            f" rounded to {step_m:.2g} m",
+            hint="where the cloud is still exact, subtract an offset, such as a global shift of"
+            f" {shift}, and export it again, or export it in float64",
+        )
 
 
 def digest_of_building(path: Path) -> str:
@@ -227,9 +263,9 @@ def sampled(vertices: F64, triangles: I64) -> Iterator[F64]:
         yield points
 
 
-def neighbour_distances_m(points_m: F64) -> F64:
-    """Distance (M,) of some points of a cloud (N, 3), evenly chosen, to their nearest neighbour."""
+def neighbour_distances_m(points_m: F64, neighbour: int = 1) -> F64:
+    """Distance (M,) of some points of a cloud (N, 3), evenly chosen, to their n-th nearest neighbour."""
     from scipy.spatial import cKDTree
 
     sample = points_m[:: max(len(points_m) // _SPACING_SAMPLE, 1)]
-    return np.asarray(cKDTree(points_m).query(sample, k=2)[0][:, 1])
+    return np.asarray(cKDTree(points_m).query(sample, k=[neighbour + 1])[0][:, 0])

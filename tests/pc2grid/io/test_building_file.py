@@ -12,7 +12,13 @@ from pc2grid.arrays import F64
 from pc2grid.config import ReadConfig
 from pc2grid.errors import MapFileError
 from pc2grid.io import building_file
-from pc2grid.io.building_file import building_points, digest_of_building, is_building_file, kind_of
+from pc2grid.io.building_file import (
+    axis_of_file,
+    building_points,
+    digest_of_building,
+    is_building_file,
+    kind_of,
+)
 from pc2grid.io.export.cloud import write_cloud
 from pc2grid.mapping.drawn_map import load_drawn_map
 from pc2grid.simulate.building import load_building
@@ -61,12 +67,32 @@ def test_units_and_the_axis_that_points_up(tmp_path: Path) -> None:
     path = tmp_path / "cloud.ply"
     write_cloud(path, CLOUD)
     assert points(path, unit_m=0.001) == pytest.approx(CLOUD * 0.001)
-    for up, axis in (("x", 0), ("y", 1)):
-        turned = points(path, up=up)
-        assert turned[:, 2] == pytest.approx(CLOUD[:, axis])
+    for up in ("x", "y", "z", "-x", "-y", "-z"):
+        turned, sign = points(path, up=up), -1.0 if up[0] == "-" else 1.0
+        assert turned[:, 2] == pytest.approx(sign * CLOUD[:, "xyz".index(up[-1])])
+        assert axis_of_file(np.array([0.0, 0.0, 1.0]), up) == up
         # A rotation keeps the hand of the axes.
         R = np.linalg.lstsq(CLOUD.astype(float), turned, rcond=None)[0].T
         assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_coordinates_too_large_for_float32_are_refused(tmp_path: Path) -> None:
+    """UTM in float32 is rounded to 0.5 m, in float64 it is exact; MGRS fits into float32."""
+    utm = CLOUD + np.array([467_325.0, 5_429_800.0, 310.0])
+    mgrs = CLOUD + np.array([67_325.0, 29_800.0, 310.0])
+    for form, unit_m in ((".ply", 1.0), (".pcd", 0.001)):
+        rounded = tmp_path / f"rounded{form}"
+        write_cloud(rounded, (utm / unit_m).astype(np.float32))
+        with pytest.raises(MapFileError, match=r"float32 cannot hold .* rounded to 0\.5\d? m") as refused:
+            points(rounded, unit_m=unit_m)
+        assert "offset" in (refused.value.hint or "")
+    path = tmp_path / "cloud.ply"
+    names = "".join(f"property double {axis}\n" for axis in "xyz")
+    head = f"ply\nformat binary_little_endian 1.0\nelement vertex {len(utm)}\n{names}end_header\n"
+    path.write_bytes(head.encode() + utm.tobytes())
+    assert np.array_equal(points(path), utm)
+    write_cloud(path, mgrs)
+    assert points(path) == pytest.approx(mgrs, abs=0.01)
 
 
 def test_local_maps_of_kiss_slam_are_one_cloud(tmp_path: Path) -> None:
