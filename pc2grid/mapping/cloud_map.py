@@ -12,6 +12,7 @@ Steps 2 and 3 need the memory of a tile beside the voxels and the grid.
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -21,12 +22,14 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64, U8, BoolGrid
 from pc2grid.clouds.ground import Ground, find_ground
+from pc2grid.clouds.parameters import CLOUD_PARAMETERS
 from pc2grid.clouds.planar_scan import project_to_plane
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.config import ProjectionConfig
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import SE2
+from pc2grid.io.building_file import UPRIGHT, axis_of_file
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
@@ -84,6 +87,11 @@ class CloudMapParameters:
 
 CLOUD_MAP = CloudMapParameters()
 PROJECTION = ProjectionConfig()
+_LEAST_UP = 0.99 / math.sqrt(3.0)
+"""Of a floor's normal along the axis that points up. The farthest direction from all axes has 1 / sqrt(3)."""
+_TILTED = dataclasses.replace(CLOUD_PARAMETERS, max_tilt_rad=math.acos(_LEAST_UP))
+_NEARLY_DEG = 10.0
+"""A plane that is tilted by less is level, and one that is nearer to upright may be a wall."""
 _SCANS_OF_A_VIEW = 2
 """Scans of the same that make a cell free in a `GridBuilder`."""
 
@@ -93,16 +101,18 @@ def level_cloud(
     parameters: CloudMapParameters = CLOUD_MAP,
     *,
     floor_z: float | None = None,
+    up: str = "z",
 ) -> F64:
     """Return T_level_cloud (4, 4): it makes the floor of a cloud (N, 3) level and puts it at z = 0.
 
-    x and y stay as they are but for the small tilt. The z axis of the cloud must point up within 35
-    degrees. Of several storeys the lowest is taken.
+    x and y stay as they are but for the tilt. The z axis of the cloud must point up within 55 degrees. Of
+    several storeys the lowest is taken.
 
     floor_z : height of the floor in the cloud, metres, where that is known: nothing is looked for, and the
         cloud is not turned.
+    up : axis of the file that became z, for the words of an error.
 
-    Raises MapFileError if the cloud shows no floor.
+    Raises MapFileError if the cloud shows no floor, or one that is tilted by more.
     """
     points = np.asarray(points_m, np.float64)
     check_plausible(points, parameters)
@@ -113,18 +123,81 @@ def level_cloud(
     # A cloud may lie far from its origin, in coordinates of a country: it is turned about its middle.
     middle = np.median(points, axis=0)
     points = points - middle
-    ground = find_ground(points, np.zeros(3))
-    if ground is None:
-        raise MapFileError(
-            "the cloud shows no floor: no large level plane lies below its other points",
-            hint="if another axis points up: --set read.up=y; if the floor is uneven, its height: "
-            "--set read.floor_z=-0.4 (metres); else cut off what lies below it",
-        )
-    ground = _refined(points, ground, parameters)
+    ground = _refined(points, _lowest_floor(points, up), parameters)
     T_level_cloud = ground.leveling()
     T_level_cloud[:3, 3] = middle - T_level_cloud[:3, :3] @ middle
     T_level_cloud[2, 3] += ground.offset_m - middle[2]
     return T_level_cloud
+
+
+def _lowest_floor(points: F64, up: str) -> Ground:
+    """The floor of a cloud (N, 3) about its middle.
+
+    Raises MapFileError if there is none, or it is tilted by more than 55 degrees.
+    """
+    found = []
+    for ground, size in possible_floors(points):
+        if _tilt_deg(ground.normal) < _NEARLY_DEG:
+            return ground
+        found.append((ground, size))
+    if not found:
+        raise _no_floor(None, up)
+    if any(ground.normal[2] > _LEAST_UP for ground, _ in found):
+        # The less a plane is tilted, the more likely it is the floor.
+        floor, _ = max(found, key=lambda one: one[1] * one[0].normal[2])
+    else:
+        # Upright walls are in every building.
+        above = [one for one in found if one[0].normal[2] < -_LEAST_UP]
+        floor, _ = max(above or found, key=lambda one: one[1])
+    if floor.normal[2] < _LEAST_UP:
+        raise _no_floor(floor.normal, up)
+    return floor
+
+
+def possible_floors(points: F64) -> Iterator[tuple[Ground, float]]:
+    """What could be the floor of a cloud (N, 3) about its middle, with each of the six axes taken as up.
+
+    z comes first. A wall is a floor of a cloud that lies on its side; but a floor is larger, and all of the
+    building is near to it: with each comes its share of the points over the height of the building above it.
+    """
+    sample = points[random_subset(len(points), _TILTED.ground_sample)]
+    for turn in UPRIGHT.values():
+        turned = sample @ turn.T
+        # Below half of the points, or, where more of them are floor, below all of them.
+        for highest_m in (0.0, float(turned[:, 2].max()) + 1.0):
+            ground = find_ground(turned, np.array([0.0, 0.0, highest_m]), parameters=_TILTED)
+            if ground is not None:
+                heights = ground.heights(turned)
+                share = float((np.abs(heights) < _TILTED.plane_tolerance_m).mean())
+                ground = dataclasses.replace(ground, normal=turn.T @ ground.normal)
+                yield ground, share / float(np.quantile(heights, 0.99))
+                break
+
+
+def _tilt_deg(normal: F64) -> float:
+    """The angle of a normal (3,) with the z axis."""
+    return math.degrees(math.acos(min(float(normal[2]), 1.0)))
+
+
+def _no_floor(normal: F64 | None, up: str) -> MapFileError:
+    """The error for a cloud whose floor is not below it. normal : (3,) of the most likely floor, if any."""
+    words = "the cloud shows no floor: no large level plane lies below its other points"
+    uneven = (
+        "if the floor is uneven, its height: --set read.floor_z=-0.4 (metres); else cut off what is below"
+    )
+    if normal is None:
+        return MapFileError(words, hint=f"if another axis points up: --set read.up=y, or -y; {uneven}")
+    turns, opposite = f"--set read.up={axis_of_file(normal, up)}", axis_of_file(-normal, up)
+    tilt_deg = _tilt_deg(normal)
+    if tilt_deg > 180.0 - _NEARLY_DEG:
+        words += ", but one lies above them"
+        return MapFileError(words, hint=f"if the cloud is upside down: {turns}; {uneven}")
+    if abs(tilt_deg - 90.0) < _NEARLY_DEG:
+        return MapFileError(words, hint=f"if another axis points up: {turns} or {opposite}; {uneven}")
+    return MapFileError(
+        f"the floor of the cloud, a large level plane, is tilted by {tilt_deg:.0f} degrees",
+        hint=f"{turns} names the axis that is nearest to up; from there the floor is levelled",
+    )
 
 
 def check_plausible(points_m: NDArray[np.floating], parameters: CloudMapParameters = CLOUD_MAP) -> None:

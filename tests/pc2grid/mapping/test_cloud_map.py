@@ -11,6 +11,7 @@ import pytest
 from pc2grid.config import Config, ReadConfig
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
+from pc2grid.io.building_file import UPRIGHT
 from pc2grid.io.export.cloud import write_cloud
 from pc2grid.mapping.cloud_map import (
     CLOUD_MAP,
@@ -22,7 +23,15 @@ from pc2grid.mapping.cloud_map import (
 )
 from pc2grid.mapping.drawn_map import load_drawn_map
 from pc2grid.model import OccupancyGrid
-from tests.helpers.building_clouds import ROOM_M, box_surface, room_cloud
+from tests.helpers.building_clouds import (
+    ROOM_M,
+    box_surface,
+    hall_cloud,
+    raised,
+    room_cloud,
+    rooms_cloud,
+    turned,
+)
 from tests.helpers.rooms import RESOLUTION_M
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
@@ -113,6 +122,44 @@ def test_cloud_without_floor_is_refused() -> None:
         level_cloud(rng.uniform(-5, 5, (5000, 3)))
     with pytest.raises(MapFileError, match="neither points"):
         level_cloud(np.empty((0, 3)))
+
+
+def test_floor_that_most_points_lie_on_is_found() -> None:
+    hall = hall_cloud()
+    assert (hall[:, 2] == 0.0).mean() > 0.6
+    assert level_cloud(raised(hall, 0.4))[2, 3] == pytest.approx(-0.4, abs=0.01)
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.4, 0.0)])
+@pytest.mark.parametrize("tilt_deg", [20.0, 37.0, 40.0])
+@pytest.mark.parametrize("ceiling", [True, False])
+def test_tilted_floor_is_levelled(axis: tuple[float, float, float], tilt_deg: float, ceiling: bool) -> None:
+    points = turned(rooms_cloud(ceiling=ceiling), axis, tilt_deg)
+    up = turned(np.array([[0.0, 0.0, 1.0]]), axis, tilt_deg)[0]
+    assert level_cloud(points)[2, :3] @ up > np.cos(np.radians(0.5))
+
+
+def test_floor_that_another_axis_is_nearer_to_is_named_with_its_tilt() -> None:
+    """At 60 degrees a wall is nearer to level than the floor."""
+    for points in (rooms_cloud(), rooms_cloud(ceiling=False), hall_cloud()):
+        lying = turned(points, (1.0, 0.0, 0.0), 60.0)
+        with pytest.raises(MapFileError, match="level plane, is tilted by 60 degrees") as refused:
+            level_cloud(lying)
+        assert "read.up=-y" in (refused.value.hint or "")
+        T = level_cloud(lying @ UPRIGHT["-y"].T, up="-y")
+        assert T[:3, :3] @ UPRIGHT["-y"] @ turned(np.eye(3), (1.0, 0.0, 0.0), 60.0).T[:, 2] == pytest.approx(
+            (0.0, 0.0, 1.0), abs=0.01
+        )
+
+
+def test_floor_above_all_else_is_said_to_be_upside_down() -> None:
+    """Without a ceiling, nothing but the floor can be the floor."""
+    for points in (rooms_cloud(ceiling=False), hall_cloud()):
+        for up in ("z", "-y"):
+            over = points @ np.diag((1.0, -1.0, -1.0))
+            with pytest.raises(MapFileError, match="but one lies above them") as refused:
+                level_cloud(over, up=up)
+            assert f"read.up={'-z' if up == 'z' else 'y'}" in (refused.value.hint or "")
 
 
 @pytest.mark.skipif(not FLOOR.is_file(), reason="no real cloud: set PC2GRID_DATA")
