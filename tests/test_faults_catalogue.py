@@ -40,9 +40,11 @@ import pytest
 
 from pc2grid import errors
 from pc2grid.errors import Pc2GridError
+from pc2grid.io.export.cloud import write_cloud
 from pc2grid_cli import console
 from signature.database import open_database
 from signature.database.maintenance import check, store
+from tests.helpers.building_clouds import hall_cloud, raised, rooms_cloud, turned
 from tests.helpers.databases import make_entry
 from tests.helpers.memory import Peak
 from tests.helpers.recordings import (
@@ -486,6 +488,36 @@ def all_scans_in_a_global_frame(folder: Path) -> str:
 def one_outlier(folder: Path) -> str:
     log(folder, changed(lambda i: cloud(i, np.vstack((planar_scan(0.1 * i + 0.2), [[1e30, -1e30, 1e7]])))))
     return CONVERT
+
+
+@fault(29, 1, errors.MapFileError, "house.ply: float32 cannot hold these coordinates", "subtract an offset")
+def building_in_utm(folder: Path) -> str:
+    write_cloud(folder / "house.ply", rooms_cloud() + np.array([467_325.0, 5_429_800.0, 310.0]))
+    return "convert house.ply -o x.submaps"
+
+
+@fault(30, 0, None, "house.ply: it looks upside down", "--set read.up=-z")
+def building_upside_down(folder: Path) -> str:
+    write_cloud(folder / "house.ply", turned(rooms_cloud(), (1.0, 0.0, 0.0), 180.0))
+    return "convert house.ply -o x.submaps"
+
+
+@fault(30, 1, errors.MapFileError, "house.ply", "level plane, is tilted by 60 degrees", "--set read.up=-y")
+def building_tilted(folder: Path) -> str:
+    write_cloud(folder / "house.ply", turned(rooms_cloud(), (1.0, 0.0, 0.0), 60.0))
+    return "convert house.ply -o x.submaps"
+
+
+@fault(30, 0, None, "another floor lies at z = 3.0", "--set read.floor_z=3.0")
+def building_of_two_storeys(folder: Path) -> str:
+    write_cloud(folder / "house.ply", np.concatenate((rooms_cloud(1), raised(rooms_cloud(1), 3.0))))
+    return "convert house.ply -o x.submaps"
+
+
+@fault(30, 0, None, "house: 9", "m2 free")
+def building_that_is_mostly_floor(folder: Path) -> str:
+    write_cloud(folder / "house.ply", hall_cloud())
+    return "convert house.ply -o x.submaps"
 
 
 @fault(30, 0, None, "log: 12 lidar scans", "0 submaps")

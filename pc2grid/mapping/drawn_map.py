@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from pc2grid.arrays import F64, freeze
-from pc2grid.config import Config
+from pc2grid.config import Config, ReadConfig
 from pc2grid.errors import MapFileError
-from pc2grid.geometry import transform_points
+from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io.building_file import (
+    axis_of_file,
     building_points,
     digest_of_building,
     is_building_file,
@@ -20,11 +22,14 @@ from pc2grid.io.building_file import (
     neighbour_distances_m,
 )
 from pc2grid.io.nav2_map import is_map_file, load_map
+from pc2grid.mapping.cloud_doubts import is_upside_down, other_floors, side_that_is_up
 from pc2grid.mapping.cloud_map import check_plausible, level_cloud, map_cloud, voxel_cloud
 from pc2grid.model import OccupancyGrid
 
-_SPARSE_M = 0.12
-"""Median distance of neighbouring points above which walls have gaps in a grid of 5 cm; chosen by hand."""
+_SPARSE_M = 0.15
+"""Spacing of points above which walls have gaps in a grid of 5 cm. Chosen by hand."""
+_SPACING_NEIGHBOUR = 3
+"""On a surface the third neighbour is as far away as a voxel filter is wide; the first may be much nearer."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,11 +85,15 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
     kind = kind_of(path)
     try:
         points = voxel_cloud(building_points(path, config.read, check_plausible), config.projection)
-        T_map_file = level_cloud(points, floor_z=config.read.floor_z)
+        T_map_file = level_cloud(points, floor_z=config.read.floor_z, up=config.read.up)
         level = transform_points(T_map_file, points)
         # Viewpoints, unlike `drivable_plan(level)`, also know the ground that furniture hides from above, as
         # the map of a robot does.
-        grid = map_cloud(level, config.projection, origin_m=T_map_file[:3, 3])
+        sparse = _sparse(points)
+        try:
+            grid = map_cloud(level, config.projection, origin_m=T_map_file[:3, 3])
+        except MapFileError as error:
+            raise MapFileError("; ".join((error.message, *sparse)), hint=error.hint) from error
     except MapFileError as error:
         if str(path) in error.message:
             raise
@@ -95,7 +104,10 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
         T_map_file=T_map_file,
         level_points_m=level,
         digest=digest_of_building(path),
-        warnings=_sparse(path, points),
+        warnings=tuple(
+            f"{path.name}: {sentence}"
+            for sentence in (*sparse, *_doubts(level, T_map_file, config.read, dense=not sparse))
+        ),
     )
 
 
@@ -113,12 +125,42 @@ def _digest_of_nav2_map(path: Path, grid: OccupancyGrid) -> str:
     return hashlib.sha256(path.read_bytes() + grid.cells.tobytes()).hexdigest()
 
 
-def _sparse(path: Path, points: F64) -> tuple[str, ...]:
-    """A warning if the points (V, 3) are too far from each other to draw walls without gaps."""
-    spacing_m = float(np.median(neighbour_distances_m(points)))
+def _sparse(points: F64) -> tuple[str, ...]:
+    """A sentence if the points (V, 3) are too far from each other to draw walls without gaps."""
+    spacing_m = float(np.median(neighbour_distances_m(points, _SPACING_NEIGHBOUR)))
     if spacing_m <= _SPARSE_M:
         return ()
     return (
-        f"{path.name}: its points are {spacing_m:.2f} m apart, so walls have gaps; less than {_SPARSE_M:g} m"
-        " is needed",
+        f"its points are {spacing_m:.2f} m apart, so walls have gaps and a lidar may not be found in it; less"
+        f" than {_SPARSE_M:g} m is needed: a voxel filter of 0.1 m or finer",
     )
+
+
+def _doubts(level: F64, T_map_file: F64, read: ReadConfig, *, dense: bool) -> Iterator[str]:
+    """What may be wrong with the map of a levelled cloud (V, 3), told; `dense` enough to show its doors."""
+    if dense and is_upside_down(level):
+        down = axis_of_file(np.array([0.0, 0.0, -1.0]), read.up)
+        yield (
+            "it looks upside down, as doors or furniture reach up to its highest plane, not down to its"
+            f" lowest; if so, the map is mirrored: --set read.up={down} turns it"
+        )
+    if read.floor_z is not None:
+        return
+    side = side_that_is_up(level)
+    if side is not None:
+        side = T_map_file[:3, :3].T @ side
+        axes = (axis_of_file(side, read.up), axis_of_file(-side, read.up))
+        yield (
+            "it looks as if it lay on its side, with a wall taken for the floor:"
+            f" --set read.up={axes[0]} or {axes[1]} turns it"
+        )
+    others = other_floors(level)
+    if others:
+        middle_m = np.median(level[:, :2], axis=0)
+        there = np.array([(*middle_m, other.height_m) for other in others], np.float64)
+        z_m = transform_points(invert_pose(T_map_file), there)[:, 2]
+        floors = " and ".join(
+            f"another floor lies at z = {z:.1f} with {other.area_m2:.0f} m2"
+            for z, other in zip(z_m, others, strict=True)
+        )
+        yield f"the lowest floor is mapped; {floors}: --set read.floor_z={z_m[0]:.1f} maps that one"

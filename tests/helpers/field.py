@@ -27,9 +27,14 @@ Change = Callable[[str, Any, int], Any]
 
 def field_log(name: str) -> Path:
     """The recording of this name; the test that asks for it is skipped where it is not there."""
-    path = DATA.resolve().parent / "field" / f"{name}.mcap"
+    return field_file(f"{name}.mcap")
+
+
+def field_file(name: str) -> Path:
+    """The file of this name; the test that asks for it is skipped where it is not there."""
+    path = DATA.resolve().parent / "field" / name
     if not path.is_file():
-        pytest.skip(f"{path}: no such recording here; PC2GRID_DATA names the folder beside it")
+        pytest.skip(f"{path}: no such file here; PC2GRID_DATA names the folder beside it")
     return path
 
 
