@@ -32,6 +32,8 @@ class FrameParameters:
 
 
 PARAMETERS = FrameParameters()
+_SAME = 1e-3
+"""Static transforms that differ by less, in metres and in parts of a rotation, are one; chosen by hand."""
 
 
 class PoseTrack:
@@ -109,6 +111,7 @@ class FrameTree:
         self._parent: dict[str, str] = {}
         self._static: dict[str, F64] = {}
         self._moving: dict[str, PoseTrack] = {}
+        self._moved: set[str] = set()  # those whose static transforms differ
         self.warnings: list[str] = []
         self._cache: dict[tuple[str, str], F64] = {}
 
@@ -145,10 +148,13 @@ class FrameTree:
         if child not in self._parent and len(self._parent) >= PARAMETERS.max_frames:
             self._warn(f"the log has more than {PARAMETERS.max_frames} frames; the others are ignored")
             return
+        before = self._static.get(child)
         self._set_parent(child, parent)
         if static:
             self._static[child] = pose_from_xyz_quat(edge.pose[:3], edge.pose[3:])
             self._cache.clear()
+            if before is not None and not np.allclose(before, self._static[child], atol=_SAME):
+                self._moved.add(child)
         elif child not in self._static:
             track = self._moving.setdefault(child, PoseTrack(lasting=edge.lasting))
             track.add(edge.header.stamp_ns or log_time_ns, edge.pose)
@@ -168,6 +174,18 @@ class FrameTree:
         """The root of the static transforms, if these form one tree."""
         roots = {self._above(child)[-1] for child in self._static}
         return roots.pop() if len(roots) == 1 else None
+
+    def static_root_of(self, frame: str) -> str:
+        """Return the frame that static transforms lead to from this one."""
+        return self._above(frame)[-1]
+
+    def rigid(self, target: str, source: str) -> bool:
+        """Return whether two frames are connected, and nothing moves between them."""
+        return self.connected(target, source) and not self.moving(target, source)
+
+    def ambiguous(self, target: str, source: str) -> bool:
+        """Return whether static transforms between two connected frames put one of them in two places."""
+        return not self._moved.isdisjoint(itertools.chain(*self._branches(target, source)))
 
     def static_leaves(self, frame: str) -> list[str]:
         """The frames that static transforms put on `frame`, and that carry no further ones."""

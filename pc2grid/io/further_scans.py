@@ -1,7 +1,7 @@
 """Scans of further sensors, taken at about the same time as those of the first: two lasers, four cameras.
 
-Each has a topic and a place on the robot of its own. Their points become part of the first sensor's scan that
-is nearest in time.
+Each has a frame and a place on the robot of its own, and mostly a topic. Their points become part of the
+first sensor's scan that is nearest in time.
 """
 
 from __future__ import annotations
@@ -9,14 +9,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import NamedTuple
 
 import numpy as np
 
 from pc2grid.arrays import F32, F64
 from pc2grid.errors import PointCloudError
 from pc2grid.geometry import invert_pose
-from pc2grid.io.message_source import TopicInfo
 from pc2grid.io.messages.types import ScanMessage
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
 from pc2grid.model import Scan
@@ -27,39 +26,59 @@ _KEPT = 50
 """Messages of a topic that wait for the first sensor's; chosen by hand."""
 
 
+class Received(NamedTuple):
+    """A scan as it was received. size_bytes : of the message as it was recorded."""
+
+    stamp_ns: int
+    log_time_ns: int
+    size_bytes: int
+    message: ScanMessage
+
+
 class FurtherScans:
-    """The scans of one further topic, decoded when the first sensor's scan needs them."""
+    """The scans of one further sensor, decoded when the first sensor's scan needs them.
 
-    def __init__(self, topic: TopicInfo, decoder: ScanDecoder) -> None:
-        self.topic, self._decoder = topic, decoder
-        self.newest_ns = 0
-        self._messages: deque[ScanMessage] = deque(maxlen=_KEPT)
+    name : for the user. silent : whether they are left out as long as they hold no return, see `Sensor`.
+    """
 
-    def take(self, data: Any) -> None:
-        """Take in a message. Raises what the decoder raises."""
-        message = self._decoder.message(data)
-        self.newest_ns = max(self.newest_ns, message.header.stamp_ns)
-        self._messages.append(message)
+    def __init__(self, name: str, decoder: ScanDecoder, *, silent: bool = False) -> None:
+        self.name, self.decoder, self.silent = name, decoder, silent
+        self.newest_ns = self._used_ns = 0
+        self._received: deque[Received] = deque(maxlen=_KEPT)
+
+    def take(self, received: Received) -> None:
+        """Take in a scan."""
+        if self.silent and not self.decoder.returns(received.message):
+            return
+        self.newest_ns = max(self.newest_ns, received.stamp_ns)
+        self._received.append(received)
+
+    def unused(self) -> list[Received]:
+        """Return the scans after those that became part of another sensor's, of those that are kept."""
+        return [received for received in self._received if received.stamp_ns > self._used_ns]
 
     def near(
         self,
         stamp_ns: int,
         pose_of: Callable[[str, int], F64],
         odometry_at: Callable[[int], F64 | None],
-    ) -> Scan:
-        """The scan nearest to a stamp.
+    ) -> Scan | None:
+        """The scan nearest to a stamp; None if there is none of a silent sensor.
 
         pose_of : `T_base_sensor` of a frame at a time.
 
         Raises PointCloudError if none is near, Pc2GridError if it cannot be decoded.
         """
-        message = min(self._messages, key=lambda m: abs(m.header.stamp_ns - stamp_ns), default=None)
-        if message is None or abs(message.header.stamp_ns - stamp_ns) > _MOST_APART_NS:
+        nearest = min(self._received, key=lambda r: abs(r.stamp_ns - stamp_ns), default=None)
+        if nearest is None or abs(nearest.stamp_ns - stamp_ns) > _MOST_APART_NS:
+            if self.silent:
+                return None
             raise PointCloudError("no scan near the first sensor's")
-        while self._messages[0] is not message:
-            self._messages.popleft()
-        own_ns = message.header.stamp_ns
-        return self._decoder.scan(message, own_ns, pose_of(message.header.frame, own_ns), odometry_at(own_ns))
+        while self._received[0] is not nearest:
+            self._received.popleft()
+        self._used_ns = own_ns = nearest.stamp_ns
+        message = nearest.message
+        return self.decoder.scan(message, own_ns, pose_of(message.header.frame, own_ns), odometry_at(own_ns))
 
 
 def together(first: Scan, further: Sequence[Scan]) -> Scan:

@@ -15,7 +15,7 @@ from pc2grid.io.frames import FrameTree
 from pc2grid.io.message_source import MessageSource, RawMessage, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, PoseStamped, Seven, valid_pose
-from pc2grid.io.read_plan import is_static, tolerant
+from pc2grid.io.read_plan import tolerant
 
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """x, y and yaw among x, y, z, roll, pitch, yaw."""
@@ -47,7 +47,7 @@ def map_poses(known: Sequence[TopicInfo], topic: str, base_frame: str) -> _Topic
     Raises TopicError, UnsupportedSchema.
     """
     channel = _channel(known, topic)
-    return _TfPoses(known, base_frame) if channel.type in topics.TF else _TopicPoses(channel)
+    return _TfPoses(known, channel, base_frame) if channel.type in topics.TF else _TopicPoses(channel)
 
 
 class BelievedPose:
@@ -125,8 +125,8 @@ class _TfPoses:
     The transform map -> odom is published ahead of time or rarely, so each one holds until the next.
     """
 
-    def __init__(self, known: Sequence[TopicInfo], base_frame: str) -> None:
-        self._decoders = {(t.topic, t.type): decoder_for(t) for t in known if t.type in topics.TF}
+    def __init__(self, known: Sequence[TopicInfo], channel: TopicInfo, base_frame: str) -> None:
+        self._decoders = {(t.topic, t.type): decoder_for(t) for t in topics.tf_topics(channel, known)}
         self._base_frame = base_frame
         self._tree = FrameTree()
         self._newest_ns: dict[str, int] = {}
@@ -137,7 +137,7 @@ class _TfPoses:
         decode = self._decoders.get((message.channel.topic, message.channel.type))
         if decode is None:
             return
-        static = is_static(message.channel)
+        static = topics.is_static(message.channel)
         for edge in tolerant(decode, message.data, ()):
             self._tree.add(replace(edge, lasting=True), static=static, log_time_ns=message.log_time_ns)
             if not static:

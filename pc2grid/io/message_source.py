@@ -72,7 +72,8 @@ class Choice:
     odometry_topic : None if there is none; a tf topic if the odometry is the transform odom -> base.
     imu_topic : None if there is none, or if none is needed.
     base_frame : the robot's frame, in which points are expressed.
-    sensor_frame : the frame in the header of the scans; None if it is empty.
+    sensor_frame : the frame in the header of the scans; None if it is empty. further_frames : of the sensors
+    whose scans are put together with these.
     reason : one sentence for the user.
     """
 
@@ -83,6 +84,7 @@ class Choice:
     sensor_frame: str | None
     reason: str
     imu_topic: str | None = None
+    further_frames: tuple[str, ...] = ()
 
 
 class RawMessage(NamedTuple):

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 import heapq
+import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -22,15 +23,14 @@ from pc2grid.errors import (
     UnsupportedSchema,
 )
 from pc2grid.geometry import invert_pose
-from pc2grid.io import topics
 from pc2grid.io.attitude import Attitude
 from pc2grid.io.frames import PARAMETERS as FRAMES
 from pc2grid.io.frames import FrameTree, PoseTrack
-from pc2grid.io.further_scans import FurtherScans, together
+from pc2grid.io.further_scans import FurtherScans, Received, together
 from pc2grid.io.message_source import GAP_NS, MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import CameraInfo, Imu, Odometry, ScanMessage, Transform
-from pc2grid.io.read_plan import Plan, Sensor, is_static, registered, tolerant
+from pc2grid.io.read_plan import Plan, Sensor, registered, tolerant
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
 from pc2grid.model import Scan
@@ -57,6 +57,8 @@ class StreamParameters:
 
 
 PARAMETERS = StreamParameters()
+_MOST_FURTHER = 20
+"""Sensors beside the first one, against hostile files; chosen by hand."""
 _FLOOR_BELOW_M, _FLOOR_SHARE = 0.05, 0.01
 """A sensor sees so much of its points below itself, as far as the floor is not at its own height; by hand."""
 _MOST_PERIODS = 1.1  # that the beams of a laser's scan take; stamps jitter
@@ -120,17 +122,20 @@ class Part:
         return kind(words, hint=error.hint)
 
 
+_Of = tuple[TopicInfo, str | None]
+"""Topic and frame of the scans of one sensor; None: a frame that is not known yet."""
+
+
 class _Waiting(NamedTuple):
     """A scan that waits; scans with equal stamps are sorted by their number in the log.
 
-    size_bytes : of the message as it was recorded. A text of numbers takes four times as much at most.
+    scan : its message takes at most four times its recorded size, if it is a text of numbers.
     """
 
     stamp_ns: int
     number: int
-    log_time_ns: int
-    size_bytes: int
-    message: ScanMessage
+    scan: Received
+    decoder: ScanDecoder
 
 
 class _Stamps:
@@ -314,9 +319,16 @@ class Stream:
         self._source, self._plan = source, plan
         self._parameters = parameters or PARAMETERS
         self._part = part or Part()
-        self._decoders = [self._decoder_of(sensor, config) for sensor in plan.sensors]
-        pairs = zip(plan.sensors, self._decoders, strict=True)
-        self._further = [FurtherScans(sensor.topic, decoder) for sensor, decoder in pairs][1:]
+        self._config = config
+        self._decode = {sensor.topic: decoder_for(sensor.topic) for sensor in plan.sensors}
+        self._decoders: dict[_Of, ScanDecoder] = {}
+        first, *further = plan.sensors
+        self._lead: _Of = (first.topic, first.frame)
+        self._alone_ns: int | None = None  # log time of the first scan of another sensor since the last of it
+        self._further: dict[_Of, FurtherScans] = {}
+        self._decoder_of(self._lead)
+        for sensor in further:
+            self._add((sensor.topic, sensor.frame), silent=sensor.silent)
         self.poses = _Poses(plan, frames, source.tally)
         self.stamps = _Stamps(source.tally)
         self._waiting: list[_Waiting] = []
@@ -325,24 +337,11 @@ class Stream:
         self._sweep_ns = 0 if SENSOR_MODELS[plan.choice.sensor].image else plan.period_ns
         self._handlers = self._make_handlers()
 
-    def _decoder_of(self, sensor: Sensor, config: ReadConfig) -> ScanDecoder:
-        return ScanDecoder(
-            sensor.topic.topic,
-            self._plan.choice.sensor,
-            decoder_for(sensor.topic),
-            config,
-            camera_topic="" if sensor.camera is None else sensor.camera.topic,
-            camera=sensor.calibration,
-            depth_unit_m=self._plan.depth_unit_m,
-            fixed_frame=self._plan.mounted is not None,
-            longest_s=_MOST_PERIODS * self._plan.period_ns * 1e-9 or math.inf,
-        )
-
     def _make_handlers(self) -> dict[TopicInfo, Callable[[Any, int], None]]:
         """By topic, what takes in its messages."""
         plan, poses = self._plan, self.poses
-        on: dict[TopicInfo, Callable[[Any, int], None]] = {self._topic: self._take_scan}
-        on.update((f.topic, functools.partial(self._take_further, f)) for f in self._further)
+        on: dict[TopicInfo, Callable[[Any, int], None]] = {}
+        on.update((topic, functools.partial(self._take_scan, topic)) for topic in self._decode)
         decoded: list[tuple[TopicInfo | None, Callable[[Any, int], None]]] = [
             (plan.odometry, poses.take_odometry),
             (plan.imu, poses.take_imu),
@@ -350,10 +349,8 @@ class Stream:
                 (sensor.camera, functools.partial(self._take_camera, sensor.camera))
                 for sensor in plan.sensors
             ),
+            *((topic, poses.take_tf) for topic in plan.moving_tf),
         ]
-        if plan.tf_moves:
-            tf = (t for t in self._source.info.topics if t.type in topics.TF and not is_static(t))
-            decoded += [(topic, poses.take_tf) for topic in tf]
         on.update((topic, _decoding(topic, take)) for topic, take in decoded if topic is not None)
         return on
 
@@ -364,7 +361,7 @@ class Stream:
 
     @property
     def _topic(self) -> TopicInfo:
-        return self._plan.sensors[0].topic
+        return self._lead[0]
 
     def run(self) -> Iterator[Scan]:
         """Yield the scans of the source. Raises as `Log.scans` says."""
@@ -372,7 +369,7 @@ class Stream:
             yield from self.take(message)
         yield from self.release_all()
         p = self._parameters
-        self._part.finish(self._topic.topic, p.max_bad_share, self._decoders[0].empty)
+        self._part.finish(self._topic.topic, p.max_bad_share, self._decoders[self._lead].empty)
         if self._last_read_ns is None and self._plan.choice.odometry_topic is not None:
             self._source.tally.warn(
                 f"no scan has odometry: that from {self._plan.choice.odometry_topic} is of other times"
@@ -394,34 +391,99 @@ class Stream:
     def _is_due(self, first: _Waiting, now_ns: int) -> bool:
         p, waiting = self._parameters, self._waiting
         return (
-            now_ns - first.log_time_ns > p.wait_ns
+            now_ns - first.scan.log_time_ns > p.wait_ns
             or len(waiting) > p.max_waiting
-            or sum(scan.size_bytes for scan in waiting) > p.max_waiting_bytes
+            or sum(entry.scan.size_bytes for entry in waiting) > p.max_waiting_bytes
             or (p.eager and self._all_is_there(first.stamp_ns))
         )
 
     def _all_is_there(self, stamp_ns: int) -> bool:
         """Whether what belongs to a scan has arrived: those of further sensors, and odometry or an IMU if
         there is any."""
-        further_ns = [further.newest_ns for further in self._further]
+        further_ns = [further.newest_ns for further in self._placed() if not further.silent]
         known_ns = self.poses.complete_ns()
         needed_ns = max([stamp_ns + self._sweep_ns, *further_ns])
         return all(t >= stamp_ns for t in further_ns) and (known_ns is None or known_ns >= needed_ns)
 
     # --- decoding messages ----------------------------------------------------------------------------
 
-    def _take_scan(self, data: Any, log_time_ns: int) -> None:
-        if not self._part.holds(log_time_ns):
+    def _take_scan(self, topic: TopicInfo, data: Any, log_time_ns: int) -> None:
+        leads = topic == self._topic
+        if leads and not self._part.holds(log_time_ns):
             return
-        self._part.count += 1
         try:
-            message = self._decoders[0].message(data)
-            stamp_ns = self._stamp_of(message, log_time_ns)
+            message: ScanMessage = self._decode[topic](data)
+            sensor = topic, message.header.frame
+            if sensor in self._plan.left_out:
+                return
+            if self._lead == (topic, None):
+                self._lead = sensor
+            leads = sensor == self._lead
+            scan = Received(self._stamp_of(message, log_time_ns), log_time_ns, len(data), message)
+            if leads:
+                self._queue(scan)
+            else:
+                self._take_further(sensor, scan)
         except Pc2GridError as error:
-            self._skip(error)
-            return
-        waiting = _Waiting(stamp_ns, self._part.count, log_time_ns, len(data), message)
+            if leads:
+                self._part.count += 1
+                self._skip(error)
+            else:
+                self._source.tally.skip(f"{topic.topic}: {error.message}")
+
+    def _queue(self, scan: Received) -> None:
+        """Let a scan of the first sensor wait."""
+        self._alone_ns = None
+        self._part.count += 1
+        waiting = _Waiting(scan.stamp_ns, self._part.count, scan, self._decoder_of(self._lead))
         heapq.heappush(self._waiting, waiting)
+
+    def _take_further(self, sensor: _Of, scan: Received) -> None:
+        """Keep a scan for the first sensor's; if that has none for long, this sensor takes its place."""
+        if sensor not in self._further:
+            if len(self._further) >= _MOST_FURTHER:
+                raise PointCloudError(f"scans in more than {_MOST_FURTHER + 1} frames")
+            name = self._add(sensor).name
+            if sensor not in ((s.topic, s.frame) for s in self._plan.sensors):
+                self._source.tally.warn(f"{name}: scans that began later are of a further sensor")
+        further = self._further[sensor]
+        further.take(scan)
+        if self._alone_ns is None:
+            self._alone_ns = scan.log_time_ns
+        if further.silent or scan.log_time_ns - self._alone_ns <= FRAMES.max_gap_ns:
+            return
+        self._source.tally.warn(f"{further.name}: these scans go on alone where the first sensor has none")
+        self._lead = sensor
+        for kept in self._further.pop(sensor).unused():
+            self._queue(kept)
+
+    def _placed(self) -> Collection[FurtherScans]:
+        """The further sensors, if it is known where on the robot they are."""
+        return () if self._plan.sensor_is_base else self._further.values()
+
+    def _add(self, sensor: _Of, *, silent: bool = False) -> FurtherScans:
+        """Add a sensor whose scans are put together with those of the first."""
+        topic, frame = sensor
+        self._further.pop((topic, None), None)
+        of_topic = [s.topic for s in self._plan.sensors].count(topic) > 1 or topic == self._topic
+        name = topic.topic + (f" in frame {frame}" if of_topic else "")
+        self._further[sensor] = FurtherScans(name, self._decoder_of(sensor), silent=silent)
+        return self._further[sensor]
+
+    def _sensor(self, of: _Of) -> Sensor:
+        """What the plan says of a sensor, or of another one on its topic if it is not known there."""
+        alike = [sensor for sensor in self._plan.sensors if sensor.topic == of[0]]
+        return next((sensor for sensor in alike if sensor.frame == of[1]), alike[0])
+
+    def _decoder_of(self, of: _Of) -> ScanDecoder:
+        if of not in self._decoders:
+            self._decoders[of] = self._sensor(of).decoder(
+                self._config,
+                depth_unit_m=self._plan.depth_unit_m,
+                fixed_frame=self._plan.mounted is not None,
+                longest_s=_MOST_PERIODS * self._plan.period_ns * 1e-9 or math.inf,
+            )
+        return self._decoders[of]
 
     def _stamp_of(self, message: ScanMessage, log_time_ns: int) -> int:
         """The stamp of a scan. Raises PointCloudError for one that is none."""
@@ -435,25 +497,26 @@ class Stream:
             raise PointCloudError("stamp is past the year 2262")
         return stamp_ns
 
-    def _take_further(self, further: FurtherScans, data: Any, log_time_ns: int) -> None:
-        try:
-            further.take(data)
-        except Pc2GridError as error:
-            self._source.tally.skip(f"{further.topic.topic}: {error.message}")
-
     def _take_camera(self, camera: TopicInfo | None, found: CameraInfo | None, log_time_ns: int) -> None:
-        for sensor, decoder in zip(self._plan.sensors, self._decoders, strict=True):
-            if sensor.camera == camera:
-                decoder.camera = found or decoder.camera
+        if found is None:
+            return
+        of_camera = {
+            of: decoder for of, decoder in self._decoders.items() if self._sensor(of).camera == camera
+        }
+        frames = {frame for _, frame in of_camera}
+        for (_, frame), decoder in of_camera.items():
+            if found.header.frame == frame or found.header.frame not in frames:
+                decoder.camera = found
 
     # --- yielding scans -------------------------------------------------------------------------------
 
     def _release(self) -> Iterator[Scan]:
         """Yield the waiting scan with the earliest stamp, unless it is skipped."""
         waiting = heapq.heappop(self._waiting)
+        log_time_ns = waiting.scan.log_time_ns
         try:
-            self.stamps.check(waiting.stamp_ns, waiting.log_time_ns, self._waiting)
-            scan = self._scan(waiting.stamp_ns, waiting.message)
+            self.stamps.check(waiting.stamp_ns, log_time_ns, self._waiting)
+            scan = self._scan(waiting.stamp_ns, waiting.scan.message, waiting.decoder)
         except UnsupportedSchema as error:
             if not self._part.good:
                 raise UnsupportedSchema(f"{self._topic.topic}: {error.message}", hint=error.hint) from error
@@ -462,21 +525,21 @@ class Stream:
         except (PointCloudError, LimitExceeded) as error:
             self._skip(error)
             return
-        self.stamps.used(waiting.stamp_ns, waiting.log_time_ns)
+        self.stamps.used(waiting.stamp_ns, log_time_ns)
         if scan.T_odom_base is not None:
             self._last_read_ns = waiting.stamp_ns
         self._part.good += 1
         self._part.returns += len(scan.points_m)
         self._source.tally.scans_read += 1
         self._source.tally.points_dropped += scan.dropped
-        for note in self._decoders[0].notes:
+        for note in itertools.chain(*(decoder.notes for decoder in self._decoders.values())):
             self._source.tally.warn(note)
         yield scan
 
-    def _scan(self, stamp_ns: int, message: ScanMessage) -> Scan:
+    def _scan(self, stamp_ns: int, message: ScanMessage, decoder: ScanDecoder) -> Scan:
         """The scan with all that belongs to it. Raises as `ScanDecoder.scan` does, and FrameError."""
         T_base_points = self.poses.sensor(message.header.frame, stamp_ns)
-        scan = self._decoders[0].scan(message, stamp_ns, T_base_points, self.poses.odometry(stamp_ns))
+        scan = decoder.scan(message, stamp_ns, T_base_points, self.poses.odometry(stamp_ns))
         if self._plan.mounted is not None:
             scan = self._measured(scan, self._plan.mounted)
         # Infinite before the first reading.
@@ -500,11 +563,13 @@ class Stream:
     def _with_further(self, scan: Scan) -> Scan:
         """The scan together with those of the further sensors that are near in time."""
         found = []
-        for further in self._further:
+        for further in self._placed():
             try:
-                found.append(further.near(scan.stamp_ns, self.poses.sensor, self.poses.odometry))
+                near = further.near(scan.stamp_ns, self.poses.sensor, self.poses.odometry)
             except (PointCloudError, LimitExceeded) as error:
-                self._source.tally.skip(f"{further.topic.topic}: {error.message}")
+                self._source.tally.skip(f"{further.name}: {error.message}")
+            else:
+                found += [] if near is None else [near]
         return together(scan, found) if found else scan
 
     def _with_motion(self, scan: Scan) -> Scan:

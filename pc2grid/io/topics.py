@@ -1,10 +1,10 @@
-"""Which topic of a log the scans come from, and which one the odometry."""
+"""Which topic of a log the scans come from, and which others belong to the same robot."""
 
 from __future__ import annotations
 
 import difflib
 import itertools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from pc2grid.errors import NoScans, TopicError, UnsupportedSchema
 from pc2grid.io.message_source import TopicInfo
@@ -132,21 +132,109 @@ def may_be_used(topic: TopicInfo, topics: Sequence[TopicInfo], wanted: str | Non
     return topic.type in (*TF, *ODOMETRY, *IMU, *CAMERA_INFOS) or topic in usable(topics, wanted)
 
 
+def belongs(topic: TopicInfo, scans: TopicInfo, topics: Sequence[TopicInfo]) -> bool | None:
+    """Return whether a topic is of the robot that the scans are of, by their namespaces; None: it may as well
+    be of another robot.
+
+    A namespace with transforms is a robot's, beside others with transforms; but one above it without scans is
+    shared by all. In a namespace without transforms, what stands beside other scans may be of their robot.
+    """
+    return _owner(scans, topics)(topic)
+
+
+def _owner(scans: TopicInfo, topics: Sequence[TopicInfo]) -> Callable[[TopicInfo], bool | None]:
+    """`belongs` for any topic."""
+    roots = {_namespace(t) for t in topics if t.type in TF and t.message_count != 0}
+    of_scans = {_namespace(t) for t in topics if _fits(t, topics)}
+    above_scans = {space[:k] for space in of_scans for k in range(1, len(space) + 1)}
+
+    def root(space: tuple[str, ...]) -> tuple[str, ...] | None:
+        return next((space[:k] for k in range(len(space), -1, -1) if space[:k] in roots), None)
+
+    home, with_scans = root(_namespace(scans)), set(map(root, of_scans))
+    others = {r for r in roots - {home} if home is not None and (home[: len(r)] != r or r in with_scans)}
+
+    def is_own(topic: TopicInfo) -> bool | None:
+        space = _namespace(topic)
+        if (there := root(space)) in others:
+            return False
+        unsure = there != home and (others or (home is None and len(roots) > 1))
+        beside = not is_above(topic, scans) and space[: _shared(topic, scans) + 1] in above_scans
+        return None if unsure or beside else True
+
+    return is_own
+
+
+def rivals(topic: TopicInfo, scans: TopicInfo, topics: Sequence[TopicInfo]) -> list[TopicInfo]:
+    """Return the other topics of scans that a topic stands beside, in a namespace that `scans` is not in."""
+    if is_above(topic, scans):
+        return []
+    branch = _namespace(topic)[: _shared(topic, scans) + 1]
+    return [t for t in topics if _namespace(t)[: len(branch)] == branch and _fits(t, topics)]
+
+
+def is_above(topic: TopicInfo, scans: TopicInfo) -> bool:
+    """Return whether the scans are in the namespace of a topic, or in one below it."""
+    return len(_namespace(topic)) == _shared(topic, scans)
+
+
+def are_namesakes(topic: TopicInfo, other: TopicInfo) -> bool:
+    """Return whether two topics have the same name in two namespaces that stand beside each other."""
+    a, b = (t.topic.lstrip("/").split("/")[_shared(topic, other) :] for t in (topic, other))
+    return len(a) > 1 and a[0] != b[0] and a[1:] == b[1:]
+
+
+def shared_parts(name: str, other: str) -> int:
+    """Return how many parts two names share from the beginning on, without the last part of each: 1 for
+    robot1/odom and robot1/camera/depth."""
+    parts = (n.lstrip("/").split("/")[:-1] for n in (name, other))
+    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
+
+
+def _namespace(topic: TopicInfo) -> tuple[str, ...]:
+    return tuple(topic.topic.lstrip("/").split("/")[:-1])
+
+
+def _shared(topic: TopicInfo, scans: TopicInfo) -> int:
+    return shared_parts(topic.topic, scans.topic)
+
+
+def _nearest(found: Sequence[TopicInfo], scans: TopicInfo, topics: Sequence[TopicInfo]) -> list[TopicInfo]:
+    """Of some topics those that are not another robot's: first those of the robot of the scans, and of these
+    those that share most of its namespace; otherwise in their order."""
+    is_own = _owner(scans, topics)
+    own = (t for t in found if is_own(t) is not False)
+    return sorted(own, key=lambda t: (is_own(t) is None, -_shared(t, scans)))
+
+
+def tf_topics(scans: TopicInfo, topics: Sequence[TopicInfo]) -> list[TopicInfo]:
+    """Return the topics of the transforms that place the sensor of the scans on its robot.
+
+    Of several robots' transforms, a robot's own go before those that all of them share, which may have
+    frames of the same names.
+    """
+    found = _nearest([t for t in topics if t.type in TF and t.message_count != 0], scans, topics)
+    is_own = _owner(scans, topics)
+    own = {is_static(t) for t in found if is_own(t)}
+    return [t for t in found if is_own(t) or is_static(t) not in own]
+
+
+def is_static(topic: TopicInfo) -> bool:
+    """Return whether a tf topic holds transforms that never change (tf2: `tf_static`)."""
+    return topic.topic.endswith("tf_static")
+
+
 def camera_info_topic(image: TopicInfo, topics: Sequence[TopicInfo]) -> TopicInfo:
-    """The CameraInfo that belongs to a depth image: the one with the longest common prefix of names.
+    """Return the CameraInfo that belongs to a depth image: the one that shares most of its namespace.
 
     Raises NoScans if there is none.
     """
-    infos = [t for t in topics if t.type in CAMERA_INFOS]
-    if not infos:
+    infos = sorted((t for t in topics if t.type in CAMERA_INFOS), key=lambda t: t.topic, reverse=True)
+    infos.sort(key=lambda t: "depth" not in t.topic)
+    own = [t for t in _nearest(infos, image, topics) if belongs(t, image, topics)]
+    if not own:
         raise _no_camera_info(image)
-
-    def rank(topic: TopicInfo) -> tuple[int, bool, str]:
-        pairs = zip(image.topic.split("/"), topic.topic.split("/"), strict=False)
-        shared = itertools.takewhile(lambda pair: pair[0] == pair[1], pairs)
-        return len(list(shared)), "depth" in topic.topic, topic.topic
-
-    return max(infos, key=rank)
+    return own[0]
 
 
 def _no_camera_info(image: TopicInfo) -> NoScans:
@@ -156,32 +244,39 @@ def _no_camera_info(image: TopicInfo) -> NoScans:
     )
 
 
-def odometry_topic(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[TopicInfo | None, str]:
-    """The odometry topic or None, and a sentence that says why; odometry in tf is found by `read_plan`.
+def odometry_topics(scans: TopicInfo, topics: Sequence[TopicInfo], wanted: str | None) -> list[TopicInfo]:
+    """Return the topics that may hold the odometry of the robot of the scans, the best first; odometry in tf
+    is found by `read_plan`.
 
     Raises TopicError if `wanted` is missing.
     """
     if wanted is not None:
         named = _named_of(topics, wanted, "odometry", ODOMETRY, TF)
-        return named, f"odometry from {wanted} as asked" if named else "odometry is ignored as asked"
-    candidates = [t for t in topics if t.message_count != 0 and _holds_odometry(t)]
-    if not candidates:
-        return None, "no odometry topic"
-    best = min(candidates, key=lambda t: (t.topic not in ("/odom", "/odometry"), len(t.topic), t.topic))
-    rest = ", ".join(t.topic for t in candidates if t is not best)
-    others = f" (also there: {rest}; --odometry chooses)" if rest else ""
-    return best, f"odometry from {best.topic}{others}"
+        return [named] if named else []
+
+    def rank(topic: TopicInfo) -> tuple[bool, int, str]:
+        name = topic.topic.strip("/").split("/")[_shared(topic, scans) :]
+        return name not in (["odom"], ["odometry"]), len(topic.topic), topic.topic
+
+    return _nearest(sorted(with_odometry(topics), key=rank), scans, topics)
 
 
-def imu_topic(topics: Sequence[TopicInfo], wanted: str | None) -> TopicInfo | None:
-    """The topic of the IMU or None.
+def with_odometry(topics: Sequence[TopicInfo]) -> list[TopicInfo]:
+    """Return the topics that hold the odometry of any robot."""
+    return [t for t in topics if t.message_count != 0 and _holds_odometry(t)]
+
+
+def imu_topics(scans: TopicInfo, topics: Sequence[TopicInfo], wanted: str | None) -> list[TopicInfo]:
+    """Return the topics of IMUs that are on the robot of the scans, the best first.
 
     Raises TopicError if `wanted` is missing.
     """
     if wanted is not None:
-        return _named_of(topics, wanted, "imu", IMU)
-    candidates = [t for t in topics if t.message_count != 0 and t.type in IMU]
-    return min(candidates, key=lambda t: (len(t.topic), t.topic), default=None)
+        named = _named_of(topics, wanted, "imu", IMU)
+        return [named] if named else []
+    found = [t for t in topics if t.message_count != 0 and t.type in IMU]
+    found.sort(key=lambda t: (len(t.topic), t.topic))
+    return _nearest(found, scans, topics)
 
 
 def _named_of(

@@ -136,12 +136,13 @@ class Ros:
         k: ArrayLike | None = None,
         p: ArrayLike | None = None,
         model: str = "plumb_bob",
+        frame: str = "camera_optical",
     ) -> Message:
         """A camera whose axis meets pixel (1, 1), unless k and p say otherwise."""
         usual = [[focal, 0, 1, 0], [0, focal, 1, 0], [0, 0, 1, 0]]
         k, p = (np.array(usual, float)[:, :n] if m is None else m for m, n in ((k, 3), (p, 4)))
         roi = self.make("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
-        header, k, p = self.header(stamp_ns, "camera_optical"), np.ravel(k).astype(float), np.ravel(p)
+        header, k, p = self.header(stamp_ns, frame), np.ravel(k).astype(float), np.ravel(p)
         content = self.make(
             "sensor_msgs/CameraInfo", header, height, width, model, np.asarray(d), k,
             np.eye(3).reshape(-1), p, 0, 0, roi,

@@ -19,7 +19,7 @@ from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io import open_log
 from pc2grid.io.message_source import Choice, LogInfo
-from pc2grid.io.topics import TF, camera_info_topic
+from pc2grid.io.topics import camera_info_topic, tf_topics
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid_cli.console import LOSSY, print_result, warn
@@ -206,7 +206,8 @@ def _show(info: Info) -> None:
         table.add_column(name, justify="right" if name == "messages" else "left", overflow="fold")
     uses: dict[str | None, str] = {}
     if choice is not None:
-        uses = {t.topic: "transforms" for t in info.topics if t.type in TF}
+        scans = next(t for t in info.topics if t.topic == choice.topic)
+        uses = {t.topic: "transforms" for t in tf_topics(scans, info.topics)}
         uses |= {choice.camera_topic: "calibration", choice.imu_topic: "gravity"}
         uses |= {choice.odometry_topic: "odometry", choice.topic: f"scans ({choice.sensor})"}
     for topic in info.topics:
@@ -216,8 +217,9 @@ def _show(info: Info) -> None:
     Console(width=_WIDEST).print(table)
     if choice is not None:
         console.print(f"convert uses {escape(choice.topic)}: {escape(choice.reason)}", soft_wrap=True)
-        frames = f"base frame {choice.base_frame}, scans in frame {choice.sensor_frame or '(unnamed)'}"
-        console.print(escape(frames), soft_wrap=True, highlight=False)
+        frames = ", ".join((choice.sensor_frame or "(unnamed)", *choice.further_frames))
+        where = f"base frame {choice.base_frame}, scans in frame {frames}"
+        console.print(escape(where), soft_wrap=True, highlight=False)
     else:
         console.print(f"convert cannot use this log: {escape(str(info.problem))}", soft_wrap=True)
     for warning in info.warnings:

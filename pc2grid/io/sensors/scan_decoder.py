@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32, F64, I64
 from pc2grid.config import ReadConfig
-from pc2grid.errors import PointCloudError
+from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
 from pc2grid.geometry import pose_from_xyz_quat
 from pc2grid.io.messages.types import CameraInfo, ScanMessage, valid_pose
 from pc2grid.io.sensors import depth, laserscan, pointcloud2
@@ -29,7 +28,7 @@ _UNIT_HINTS: dict[SensorKind, str] = {
 
 
 class ScanDecoder:
-    """Decodes scans of one topic; keeps the camera's calibration between them.
+    """Turns the messages of one sensor into scans; keeps the camera's calibration between them.
 
     notes : sentences for the user. empty : why the last scan without a return has none.
     """
@@ -38,7 +37,6 @@ class ScanDecoder:
         self,
         topic: str,
         sensor: SensorKind,
-        decode: Callable[[Any], Any],
         config: ReadConfig,
         *,
         camera_topic: str = "",
@@ -58,14 +56,15 @@ class ScanDecoder:
         self._depth_unit_m = depth_unit_m
         self._fixed_frame = fixed_frame
         self._sensor = sensor
-        self._decode = decode
         self._config = config
         self._rectified = "rect" in topic
 
-    def message(self, data: Any) -> ScanMessage:
-        """The decoded message, without points. Raises what the decoder raises."""
-        message: ScanMessage = self._decode(data)
-        return message
+    def returns(self, message: ScanMessage) -> int:
+        """Return how many points a message holds; 0 if it cannot be used."""
+        try:
+            return len(self._points(message).xyz_m)
+        except (PointCloudError, LimitExceeded, UnsupportedSchema):
+            return 0
 
     def scan(self, message: ScanMessage, stamp_ns: int, T_base_sensor: F64, T_odom_base: F64 | None) -> Scan:
         """The whole scan. Raises PointCloudError, LimitExceeded or UnsupportedSchema."""

@@ -242,7 +242,7 @@ def test_an_origin_that_is_nowhere() -> None:
     from pc2grid.io.sensors.scan_decoder import ScanDecoder
 
     cloud = parser("bin")(struct.pack("<8f", 1, 2, 3, 0, 2, 3, 4, 0), HEADER)
-    decoder = ScanDecoder("/points", "lidar", lambda data: data, ReadConfig())
+    decoder = ScanDecoder("/points", "lidar", ReadConfig())
     moved = dataclasses.replace(cloud, origin=(1.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0))
     scan = decoder.scan(moved, T0, np.eye(4), None)
     np.testing.assert_allclose(scan.points_m, [[2, 2, 3.5], [3, 3, 4.5]])
@@ -250,6 +250,4 @@ def test_an_origin_that_is_nowhere() -> None:
     with pytest.raises(PointCloudError, match="the origin of the points is not finite"):
         decoder.scan(nowhere, T0, np.eye(4), None)
     with pytest.raises(PointCloudError, match="every point is farther than 1 m"):
-        ScanDecoder("/points", "lidar", lambda data: data, ReadConfig(max_range_m=1.0)).scan(
-            cloud, T0, np.eye(4), None
-        )
+        ScanDecoder("/points", "lidar", ReadConfig(max_range_m=1.0)).scan(cloud, T0, np.eye(4), None)

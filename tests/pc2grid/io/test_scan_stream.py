@@ -96,7 +96,7 @@ def test_what_waits_for_its_turn_is_bounded_in_bytes(
     monkeypatch.setattr(
         scan_stream.Stream,
         "_take_scan",
-        lambda self, data, time: (seen.append(time), take(self, data, time))[1],
+        lambda self, topic, data, time: (seen.append(time), take(self, topic, data, time))[1],
     )
     path = write_mcap(tmp_path / "a.mcap", [cloud(T0 + i * 1_000_000) for i in range(20)])
     with open_log(path) as log:
