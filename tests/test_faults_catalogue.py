@@ -352,6 +352,33 @@ def one_of_two_lidars(folder: Path) -> str:
     return two_lidars(folder) + " --topic /points"
 
 
+def second_robot(*topics: str, tf: bool = True) -> list[Message]:
+    """Of a robot whose frames have the same names: its mount (tf), and what else it has."""
+    mount = ros().tf(T0, "base_link", "lidar", -0.4, quaternion=(0, 0, 1, 0), topic="/robot2/tf_static")
+    others = [*CLOUDS, *(ros().odometry("/odom", T0 + i * STEP, -0.3 * i) for i in range(SCANS))]
+    named = [m._replace(topic="/robot2" + m.topic) for m in others if m.topic in topics]
+    return [mount, *named] if tf else named
+
+
+@fault(15, 0, None, "odometry from /odom (also there: /robot2/odom; --odometry chooses)", same=True)
+def one_of_two_robots(folder: Path) -> str:
+    log(folder, recording(CLOUDS, *second_robot("/points", "/odom")))
+    return CONVERT + " --topic /points"
+
+
+@fault(15, 1, errors.TopicError, "/points and /robot2/points are of two robots", "--topic /points")
+def two_robots_together(folder: Path) -> str:
+    log(folder, recording(CLOUDS, *second_robot("/points")))
+    return CONVERT + " --topic /points,/robot2/points"
+
+
+@fault(15, 1, errors.TopicError, "it cannot be told whether this odometry", "/robot2/odom", "--odometry none")
+def odometry_of_another_robot(folder: Path) -> str:
+    other = second_robot("/points", "/odom", tf=False)
+    log(folder, sorted([MOUNT, *CLOUDS, *other], key=lambda m: m.log_time_ns))
+    return CONVERT + " --topic /points"
+
+
 @fault(16, 1, errors.NoScans, "/points (sensor_msgs/PointCloud2)", "no message in the log")
 def topic_without_messages(folder: Path) -> str:
     raw_log(folder / "log.mcap", [("/points", CLOUD, "ros2msg", ros().schema(CLOUDS[0].type), b"")])
@@ -596,6 +623,23 @@ def frame_empty(folder: Path) -> str:
 @fault(35, 1, errors.FrameError, "frame rear", "frames in the log: base_link, lidar")
 def frame_that_changes(folder: Path) -> str:
     log(folder, changed(lambda i: cloud(i, frame="rear") if i > 6 else None))
+    return CONVERT
+
+
+@fault(35, 0, None, same=True)
+def two_sensors_on_one_topic(folder: Path) -> str:
+    mount = ros().tf(T0, "base_link", "rear", 0.25, topic="/tf_static")
+    parts = np.split(np.stack([planar_scan(0.1 * i + 0.2) for i in range(SCANS)]), [500], axis=1)
+    front = [cloud(i, parts[0][i]) for i in range(SCANS)]
+    rear = [cloud(i, parts[1][i], frame="rear") for i in range(SCANS)]
+    log(folder, recording([*front, *rear], mount))
+    return CONVERT
+
+
+@fault(35, 0, None, "frame blind of /points is left out", "its scans hold no return", same=True)
+def a_dead_driver_on_the_same_topic(folder: Path) -> str:
+    blind = [cloud(i, np.empty((0, 3), "f4"), frame="blind", stamp=i * STEP + 1) for i in range(SCANS)]
+    log(folder, recording([*blind, *CLOUDS]))
     return CONVERT
 
 
