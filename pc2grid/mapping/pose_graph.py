@@ -1,8 +1,9 @@
 """Sparse least squares over planar poses with robust edges.
 
-The manifold Gauss-Newton of Grisetti et al., "A tutorial on graph-based SLAM" (2010), section IV, with
-Cauchy weights on the edges that may be wrong. In the plane it needs 3 numbers a pose where Open3D's
-optimiser has 6, uses each edge's information as it was measured, and needs no Open3D for a 2D laser.
+The manifold Gauss-Newton of Grisetti et al., "A tutorial on graph-based SLAM" (2010), section IV. Cauchy
+weights tell which of the edges that may be wrong are right, and those solve the graph. In the plane it needs
+3 numbers a pose where Open3D's optimiser has 6, uses each edge's information as it was measured, and needs no
+Open3D for a 2D laser.
 It was measured against Open3D's `global_optimization` (`docs/method.md`).
 """
 
@@ -14,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_matrix, csc_matrix, identity
-from scipy.sparse.linalg import spsolve
+from scipy.sparse.linalg import splu
 
 from pc2grid.arrays import F64
 from pc2grid.geometry import SE2, wrap_angle
@@ -25,10 +26,14 @@ from pc2grid.mapping.building_axes import WallDirection, pull_to_axes
 class PoseGraphParameters:
     """Numbers of the optimisation; chosen by hand.
 
-    iterations : at most. converged : largest change of a coordinate, metres and radians, that ends them.
+    iterations : of each of the two rounds, at most. converged : largest change of a coordinate, metres and
+        radians, that ends them.
     damping : added to the diagonal of the normal equations, so that they can always be solved.
     robust_sigmas : standard deviations at which a loop edge has half of its weight.
     annealing : factor by which the robust scale of loops shrinks in each iteration.
+    kept : share of its weight with which a loop still counts in full, when the graph is solved again: that
+        which is left at a chi-square of three `robust_sigmas` squared, 27. Of true loops, which have three
+        degrees of freedom, six in a million are farther off.
     """
 
     iterations: int = 25
@@ -36,6 +41,7 @@ class PoseGraphParameters:
     damping: float = 1e-6
     robust_sigmas: float = 3.0
     annealing: float = 3.0
+    kept: float = 0.25
 
 
 POSE_GRAPH = PoseGraphParameters()
@@ -59,7 +65,8 @@ class Edge:
 class Solution:
     """The poses that agree best with the edges.
 
-    poses : (N, 3) x, y, yaw. accepted : (E,) False for loops that lost more than half of their weight.
+    poses : (N, 3) x, y, yaw. accepted : (E,) False for loops that contradict the poses by more than
+    `PoseGraphParameters.robust_sigmas`.
     """
 
     poses: F64
@@ -77,9 +84,13 @@ def optimise(
     walls : of each pose, where the building's axes constrain the headings; see
         `pc2grid.mapping.building_axes`.
 
-    The robust scale of a loop that contradicts the poses starts so large that it has half of its weight, and
-    shrinks to its final value during the iterations (graduated non-convexity, Yang et al. 2020): large drift
-    is taken out by loops that agree, and a false loop is outvoted.
+    First, Cauchy weights say which loops agree. The robust scale of a loop that contradicts the poses starts
+    so large that it has half of its weight, and shrinks to its final value during the iterations (graduated
+    non-convexity, Yang et al. 2020): large drift is taken out by loops that agree, and a false loop is
+    outvoted. But together false loops still pull, each by the inverse of its error. So the graph is solved
+    again with fixed weights. A loop that has kept `kept` of its weight counts in full; beyond, its pull falls
+    with the third power of its error. There is no edge of being dropped at which a map would hang on the last
+    bit of a number.
     """
     poses = np.array(poses, dtype=np.float64)
     if not edges or len(poses) < 2:
@@ -92,19 +103,24 @@ def optimise(
     error, jacobian = _linearise(poses, i, j, measured)
     chi2 = np.einsum("ea,eab,eb->e", error, information, error)
     scale = np.maximum(chi2 / limit, 1.0)
-    for _ in range(parameters.iterations):
-        weight = np.where(loop, 1.0 / (1.0 + chi2 / (scale * limit)), 1.0)
-        JtO = jacobian.transpose(0, 2, 1) @ (information * weight[:, None, None])
-        H, g = _normal_equations(poses, rows, JtO, jacobian, error, walls)
-        delta = np.zeros(3 * len(poses))
-        delta[3:] = spsolve(H[3:, 3:] + damping, -g[3:])
-        poses += delta.reshape(-1, 3)
-        poses[:, 2] = wrap_angle(poses[:, 2])
-        error, jacobian = _linearise(poses, i, j, measured)
-        chi2 = np.einsum("ea,eab,eb->e", error, information, error)
-        if scale.max() == 1.0 and np.abs(delta).max() < parameters.converged:
-            break
-        scale = np.maximum(scale / parameters.annealing, 1.0)
+    fixed: F64 | None = None
+    for _ in range(2):
+        for _ in range(parameters.iterations):
+            weight = 1.0 / (1.0 + chi2 / (scale * limit)) if fixed is None else fixed
+            JtO = jacobian.transpose(0, 2, 1) @ (information * np.where(loop, weight, 1.0)[:, None, None])
+            H, g = _normal_equations(poses, rows, JtO, jacobian, error, walls)
+            delta = np.zeros(3 * len(poses))
+            # Ordered and pivoted as a symmetric matrix: 2,000 poses take 0.8 s in place of 1.8.
+            factors = splu(H[3:, 3:] + damping, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            delta[3:] = factors.solve(-g[3:])
+            poses += delta.reshape(-1, 3)
+            poses[:, 2] = wrap_angle(poses[:, 2])
+            error, jacobian = _linearise(poses, i, j, measured)
+            chi2 = np.einsum("ea,eab,eb->e", error, information, error)
+            if scale.max() == 1.0 and np.abs(delta).max() < parameters.converged:
+                break
+            scale = np.maximum(scale / parameters.annealing, 1.0)
+        fixed = np.minimum(1.0 / (1.0 + chi2 / limit) / parameters.kept, 1.0) ** 2
     return Solution(poses, ~loop | (chi2 <= limit))
 
 
