@@ -12,7 +12,6 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import Config, PartitionConfig
 from pc2grid.errors import NoScans
 from pc2grid.estimation.carried import begin
-from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframe_points import KeyframePoints
@@ -70,9 +69,9 @@ def follow(
 def _followed(
     scans: Iterable[Scan], config: Config, observer: Observer
 ) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
-    tracker = Tracker(config.registration, config.projection)
     rest = iter(scans)
     beginning = begin(rest)
+    tracker = Tracker(config.registration, config.projection, in_hand=beginning.in_hand)
     if beginning.warning is not None:
         observer.on_warning(beginning.warning)
     for scan in chain(beginning.scans, rest):
@@ -228,7 +227,6 @@ def _map(
     first = beginning.scans[:1]  # a recording has one kind of sensor
     narrow = any(SENSOR_MODELS[scan.sensor].narrow for scan in first)
     planar = any(SENSOR_MODELS[scan.sensor].planar for scan in first)
-    in_hand = not all(is_rolling(scan) for scan in first)
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
         points = None
@@ -239,10 +237,10 @@ def _map(
             keyframes,
             recognizer=recognizer,
             projection=projection,
-            parameters=EXACT_TRACKING if narrow or in_hand else LOOPS,
+            parameters=EXACT_TRACKING if narrow or beginning.in_hand else LOOPS,
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
-        tracker = Tracker(config.registration, config.projection)
+        tracker = Tracker(config.registration, config.projection, in_hand=beginning.in_hand)
         record = _track(chain(beginning.scans, rest), tracker, closer, points, observer)
         track = record.track(beginning.left_out, beginning.warning)
         closed = closer.finish()

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 
@@ -21,14 +21,15 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.upright import level_floor
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.estimation.belief import KERNEL, SPATIAL, Belief
-from pc2grid.estimation.ground_model import is_rolling
+from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
 from pc2grid.estimation.manifold import moved, steps
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placing import Estimate, Fit
 from pc2grid.estimation.space_map import SpaceMap, ThinnedScan
 from pc2grid.estimation.surface_map import SURFACES, Placement
-from pc2grid.geometry import SE2, leveling
+from pc2grid.geometry import invert_pose, leveling, motion_size
 from pc2grid.model import Scan
+from pc2grid.sensor_model import SENSOR_MODELS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,7 +41,7 @@ class CarriedParameters:
     residual_weight_per_m : of two placements the one with the larger agreement - weight * residual is taken.
     starts : placements that a search refines in space. turned_rad : by how much these may be turned, a
         standard deviation: more than a step of the search.
-    most_waiting : scans that wait for one that shows the floor, at most: some 50 MB.
+    most_waiting : scans that wait for one that shows the floor, or for a motion, at most: some 50 MB.
     """
 
     least_agreement: float = 0.85
@@ -80,11 +81,10 @@ class CarriedSensor:
         """Forget the map: the next scan begins a new one."""
         self._map = None
 
-    def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
-        """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
-        levelled."""
+    def start(self, scan: Scan, points_m: F32) -> F64:
+        """See `PlacingSensor`."""
         self.take(scan, points_m)
-        return at.lift() @ first_pose(scan, points_m)
+        return first_pose(scan, points_m)
 
     def levelled(self, pose: F64) -> F64:
         """A pose (4, 4) in space has its tilt and its height already."""
@@ -191,33 +191,66 @@ def first_pose(scan: Scan, points_m: F32) -> F64:
 class Beginning:
     """The first scans of a session, of which none is missing but those `left_out`.
 
+    in_hand : how the sensor is carried: in the hand, else on wheels. All stages are given this.
     warning : what was left out, or assumed, as a sentence for the user; None: nothing.
     """
 
     scans: Sequence[Scan]
+    in_hand: bool = False
     left_out: int = 0
     warning: str | None = None
 
 
 def begin(scans: Iterator[Scan], parameters: CarriedParameters = CARRIED) -> Beginning:
-    """Take scans up to the first that shows which way is up: with it a session begins.
+    """Look ahead until it is known how the sensor is carried, and in the hand, which way is up.
 
-    If none of the first scans does, all of them are kept: the sensor is taken to be held level.
+    A session in the hand begins with the first scan that shows which way is up. If none of the first scans
+    does, all of them are kept: the sensor is taken to be held level.
+    """
+    ahead = islice(scans, parameters.most_waiting)
+    waiting, in_hand = _until_decided(ahead)
+    if not in_hand:
+        return Beginning(waiting)
+    unknown = "no floor, and neither odometry nor an IMU says which way is up"
+    seen: list[Scan] = []
+    for scan in chain(waiting, ahead):
+        if _knows_vertical(scan):
+            said = f"{len(seen)} scans show {unknown}: they are left out; begin with the floor in view"
+            rest = [scan, *waiting[len(seen) + 1 :]]
+            return Beginning(rest, True, len(seen), said if seen else None)
+        seen.append(scan)
+    said = f"the scans show {unknown}: the sensor is taken to be held level; begin with the floor in view"
+    return Beginning(seen, True, warning=said)
+
+
+def _until_decided(scans: Iterator[Scan]) -> tuple[list[Scan], bool]:
+    """Take scans until they tell whether the sensor is in the hand; returns them, and whether it is.
+
+    A hand that stands still, or a phone on a table, may be level. So only scans count after which the base
+    has moved, or of which that is not known.
     """
     waiting: list[Scan] = []
-    unknown = "no floor, and neither odometry nor an IMU says which way is up"
-    for scan in islice(scans, parameters.most_waiting):
+    moving = 0
+    for scan in scans:
         waiting.append(scan)
-        if not _knows_vertical(scan):
-            continue
-        left_out = len(waiting) - 1
-        said = f"{left_out} scans show {unknown}: they are left out; begin with the floor in view"
-        return Beginning([scan], left_out, said if left_out else None)
-    said = f"the scans show {unknown}: the sensor is taken to be held level; begin with the floor in view"
-    return Beginning(waiting, warning=said if waiting else None)
+        if not is_rolling(scan, waiting[0]):
+            return waiting, True
+        moving += _has_moved(waiting[0], scan)
+        if SENSOR_MODELS[scan.sensor].planar or moving == DECIDING_SCANS:
+            break
+    return waiting, False
+
+
+def _has_moved(first: Scan, scan: Scan) -> bool:
+    """Whether a base has moved since the first scan as far as makes a keyframe, unless that is not known."""
+    if first.T_odom_base is None or scan.T_odom_base is None:
+        return True
+    distance_m, turn_rad = motion_size(invert_pose(first.T_odom_base) @ scan.T_odom_base)
+    p = TRACKING_PARAMETERS
+    return distance_m >= p.keyframe_travel_m or turn_rad >= p.keyframe_turn_rad
 
 
 def _knows_vertical(scan: Scan) -> bool:
-    """Whether it is on wheels, or odometry, an IMU or a floor in view tells the vertical."""
+    """Whether odometry, an IMU or a floor in view tells the vertical."""
     known = scan.T_odom_base is not None or scan.T_level_base is not None
-    return known or is_rolling(scan) or level_floor(scan, scan.points_m) is not None
+    return known or level_floor(scan, scan.points_m) is not None

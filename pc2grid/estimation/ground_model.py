@@ -18,7 +18,8 @@ _UPRIGHT_HEIGHT_M, _UPRIGHT_TILT_RAD = 0.05, math.radians(0.5)
 dimensions says a few tenths of a degree; a phone in the hand (depth/room) 0.8 to 6.5 degrees within a second.
 Without odometry, a sensor that is mounted lower than this above its base is in the hand."""
 DECIDING_SCANS = 20
-"""So many scans decide whether a base is on wheels; what tilts and rises later is on a ramp. By hand."""
+"""So many scans of a base that moves decide whether it is on wheels; what tilts and rises later is on a ramp.
+By hand."""
 
 
 class GroundModel:

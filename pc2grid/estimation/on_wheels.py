@@ -54,16 +54,15 @@ class SensorOnWheels:
         self._points_m, self._unaided = np.empty((0, 3), np.float32), True
         self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)
 
-    def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
-        """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
-        levelled."""
+    def start(self, scan: Scan, points_m: F32) -> F64:
+        """See `PlacingSensor`."""
         self._floor = GroundModel.start(points_m, scan, self._parameters)
         narrow = SENSOR_MODELS[scan.sensor].narrow  # the sensor sees a part of its surroundings only
         self._matching = CAMERA_MATCHING if narrow else MATCHING_PARAMETERS
         self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         self._points_m = self._floor.remove(points_m)
         self._planar_scan = self._project(scan, points_m)
-        return self.levelled(at.lift())
+        return self.levelled(np.eye(4))
 
     def restart(self) -> None:
         """Forget the local maps: the next keyframe begins new ones."""

@@ -20,7 +20,6 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.estimation.belief import KERNEL, Belief
 from pc2grid.estimation.manifold import steps
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.geometry import SE2
 from pc2grid.model import Scan
 
 Estimate = tuple[F64, F64]
@@ -56,9 +55,8 @@ class PlacingSensor(Protocol):
 
     free: tuple[int, ...]
 
-    def start(self, scan: Scan, points_m: F32, at: SE2) -> F64:
-        """Begin with a scan whose base is at a place of the session frame; returns its pose (4, 4),
-        levelled."""
+    def start(self, scan: Scan, points_m: F32) -> F64:
+        """Begin with the first scan; returns its pose (4, 4): the session frame is its base, levelled."""
 
     def take(self, scan: Scan, points_m: F32) -> None:
         """Take in a scan."""

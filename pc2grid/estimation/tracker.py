@@ -19,9 +19,8 @@ from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.estimation.belief import SPATIAL, Belief
+from pc2grid.estimation.belief import Belief
 from pc2grid.estimation.carried import CarriedSensor
-from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
 from pc2grid.estimation.health import HealthJudge
 from pc2grid.estimation.odometer import Odometer
 from pc2grid.estimation.on_wheels import SensorOnWheels
@@ -63,42 +62,31 @@ class Tracker:
         registration: RegistrationConfig,
         projection: ProjectionConfig | None = None,
         parameters: TrackingParameters = TRACKING_PARAMETERS,
+        *,
+        in_hand: bool,
     ) -> None:
+        """in_hand : how the sensor is carried; `pc2grid.estimation.carried.begin` finds it out."""
         self._config = registration
-        self._projection = projection or ProjectionConfig()
         self._parameters = parameters
-        self._first: Scan | None = None
-        self._count = 0  # scans since the first one
         self._last: Scan | None = None
         self._odometer = Odometer(parameters=parameters)
         self._keyframe: SE2 | None = None  # where the last one was
         self._restarted = False  # no keyframe has been reported since tracking started again
-        # These three depend on how the sensor is carried; `start` makes them from the first scan.
-        self._sensor: PlacingSensor = SensorOnWheels(registration, self._projection, parameters)
-        self._smoother = Smoother()
+        self._in_hand = in_hand
+        projection = projection or ProjectionConfig()
+        self._sensor: PlacingSensor
+        if in_hand:
+            self._sensor = CarriedSensor(registration, projection)
+        else:
+            self._sensor = SensorOnWheels(registration, projection, parameters)
+        self._smoother = Smoother(self._sensor.free, IN_THE_HAND if in_hand else SMOOTHER)
         self._health = HealthJudge(parameters)
-
-    @property
-    def carried(self) -> bool:
-        """Whether the sensor is in the hand."""
-        return self._sensor.free == SPATIAL
 
     def start(self, scan: Scan) -> Tracked:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
-        self._first, self._count = scan, 0
-        return self._begin(scan, SE2(), rolling=is_rolling(scan))
-
-    def _begin(self, scan: Scan, at: SE2, *, rolling: bool) -> Tracked:
-        """Begin with a scan whose base is at a place of the session frame, on wheels or in the hand."""
-        self._keyframe, self._odometer = None, Odometer(scan.stamp_ns, self._parameters)
+        self._odometer = Odometer(scan.stamp_ns, self._parameters)
         points = self._deskewed(scan, np.eye(4), 1.0)
-        if rolling:
-            self._sensor = SensorOnWheels(self._config, self._projection, self._parameters)
-        else:
-            self._sensor = CarriedSensor(self._config, self._projection)
-        self._health = HealthJudge(self._parameters)
-        pose = self._sensor.start(scan, points, at)
-        self._smoother = Smoother(self._sensor.free, SMOOTHER if rolling else IN_THE_HAND)
+        pose = self._sensor.start(scan, points)
         self._smoother.start(self._flat(pose), self._reading(scan))
         return self._finish(scan, points, pose, Health.FINE)
 
@@ -114,9 +102,6 @@ class Tracker:
         expected = [self._smoother.after(*steady)]
         if reading is not None and reported is not None:
             expected.insert(0 if continues else 1, self._smoother.by_odometry(reading))
-        self._count += 1
-        if not self.carried and self._count < DECIDING_SCANS and not is_rolling(scan, self._first):
-            return self._begin(scan, SE2.from_matrix(expected[0].pose), rolling=False)
         # 2. Undo the motion within the scan.
         motion = invert_pose(self._smoother.belief.pose) @ expected[0].pose
         points = self._deskewed(scan, motion, seconds)
@@ -144,7 +129,7 @@ class Tracker:
         """What the pose of a scan is worth."""
         read = evidence.T_odom_base is not None
         bridged = placed.motion is not None or (read and evidence.continues)
-        unaided = estimate if self.carried and not read else None
+        unaided = estimate if self._in_hand and not read else None
         return self._health.judge(placed, unaided, bridged=bridged)
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
@@ -187,7 +172,7 @@ class Tracker:
 
     def _flat(self, pose: F64) -> F64:
         """A pose (4, 4) in the directions that are free: on wheels those of the plane."""
-        return pose if self.carried else SE2.from_matrix(pose).lift()
+        return pose if self._in_hand else SE2.from_matrix(pose).lift()
 
     def _reading(self, scan: Scan) -> F64 | None:
         """The reading (4, 4) of odometry at a scan."""
@@ -197,7 +182,7 @@ class Tracker:
         """The turn (4, 4) of a sensor in the hand since the last scan, by its IMU; None if that is not known,
         and beside odometry."""
         before = None if self._last is None else self._last.T_level_base
-        unaided = self.carried and scan.T_odom_base is None
+        unaided = self._in_hand and scan.T_odom_base is None
         if not unaided or before is None or scan.T_level_base is None:
             return None
         return invert_pose(before) @ scan.T_level_base

@@ -79,5 +79,5 @@ def test_the_tracker_asks_it_for_cameras_only(sensor: SensorKind, odometry: bool
         sensor=sensor,
         T_odom_base=np.eye(4) if odometry else None,
     )
-    hits_m = Tracker(RegistrationConfig()).track(scan).planar_scan.hits_m
+    hits_m = Tracker(RegistrationConfig(), in_hand=False).track(scan).planar_scan.hits_m
     assert bool((hits_m[:, 0] > LIMIT_M - 0.08).any()) is left

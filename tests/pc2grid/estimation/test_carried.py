@@ -8,18 +8,23 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from pc2grid import pipeline
 from pc2grid.arrays import F64
 from pc2grid.clouds.upright import level_floor
 from pc2grid.config import Config, RegistrationConfig
 from pc2grid.estimation.carried import CARRIED, begin, first_pose
+from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
+from pc2grid.mapping.loop_closure import LoopCloser
+from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LoopParameters
 from pc2grid.model import Health, OccupancyGrid, Scan
 from pc2grid.observer import Observer
 from pc2grid.pipeline import follow, map_scans
@@ -108,9 +113,9 @@ def recorded() -> list[tuple[Scan, F64]]:
     return list(images(room(), hand(80)))
 
 
-def tracked(scans: list[Scan]) -> tuple[list[Tracked], Tracker]:
-    tracker = Tracker(RegistrationConfig())
-    return [tracker.track(scan) for scan in scans], tracker
+def tracked(scans: list[Scan]) -> list[Tracked]:
+    tracker = Tracker(RegistrationConfig(), in_hand=True)
+    return [tracker.track(scan) for scan in scans]
 
 
 def error_m(found: list[Tracked], truth: list[F64]) -> float:
@@ -131,10 +136,39 @@ def grid_in_the_room(scans: list[Scan], first: F64) -> tuple[OccupancyGrid, F64]
 def test_a_camera_in_the_hand_is_followed_with_its_odometry(recorded: list[tuple[Scan, F64]]) -> None:
     """6 m of travel with exact odometry: what is left is the noise of coarse images, half a percent."""
     scans, truth = zip(*recorded, strict=True)
-    found, tracker = tracked(list(scans))
-    assert tracker.carried
+    found = tracked(list(scans))
+    assert begin(iter(scans)).in_hand
     assert not any(one.registered.health is Health.LOST for one in found)
     assert error_m(found, list(truth)) < 0.05
+
+
+def test_a_sensor_that_is_level_at_first_is_in_the_hand_for_every_stage(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """For half a second it is held level, then as by any hand."""
+    held = hand(20)
+    yaw_rad = math.atan2(held[0][1, 0], held[0][0, 0])
+    upright = pose_from_rotation_vector((0.0, 0.0, yaw_rad), held[0][:3, 3])
+    poses = [upright] * 5 + held
+    scans = [dataclasses.replace(scan, sensor="lidar") for scan, _ in images(room(), poses)]
+    assert is_rolling(scans[0])
+    weighted: list[LoopParameters] = []
+
+    class Watched(LoopCloser):
+        def __init__(self, *given: Any, **named: Any) -> None:
+            weighted.append(named["parameters"])
+            super().__init__(*given, **named)
+
+    monkeypatch.setattr(pipeline, "LoopCloser", Watched)
+    _, trajectory, _ = map_scans(scans, Config())
+    assert weighted == [EXACT_TRACKING]
+    in_session = trajectory.T_session_base
+    for k in range(
+        len(scans) - 1
+    ):  # in space from its first scan on: on wheels it has neither tilt nor height
+        found, true = (invert_pose(T[k]) @ T[k + 1] for T in (in_session, poses))
+        distance_m, turn_rad = motion_size(invert_pose(found) @ true)
+        assert distance_m < 0.05 and turn_rad < math.radians(2.0)
 
 
 def test_odometry_that_drifts_is_corrected(recorded: list[tuple[Scan, F64]]) -> None:
@@ -146,7 +180,7 @@ def test_odometry_that_drifts_is_corrected(recorded: list[tuple[Scan, F64]]) -> 
         step[:3, 3] *= 1.02
         turn = pose_from_rotation_vector((0.0, 0.0, math.radians(0.5) * motion_size(step)[0]))
         drift.append(drift[-1] @ turn @ step)
-    found, _ = tracked([dataclasses.replace(s, T_odom_base=T) for s, T in zip(scans, drift, strict=True)])
+    found = tracked([dataclasses.replace(s, T_odom_base=T) for s, T in zip(scans, drift, strict=True)])
     alone = max(float(np.linalg.norm((a - b)[:3, 3])) for a, b in zip(drift, truth, strict=True))
     assert alone > 0.08
     assert error_m(found, list(truth)) < 0.9 * alone
@@ -175,7 +209,7 @@ def test_the_floor_is_free_the_table_is_no_wall_and_walls_are(recorded: list[tup
 
 def test_the_same_scans_give_the_same_bytes(recorded: list[tuple[Scan, F64]]) -> None:
     scans = [scan for scan, _ in recorded][:20]
-    first, second = (tracked(scans)[0] for _ in range(2))
+    first, second = (tracked(scans) for _ in range(2))
     for a, b in zip(first, second, strict=True):
         assert a.registered.T_session_base.tobytes() == b.registered.T_session_base.tobytes()
         assert a.planar_scan.hits_m.tobytes() == b.planar_scan.hits_m.tobytes()
@@ -195,10 +229,10 @@ def along_a_bare_wall(count: int) -> tuple[list[Scan], list[F64]]:
 def test_along_a_bare_wall_nothing_is_known_without_odometry() -> None:
     """Each image fits the last ones wherever it is put along the wall. Odometry knows how fast it goes."""
     scans, passing = along_a_bare_wall(30)
-    with_it, _ = tracked(scans)
+    with_it = tracked(scans)
     assert not any(one.registered.health is Health.LOST for one in with_it)
     assert error_m(with_it, passing) < 0.05
-    without, _ = tracked([dataclasses.replace(scan, T_odom_base=None) for scan in scans])
+    without = tracked([dataclasses.replace(scan, T_odom_base=None) for scan in scans])
     lost = [one.registered.health is Health.LOST for one in without]
     assert sum(lost) > 3
 
@@ -221,7 +255,7 @@ def test_along_a_bare_wall_no_part_is_longer_than_its_pose_is_known() -> None:
 
 
 def test_in_a_furnished_room_the_pose_is_known_without_odometry(recorded: list[tuple[Scan, F64]]) -> None:
-    found, _ = tracked([dataclasses.replace(scan, T_odom_base=None) for scan, _ in recorded])
+    found = tracked([dataclasses.replace(scan, T_odom_base=None) for scan, _ in recorded])
     health = [one.registered.health for one in found]
     assert health.count(Health.FINE) > 0.5 * len(found) and health.count(Health.LOST) < 0.1 * len(found)
 
@@ -249,10 +283,10 @@ def test_a_start_that_shows_no_floor_is_levelled_by_the_imu() -> None:
     wrong = pose_from_rotation_vector((0.0, math.radians(2.0), 0.0)) @ pose_from_rotation_vector((0, 0, 2.5))
     scans = [dataclasses.replace(s, T_odom_base=None) for s, _ in images(room(), poses)]
     felt = [dataclasses.replace(s, T_level_base=level(wrong @ T)) for s, T in zip(scans, poses, strict=True)]
-    by_imu, _ = tracked(felt)
+    by_imu = tracked(felt)
     for one, true in zip(by_imu, poses, strict=True):
         assert tilt_deg(one.registered.T_session_base, true) < 3.0  # its error, and some of tracking
-    without, _ = tracked(scans)
+    without = tracked(scans)
     assert tilt_deg(without[0].registered.T_session_base, poses[0]) > 20.0  # taken to be held level
 
 
@@ -370,8 +404,7 @@ def test_sixteen_rings_in_the_hand_of_somebody_who_walks_need_the_gyroscope() ->
     worst_deg = []
     for with_imu in (True, False):
         silent = {} if with_imu else {"T_level_base": None, "T_first_last": None}
-        found, tracker = tracked([dataclasses.replace(scan, **silent) for scan in scans])
-        assert tracker.carried
+        found = tracked([dataclasses.replace(scan, **silent) for scan in scans])
         poses = [one.registered.T_session_base for one in found]
         worst_deg.append(max(tilt_deg(a, b) for a, b in zip(poses, truth, strict=True)))
     assert worst_deg[0] < 3.0
@@ -390,7 +423,7 @@ def test_the_rooms_of_a_phone(name: str, with_odometry: bool, limit_m: float) ->
         scans = list(log.scans())
     truth = read_tum(ROOMS / f"{name}.tum")
     seen = [s if with_odometry else dataclasses.replace(s, T_odom_base=None) for s in scans]
-    found, _ = tracked(seen)
+    found = tracked(seen)
     at = np.searchsorted(truth.stamps_ns, [s.stamp_ns for s in scans]).clip(max=len(truth) - 1)
     ours = np.array([one.registered.T_session_base[:3, 3] for one in found])
     true = truth.T_session_base[at, :3, 3]

@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
-from pc2grid.config import RegistrationConfig
+from pc2grid.estimation.carried import Beginning, begin
 from pc2grid.estimation.ground_model import GroundModel, is_rolling
-from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import pose_from_rotation_vector
 from pc2grid.model import Scan
 from pc2grid.simulate import SimulationConfig, iter_session
@@ -96,16 +95,30 @@ def moved(scan: Scan, height_m: float, pitch_deg: float) -> Scan:
         (lambda k: 0.01, lambda k: 0.3 * math.sin(k), False),  # pitch of an EKF
         (lambda k: 0.01, lambda k: 0.0 if k < 5 else 4.0, True),  # a hand that begins level
         (lambda k: 0.02 * k, lambda k: 0.0, True),  # and one that lifts the sensor
-        (lambda k: 0.0, lambda k: 0.0 if k < 25 else 7.0, False),  # a ramp after some seconds
+        (lambda k: 0.0, lambda k: 0.0 if k < 30 else 7.0, False),  # a ramp after some seconds
     ],
 )
-def test_several_scans_decide_whether_a_robot_is_on_wheels(
-    height_m: Callable[[int], float], pitch_deg: Callable[[int], float], carried: bool
+@pytest.mark.parametrize("standing", [0, 40])
+def test_the_scans_of_the_first_metres_decide_whether_a_robot_is_on_wheels(
+    standing: int,
+    height_m: Callable[[int], float],
+    pitch_deg: Callable[[int], float],
+    carried: bool,
 ) -> None:
     small = LidarConfig(rate_hz=5.0, columns=300)
     config = SimulationConfig(length_m=4.0, seed=3, clutter=0, lidar=small)
-    tracker, k = Tracker(RegistrationConfig()), -1
-    for k, (scan, _) in enumerate(iter_session(sensor="lidar", config=config)):
-        tracker.track(moved(scan, height_m(k), pitch_deg(k)))
-    assert k > 25
-    assert tracker.carried == carried
+    driven = [scan for scan, _ in iter_session(sensor="lidar", config=config)]
+    scans = [moved(scan, height_m(k), pitch_deg(k)) for k, scan in enumerate(driven)]
+    assert len(scans) > 35
+    beginning = begin(iter([scans[0]] * standing + scans))
+    assert beginning.in_hand == carried
+    assert len(beginning.scans) < standing + 35
+
+
+def test_a_laser_and_a_tilted_sensor_are_known_from_their_first_scan() -> None:
+    floor, walls = hall()
+    scan = replace(scan_of(np.concatenate((floor, walls)), mounted_m=1.0), T_odom_base=np.eye(4))
+    laser = replace(scan, sensor="laser")
+    assert begin(iter([laser] * 9)) == Beginning([laser])
+    tilted = moved(scan, 0.0, 5.0)
+    assert begin(iter([tilted] * 9)) == Beginning([tilted], in_hand=True)

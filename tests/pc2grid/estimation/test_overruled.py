@@ -42,7 +42,7 @@ def scans() -> list[Scan]:
 
 
 def checked(scans: list[Scan]) -> tuple[OdometryCheck, list[Health]]:
-    tracker = Tracker(Config().registration)
+    tracker = Tracker(Config().registration, in_hand=False)
     tracked = [tracker.track(scan) for scan in scans]
     check = check_odometry([scan.stamp_ns for scan in scans], [t.disagreement for t in tracked])
     return check, [t.registered.health for t in tracked]

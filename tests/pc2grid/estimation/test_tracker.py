@@ -11,6 +11,7 @@ import pytest
 from pc2grid.clouds.deskew import deskew
 from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.estimation.carried import begin
 from pc2grid.estimation.matching_maps import MatchingMaps
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.tracker import Tracker
@@ -36,7 +37,10 @@ def laser():
 
 
 def follow(scans):
-    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    rest = iter(scans)
+    beginning = begin(rest)
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=beginning.in_hand)
+    scans = itertools.chain(beginning.scans, rest)
     return [tracker.track(scan).registered for scan in scans]
 
 
@@ -285,7 +289,7 @@ def test_a_gap_over_which_odometry_turned_wrong_loses_no_place(laser):
         (dataclasses.replace(scan, T_odom_base=wrong @ scan.T_odom_base), pose) for scan, pose in laser[70:]
     ]
     pairs = [*laser[:40], *behind]
-    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=False)
     tracked = [tracker.track(scan) for scan, _ in pairs]
     assert not any(t.restart for t in tracked)
     assert sum(t.registered.health is Health.LOST for t in tracked) <= 1
@@ -295,7 +299,7 @@ def test_a_gap_over_which_odometry_turned_wrong_loses_no_place(laser):
 def test_odometry_that_restarts_in_a_gap_is_not_used(laser):
     gap_ns = laser[39][0].stamp_ns - laser[0][0].stamp_ns + 5_000_000_000
     elsewhere = restarted(session("laser", length_m=2.0, seed=11), gap_ns)
-    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=False)
     tracked = [tracker.track(scan) for scan, _ in [*laser[:40], *elsewhere]]
     lost = [k for k, t in enumerate(tracked) if t.registered.health is Health.LOST]
     # The robot may be near, so ten scans are searched for before tracking starts again.
@@ -304,7 +308,7 @@ def test_odometry_that_restarts_in_a_gap_is_not_used(laser):
 
 
 def test_carried_off_without_odometry_is_noticed_and_restarts(laser):
-    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=False)
     elsewhere = session("laser", length_m=3.0, seed=11)
     tracked = [tracker.track(blind(scan)) for scan, _ in laser[:40]]
     end_ns = laser[39][0].stamp_ns
@@ -354,7 +358,7 @@ def test_a_single_wall_is_degenerate_along_itself():
     y = np.linspace(-4, 4, 200)
     wall = np.column_stack((np.full(200, 2.0), y, np.zeros(200)))
     rng = np.random.default_rng(0)
-    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=False)
     health = []
     for k in range(8):
         odometry = SE2(0.0, 0.02 * k, 0.0).lift()
@@ -374,7 +378,7 @@ def test_a_single_wall_is_degenerate_along_itself():
 
 
 def test_empty_scans_only_advance_the_time(laser):
-    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=False)
     results = []
     for k, (scan, _) in enumerate(laser[:30]):
         if k % 3 == 1:
@@ -387,7 +391,7 @@ def test_empty_scans_only_advance_the_time(laser):
 
 def test_standing_still_adds_no_keyframes(laser):
     scan = laser[0][0]
-    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=False)
     still = (dataclasses.replace(scan, stamp_ns=scan.stamp_ns + k) for k in range(0, 10**9, 10**8))
     assert sum(tracker.track(s).keyframe for s in still) == 1
 
@@ -458,7 +462,7 @@ def test_kiss_icp_without_points_returns_the_guess():
 def test_a_camera_without_odometry_does_not_leap_along_a_wall(monkeypatch):
     """A single leap would go on for many scans, as the motion before continues."""
     depth = [blind(scan) for scan, _ in session("depth", length_m=2.0, seed=3)[:30]]
-    tracker = Tracker(RegistrationConfig(), ProjectionConfig())
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=False)
     for scan in depth[:-1]:
         before = SE2.from_matrix(tracker.track(scan).registered.T_session_base)
     matched = MatchingMaps.match

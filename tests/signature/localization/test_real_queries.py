@@ -51,7 +51,9 @@ def map_of(scans: Iterator[Scan], truth: Trajectory) -> MapIndex:
             continue
         step = SE2(1.0, 0.0, 0.0) if last is None else last.inverse() @ pose
         if math.hypot(step.x, step.y) > 0.15 or abs(step.yaw) > 0.1:
-            builder.add(Tracker(CONFIG.registration, CONFIG.projection).start(scan).planar_scan, pose)
+            builder.add(
+                Tracker(CONFIG.registration, CONFIG.projection, in_hand=False).start(scan).planar_scan, pose
+            )
             last = pose
     return building({"map": builder.grid()})
 

@@ -22,13 +22,13 @@ from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F32, F64
 from pc2grid.errors import ConfigError, LogNotFound
-from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.io import Log, open_log
 from pc2grid.io.nav2_map import load_map, save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind
+from pc2grid.pipeline import follow
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.simulate import Session, load_building, prepare_session
 from pc2grid_lab.experiments.frames import apart, nearest
@@ -206,10 +206,10 @@ def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
     builder = GridBuilder(config.projection)
     path, clouds = [], []
     for scan, T_world_base in _keyframes(site, scans):
-        tracked = Tracker(config.registration, config.projection).start(scan)
-        builder.add(tracked.planar_scan, SE2.from_matrix(T_world_base))
+        ((registered, planar_scan),) = follow([scan], config)
+        builder.add(planar_scan, SE2.from_matrix(T_world_base))
         path.append(T_world_base)
-        clouds.append(_thinned(transform_points(T_world_base, tracked.registered.scan.points_m)))
+        clouds.append(_thinned(transform_points(T_world_base, registered.scan.points_m)))
     grid = builder.grid()
     site.folder.mkdir(parents=True, exist_ok=True)
     if not site.planar:
@@ -255,11 +255,11 @@ def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Con
         cloud = [transform_points(T_query_odom @ r.T_session_base, r.scan.points_m) for r in seen]
         write_arrays(stem.with_suffix(".cloud.npz"), points_m=_thinned(np.concatenate(cloud)))
     # What registration made of the scans before must not decide which queries count.
-    alone = Tracker(config.registration, config.projection).start(seen[-1].scan)
+    ((_, alone),) = follow([seen[-1].scan], config)
     grid = load_map(site.map_stem.with_suffix(".yaml"))
     query = SiteQuery(
         pose=(truth.x, truth.y, truth.yaw),
-        covered=is_covered(grid, truth.apply(alone.planar_scan.hits_m)),
+        covered=is_covered(grid, truth.apply(alone.hits_m)),
         travel_m=float(session.path_m()[-1]),
     )
     write_text(stem.with_suffix(".json"), json.dumps(asdict(query)))  # last: the query is complete
