@@ -147,7 +147,9 @@ def build_maps(
     if planar and not track.with_odometry:
         check_followed(track.trajectory, str(log.info.path))
     kept = long_enough(parts)
-    reports = part_reports(with_track_warnings(log.report(), track), session, parts, kept)
+    reports = part_reports(
+        with_track_warnings(log.report(), track), session, parts, kept, track.walls_changed_ns
+    )
     maps = tuple(
         _divided(part, report, session=part_name(session, k), sensor=sensor, config=config.partition)
         for k, (part, report) in enumerate(zip(kept, reports, strict=True))

@@ -141,6 +141,11 @@ class CarriedSensor:
     def follow(self, belief: Belief) -> None:
         """Nothing: the surfaces of the last scans are in the map."""
 
+    def fits_last(self, belief: Belief) -> bool:
+        """Not known: see `follow`."""
+        del belief
+        return False
+
     def extend(self, pose: F64) -> None:
         """Nothing: scans join the map in space oftener than keyframes begin, see `cut`."""
 

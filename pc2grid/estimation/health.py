@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from pc2grid.arrays import F64
 from pc2grid.estimation.belief import Belief
 from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placing import Placed
-from pc2grid.model import Health
+from pc2grid.geometry import invert_pose, motion_size
+from pc2grid.model import Health, Scan
 
 
 class HealthJudge:
@@ -32,8 +34,9 @@ class HealthJudge:
             return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
         if bridged and not self._lost_scans:
             return Health.DEGENERATE
-        # A pose that fits anywhere along a wall does not become known by waiting.
-        self._lost_scans += p.give_up_scans + 1 if fits else 1
+        if fits:  # a pose that fits anywhere along a wall does not become known by waiting
+            return self.give_up()
+        self._lost_scans += 1
         return Health.LOST
 
     @property
@@ -41,6 +44,37 @@ class HealthJudge:
         """Whether tracking must start again: so many scans in a row were lost."""
         return self._lost_scans > self._parameters.give_up_scans
 
+    def give_up(self) -> Health:
+        """Start tracking again at once: the scan is lost."""
+        self._lost_scans += self._parameters.give_up_scans + 1
+        return Health.LOST
+
     def restart(self) -> None:
         """Start to count again."""
         self._lost_scans = 0
+
+
+class Standstill:
+    """Notices that the walls have changed for good while odometry stood still, as after a ride in a lift.
+
+    Walls that come back, while the base stands or when it leaves, have not changed.
+    """
+
+    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters = parameters
+        self._known: tuple[int, F64] | None = None  # stamp and T_odom_base of the last scan that fits well
+
+    def left(self, scan: Scan, *, sure: bool) -> bool:
+        """Take in the next scan; returns whether the base leaves a place whose walls have changed.
+
+        sure : it fits the local map well.
+        """
+        known, T_odom_base = self._known, scan.T_odom_base
+        if sure or known is None or T_odom_base is None:
+            self._known = None if T_odom_base is None else (scan.stamp_ns, T_odom_base)
+            return False
+        p, (distance_m, turn_rad) = self._parameters, motion_size(invert_pose(known[1]) @ T_odom_base)
+        if distance_m <= p.standing_m and turn_rad <= p.standing_rad:
+            return False
+        self._known = scan.stamp_ns, T_odom_base
+        return (scan.stamp_ns - known[0]) * 1e-9 > p.changed_s

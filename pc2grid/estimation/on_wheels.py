@@ -106,13 +106,21 @@ class SensorOnWheels:
         the scans before. Odometry is trusted more."""
         if not self._unaided:
             return None
-        last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
-        for before, pose in self._latest:
-            last.extend(before, pose)
-        fit = self._matched(last, SE2.from_matrix(belief.pose), belief)
+        fit = self._matched_with_last(belief)
         at, information = fit.alone
         motion = self._last.inverse() @ SE2.from_matrix(at)
         return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible else None
+
+    def fits_last(self, belief: Belief) -> bool:
+        """See `PlacingSensor`."""
+        return self._matched_with_last(belief).credible
+
+    def _matched_with_last(self, belief: Belief) -> Fit:
+        """The planar scan matched with a map of the last scans alone."""
+        last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
+        for before, pose in self._latest:
+            last.extend(before, pose)
+        return self._matched(last, SE2.from_matrix(belief.pose), belief)
 
     def _matched(self, maps: MatchingMaps, guess: SE2, belief: Belief) -> Fit:
         """The planar scan matched with local maps from a guess, held to a belief.

@@ -76,6 +76,9 @@ class TrackingParameters:
     known_m, known_rad : a scan of a sensor in the hand without odometry is lost if a standard deviation of
         its pose on the local map is larger. The first is half of what a right answer may be off.
     give_up_scans : lost scans in a row after which tracking starts again.
+    standing_m, standing_rad : a base stands while its odometry changes by no more.
+    changed_s : time for which no scan of a standing base fits well, after which the walls have changed; a
+        ride in a lift takes longer.
     """
 
     max_points: int = 40_000
@@ -104,6 +107,9 @@ class TrackingParameters:
     known_m: float = 0.15
     known_rad: float = math.radians(3.0)
     give_up_scans: int = 10
+    standing_m: float = 0.02
+    standing_rad: float = 0.01
+    changed_s: float = 3.0
 
 
 MATCHING_PARAMETERS = MatchingParameters()

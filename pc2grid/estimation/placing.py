@@ -77,6 +77,9 @@ class PlacingSensor(Protocol):
     def follow(self, belief: Belief) -> Estimate | None:
         """The motion, T_last_now, by the last scans alone; None if the scan taken last does not fit them."""
 
+    def fits_last(self, belief: Belief) -> bool:
+        """Whether the scan taken last fits the scans before it, whatever the local map holds."""
+
     def levelled(self, pose: F64) -> F64:
         """A pose (4, 4) in the free directions, with the tilt and the height that are known besides."""
 
@@ -96,13 +99,14 @@ class Placed:
 
     pose : (4, 4) T_session_base, from which the smoother begins. alone : as of `Fit`; None if the scan fits
     nowhere. motion : T_last_now, if the scan fits those before, but not the map: what it shows is new.
-    measured : its points fix every direction of the position. first : there is no local map yet, nor any
-    since tracking started again.
+    sure : it fits the map well. measured : its points fix every direction of the position.
+    first : there is no local map yet, nor any since tracking started again.
     """
 
     pose: F64
     alone: Estimate | None = None
     motion: Estimate | None = None
+    sure: bool = False
     measured: bool = False
     first: bool = False
 
@@ -135,7 +139,7 @@ class Placer:
         p, belief = self._parameters, expected[0]
         self._sensor.take(scan, points_m)
         if not self._sensor:
-            return Placed(belief.pose, first=True)
+            return Placed(belief.pose, sure=True, first=True)
         found = self._hypotheses(expected)
         best = max(found)
         if best.fit.overlap < p.min_overlap or not (best.near or best.fit.credible):
@@ -145,7 +149,8 @@ class Placer:
         alone, information = fit.alone
         # The inverse of the sum of both covariances, also where a match tells nothing of a direction.
         believed = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
-        return Placed(fit.pose, (alone, 0.5 * (believed + believed.T)), measured=fit.measured)
+        estimate = alone, 0.5 * (believed + believed.T)
+        return Placed(fit.pose, estimate, sure=best.sure, measured=fit.measured)
 
     def _hypotheses(self, expected: Sequence[Belief]) -> list[_Hypothesis]:
         """Where the scan taken last may lie. If it fits nowhere that it is expected, it is searched for."""

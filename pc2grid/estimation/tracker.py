@@ -21,7 +21,7 @@ from pc2grid.clouds.sampling import random_subset
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.estimation.belief import Belief
 from pc2grid.estimation.carried import CarriedSensor
-from pc2grid.estimation.health import HealthJudge
+from pc2grid.estimation.health import HealthJudge, Standstill
 from pc2grid.estimation.odometer import Odometer
 from pc2grid.estimation.on_wheels import SensorOnWheels
 from pc2grid.estimation.overruled import Disagreement
@@ -41,6 +41,7 @@ class Tracked:
     planar_scan : the scan reduced to the plane.
     keyframe : whether the robot had moved enough for the scan to become part of the local map.
     restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
+    walls_changed : it was lost because the walls had changed while odometry stood still.
     disagreement : of odometry with the pose; None for a lost scan, and where there is nothing to compare.
     """
 
@@ -48,6 +49,7 @@ class Tracked:
     planar_scan: PlanarScan
     keyframe: bool
     restart: bool = False
+    walls_changed: bool = False
     disagreement: Disagreement | None = None
 
 
@@ -72,6 +74,8 @@ class Tracker:
         self._odometer = Odometer(parameters=parameters)
         self._keyframe: SE2 | None = None  # where the last one was
         self._restarted = False  # no keyframe has been reported since tracking started again
+        self._walls_changed = False  # why
+        self._standstill = Standstill(parameters)
         self._in_hand = in_hand
         projection = projection or ProjectionConfig()
         self._sensor: PlacingSensor
@@ -112,6 +116,8 @@ class Tracker:
         estimate = self._estimated(placed, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
         health = self._judged(placed, estimate, evidence)
+        if self._standstill.left(scan, sure=placed.sure) and self._sensor.fits_last(expected[0]):
+            self._walls_changed, health = True, self._health.give_up()
         pose = self._sensor.levelled(estimate.pose)
         tracked = self._finish(scan, points, pose, health)
         if self._health.gives_up:
@@ -141,7 +147,9 @@ class Tracker:
             self._keyframe = SE2.from_matrix(pose)
             self._sensor.extend(pose)
         restart = keyframe and self._restarted
-        self._restarted &= not keyframe
+        walls_changed = restart and self._walls_changed
+        if keyframe:
+            self._restarted = self._walls_changed = False
         found = None if lost else self._odometer.disagreement(scan, pose)
         if health is Health.FINE and found is not None and found.overrules:
             health = Health.OVERRULED
@@ -153,6 +161,7 @@ class Tracker:
             planar_scan=planar_scan,
             keyframe=keyframe,
             restart=restart,
+            walls_changed=walls_changed,
             disagreement=found,
         )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 
@@ -48,18 +48,23 @@ def lost_warnings(health: Sequence[Health]) -> list[str]:
 
 
 def part_reports(
-    report: ReadReport, session: str, parts: Sequence[SessionMap], kept: Sequence[SessionMap]
+    report: ReadReport,
+    session: str,
+    parts: Sequence[SessionMap],
+    kept: Sequence[SessionMap],
+    walls_changed_ns: Collection[int] = (),
 ) -> list[ReadReport]:
     """The report of each part that is kept.
 
     report : of the reader. It becomes part of that of the first part; the scans of the others are counted in
         theirs.
+    walls_changed_ns : as of a `Track`.
     """
     first, *others = (part.report for part in kept)
     elsewhere = sum(other.scans_read for other in others)
     left_out = sum(len(part.trajectory) for part in parts) - elsewhere - first.scans_read
     skipped = {"in a part too short to be of use": left_out} if left_out else {}
-    division = [division_warning(session, parts, kept)] if len(parts) > 1 else []
+    division = [division_warning(session, parts, kept, walls_changed_ns)] if len(parts) > 1 else []
     first = dataclasses.replace(
         report,
         scans_read=report.scans_read - elsewhere,
@@ -69,22 +74,36 @@ def part_reports(
     return [first, *others]
 
 
-def division_warning(session: str, parts: Sequence[SessionMap], kept: Sequence[SessionMap]) -> str:
+def division_warning(
+    session: str,
+    parts: Sequence[SessionMap],
+    kept: Sequence[SessionMap],
+    walls_changed_ns: Collection[int] = (),
+) -> str:
     """One sentence that says into what a recording was divided, where, and what to do."""
     start_ns = min(int(part.trajectory.stamps_ns[0]) for part in parts if len(part.trajectory))
 
     def begin_s(part: SessionMap) -> float:
         return (int(part.trajectory.stamps_ns[0]) - start_ns) * 1e-9
 
+    short = len(parts) - len(kept)
+    dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
     named = ", ".join(
         f"{part_name(session, k)} from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
         for k, part in enumerate(kept)
     )
+    changed_s = [begin_s(part) for part in parts if part.trajectory.stamps_ns[0] in walls_changed_ns]
+    if changed_s:
+        times = " and ".join(f"{seconds:.0f}" for seconds in changed_s)
+        return (
+            f"the recording falls into {len(parts)} parts whose places relative to each other are not known: "
+            f"{named}{dropped}; before {times} s after the first scan all walls changed while odometry stood "
+            "still, as in a lift: cut the recording there, with --start and --duration, and name each floor "
+            "with --floor"
+        )
     advice = "come back to known places more often, to keep them together"
     if not any(part.odometry and part.odometry.compared for part in parts):
         advice = f"record with odometry, or {advice}"
-    short = len(parts) - len(kept)
-    dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
     return (
         f"the recording falls into {len(parts)} parts whose places relative to each other are not known, "
         f"because tracking was lost: {named}{dropped}; {advice}"

@@ -25,12 +25,14 @@ class Track:
 
     trajectory : before loops are closed. disagreements : of odometry, at each scan. readings : (N, 4, 4) of
     odometry, NaN where there is none.
+    walls_changed_ns : stamps of the scans before which the walls had changed while odometry stood still.
     left_out : scans before the first of the trajectory. warning : why, or what was assumed of that.
     """
 
     trajectory: Trajectory
     disagreements: Sequence[Disagreement | None]
     readings: F64
+    walls_changed_ns: tuple[int, ...] = ()
     left_out: int = 0
     warning: str | None = None
 
@@ -53,6 +55,7 @@ class TrackRecord:
         self._stamps, self._poses, self._readings = array("q"), array("d"), array("d")
         self._health: list[Health] = []
         self._disagreements: list[Disagreement | None] = []
+        self._walls_changed_ns: list[int] = []
 
     def __len__(self) -> int:
         return len(self._stamps)
@@ -63,6 +66,8 @@ class TrackRecord:
         self._poses.extend(tracked.registered.T_session_base.ravel())
         self._health.append(tracked.registered.health)
         self._disagreements.append(tracked.disagreement)
+        if tracked.walls_changed:
+            self._walls_changed_ns.append(scan.stamp_ns)
         self._readings.extend((_NO_READING if scan.T_odom_base is None else scan.T_odom_base).ravel())
 
     def track(self, left_out: int, warning: str | None) -> Track:
@@ -73,4 +78,5 @@ class TrackRecord:
             health=tuple(self._health),
         )
         readings = np.frombuffer(self._readings).reshape(-1, 4, 4)
-        return Track(trajectory, self._disagreements, readings, left_out, warning)
+        changed_ns = tuple(self._walls_changed_ns)
+        return Track(trajectory, self._disagreements, readings, changed_ns, left_out, warning)

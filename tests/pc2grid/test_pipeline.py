@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ import pytest
 
 from pc2grid.config import Config
 from pc2grid.errors import NoScans, TrackingLost
-from pc2grid.geometry import SE2
+from pc2grid.geometry import SE2, invert_pose
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.report import check_followed, lost_warnings
@@ -131,6 +132,41 @@ def test_the_map_of_a_robot_that_was_carried_elsewhere_is_warned_of(
     assert len(made.trajectory) == len(scans)
     assert any("contradicts itself" in warning for warning in made.report.warnings)
     assert not any("contradicts itself" in warning for warning in alone.report.warnings)
+
+
+def test_a_ride_in_a_lift_gives_a_map_for_each_floor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its odometry stands still, and for four seconds it looks at another floor before it drives on."""
+    floors = [
+        SimulationConfig(
+            length_m=10.0, seed=floor, building_seed=floor, laser=LaserConfig(rate_hz=5.0, step_deg=1.0)
+        )
+        for floor in (1, 2)
+    ]
+    made = simulate_session(tmp_path / "lift.mcap", sensor="laser", config=floors[0])
+    up = [scan for scan, _ in prepare_session(sensor="laser", config=floors[1]).scans()]
+    with open_log(made.path) as log:
+        scans = list(log.scans())
+        below, begin_ns = scans[-1], scans[-1].stamp_ns + 2 * 10**8
+        assert below.T_odom_base is not None and up[0].T_odom_base is not None
+        T = below.T_odom_base @ invert_pose(up[0].T_odom_base)
+        scans += [
+            replace(up[0], stamp_ns=begin_ns + k * 2 * 10**8, T_odom_base=T @ up[0].T_odom_base)
+            for k in range(20)
+        ]
+        for scan in up:
+            assert scan.T_odom_base is not None
+            stamp_ns = begin_ns + 4 * 10**9 + scan.stamp_ns - up[0].stamp_ns
+            scans.append(replace(scan, stamp_ns=stamp_ns, T_odom_base=T @ scan.T_odom_base))
+        monkeypatch.setattr(log, "scans", lambda *_: iter(scans))
+        first, second = build_maps(log, session="robot")
+    (said,) = [text for text in first.report.warnings if "falls into" in text]
+    found = re.search(
+        r"before (\d+) s after the first scan all walls changed .* cut the recording there", said
+    )
+    assert found is not None
+    rode_s = (begin_ns - scans[0].stamp_ns) * 1e-9
+    assert rode_s + 3.0 < int(found[1]) < rode_s + 6.0
+    assert not any("contradicts itself" in text for part in (first, second) for text in part.report.warnings)
 
 
 @pytest.mark.parametrize(("rise_m", "warned"), [(3.0, True), (-3.0, True), (0.5, False)])

@@ -478,3 +478,64 @@ def test_a_camera_without_odometry_does_not_leap_along_a_wall(monkeypatch):
     pose = SE2.from_matrix(tracker.track(depth[-1]).registered.T_session_base)
     # Of the leap of 0.41 m a quarter is believed, which the next scans correct; a step is 0.04 m.
     assert abs(pose.x - before.x) < 0.41 / 3.0
+
+
+def standing(scan, seconds, see=lambda points, k: points):
+    """Scans of a robot that stands where `scan` was taken. see : the points (N, 3) of the k-th of them."""
+    rng = np.random.default_rng(0)
+    for k in range(int(10 * seconds)):
+        noisy = (scan.points_m + rng.normal(0.0, 0.005, scan.points_m.shape)).astype(np.float32)
+        points = see(noisy, k).astype(np.float32)
+        yield dataclasses.replace(scan, stamp_ns=scan.stamp_ns + k * 10**8, points_m=points, offsets_s=None)
+
+
+def chained(*parts):
+    """Scans that follow each other after a tenth of a second; odometry stands still in between."""
+    scans, end_ns, T_odom_base = [], 0, np.eye(4)
+    for part in map(list, parts):
+        T = T_odom_base @ invert_pose(part[0].T_odom_base)
+        for scan in part:
+            stamp_ns = end_ns + scan.stamp_ns - part[0].stamp_ns
+            scans.append(dataclasses.replace(scan, stamp_ns=stamp_ns, T_odom_base=T @ scan.T_odom_base))
+        end_ns, T_odom_base = scans[-1].stamp_ns + 10**8, scans[-1].T_odom_base
+    return scans
+
+
+def within(points, nearest_m, first_rad, last_rad):
+    """Points (N, 3) of which those in a sector are as near as somebody who stands there."""
+    bearing = np.arctan2(points[:, 1], points[:, 0])
+    hidden = (bearing > first_rad) & (bearing < last_rad)
+    return np.where(hidden[:, None], points * nearest_m / np.linalg.norm(points, axis=1)[:, None], points)
+
+
+def walls_changed(scans):
+    tracker = Tracker(RegistrationConfig(), ProjectionConfig(), in_hand=False)
+    return [k for k, scan in enumerate(scans) if tracker.track(scan).walls_changed]
+
+
+@pytest.mark.parametrize("cabin_s", [0.0, 8.0])
+def test_all_walls_that_change_in_a_standstill_begin_a_new_part(laser, cabin_s):
+    """A robot rides in a lift, of which the cabin hides all else, and looks at another floor for 4 s."""
+    down = [scan for scan, _ in laser[:40]]
+    config = SimulationConfig(length_m=6.0, seed=2, building_seed=2)
+    up = [scan for scan, _ in iter_session(sensor="laser", config=config)]
+    ride = standing(down[-1], cabin_s, lambda points, k: within(points, 0.8, -4.0, 4.0))
+    parts = [list(part) for part in (down, ride, standing(up[0], 4.0), up)]
+    (changed,) = walls_changed(chained(*filter(None, parts)))
+    begin = len(down) + int(10 * (cabin_s + 4.0))
+    assert begin <= changed < begin + 10  # it starts slowly
+
+
+@pytest.mark.parametrize(
+    "see",
+    [
+        lambda points, k: within(points, 1.0, 0.1 * k - 2.0, 0.1 * k - 1.2),  # somebody walks by
+        lambda points, k: within(points, 0.8, -0.6, 0.6),  # and stands in front
+        lambda points, k: within(points, 8.0, 0.3, 0.9),  # a door opens
+        lambda points, k: within(points, 0.2, -4.0, 4.0) if k < 50 else points,  # something covers the laser
+        lambda points, k: points[:0] if k < 50 else points,  # it is blinded
+    ],
+)
+def test_what_passes_a_standing_robot_begins_no_new_part(laser, see):
+    scans = [scan for scan, _ in laser]
+    assert walls_changed(chained(scans[:40], standing(scans[40], 6.0, see), scans[41:])) == []
