@@ -211,7 +211,7 @@ def find(
                 observer.on_scan(registered)
                 see(registered, estimate)
                 seen.append((registered.scan.stamp_ns, registered.T_session_base, registered.health))
-                if until_located and estimate is not None and estimate.answer.status == "located":
+                if until_located and estimate is not None and localizer.answer().status == "located":
                     break
             answer = localizer.answer()
         stamps_ns, poses, health = zip(*seen, strict=True)

@@ -131,9 +131,9 @@ class Answer:
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with. views_m :
     where it was described by signatures, in that frame. map : of the session of the best hypothesis.
     sessions, labels : all of the database, that `Hypothesis.session_index` counts.
-    prior : what became of the prior, None if there was none; "lapsed": registration was lost after the time
-    that it is about, so it was not used. excluded : the best place that the prior excludes, if nothing that
-    it allows is certain and this fits better.
+    prior : what became of the prior, None if there was none. Not used: "lapsed", registration was lost after
+    the time that it is about; "ahead", its time lies after the last scan. excluded : the best place that the
+    prior excludes, if nothing that it allows is certain and this fits better.
     frames : for each session the frame of its building that poses are in, None: in its map frame; empty: all
     are in the map frames of their sessions (`signature.localization.in_building`).
     in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
@@ -168,7 +168,7 @@ class Answer:
     local_map: OccupancyGrid
     timing_ms: dict[str, float] = field(default_factory=dict)
     masses: tuple[float, ...] = ()
-    prior: Literal["used", "lapsed"] | None = None
+    prior: Literal["used", "lapsed", "ahead"] | None = None
     excluded: Moment | None = None
     in_space: PoseInSpace | None = None
     views_m: tuple[tuple[float, float], ...] = ()

@@ -99,11 +99,11 @@ class Sessions(TypedDict):
 
 
 class PriorUse(TypedDict):
-    """What became of the prior. status: used, or lapsed if registration was lost after the time that it is
-    about. excluded: the best place that the prior excludes; null, unless nothing inside is certain and it
-    fits better."""
+    """What became of the prior. status: used, lapsed if registration was lost after the time that it is
+    about, or ahead if its time lies after the last scan. excluded: the best place that the prior excludes;
+    null, unless nothing inside is certain and it fits better."""
 
-    status: Literal["used", "lapsed"]
+    status: Literal["used", "lapsed", "ahead"]
     excluded: Moment | None
 
 

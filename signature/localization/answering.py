@@ -69,14 +69,16 @@ def answer_query(
 
 def _with_prior(
     index: MapIndex, query: QueryMap, verdict: Verdict, prior_of: PriorOf
-) -> tuple[Verdict, Literal["used", "lapsed"] | None, Moment | None]:
+) -> tuple[Verdict, Literal["used", "lapsed", "ahead"] | None, Moment | None]:
     """The verdict, what became of the prior, and the best place that it excludes.
 
     Where nothing that the prior allows is certain, all places are asked: those that fit better outside tell
     what wrong places score.
     """
-    if index.whole is None or not index.prior_applies(query):
-        return verdict, None if index.whole is None else "lapsed", None
+    if index.whole is None or index.region is None:
+        return verdict, None, None
+    if not index.prior_applies(query):
+        return verdict, "ahead" if index.region.is_ahead(query) else "lapsed", None
     if verdict.status == "located":
         return verdict, "used", None
     everywhere = index.whole.look_up(query, verdict.hypotheses)

@@ -61,7 +61,8 @@ class Localizer:
 
     Memory does not grow with the travel.
 
-    index : where to look; `MapIndex.within` restricts it to what is known beforehand.
+    index : where to look; `MapIndex.within` restricts it to what is known beforehand: estimates from the time
+    of the prior on, or, if it has none, `answer` alone.
 
     >>> import pc2grid, signature
     >>> with signature.open_database("building.submaps") as database, pc2grid.open_log("tuesday.mcap") as log:
@@ -79,12 +80,11 @@ class Localizer:
         self.index = index
         self._belief = Belief(index.config.accept)
         self._history: deque[Moment] = deque(maxlen=_MOMENTS)
-        self._begin(prior_ns if index.prior is None else index.prior.stamp_ns)
+        prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
+        self._begin(Query(index.made_with, index.config, prior_ns=prior_ns, in_space=self.uses_points))
 
-    def _begin(self, prior_ns: int | None) -> None:
-        self.query = Query(
-            self.index.made_with, self.index.config, prior_ns=prior_ns, in_space=self.uses_points
-        )
+    def _begin(self, query: Query) -> None:
+        self.query = query
         # Of the last search: part of the query, metres driven in it, and hypotheses.
         self._last: tuple[int, float, tuple[Hypothesis, ...]] = 0, 0.0, ()
         self._answer: Answer | None = None  # of the last scan
@@ -113,15 +113,15 @@ class Localizer:
         if not self.take(registered, planar_scan, may_search=may_search):
             return None
         try:
-            self.query, answer = self._since_slip()
+            self.query, answer = self._since_slip(self._on_the_way)
         except NoScans:  # the scans since the start, or since registration was lost, show nothing
             return None
         query = self.query.map()
-        self._answer = answer
+        self._answer = answer if self._on_the_way is self.index else None
         self._last = query.part, query.path_m, answer.hypotheses
         self._history.append(answer.history[-1])
         state = self._belief.follow(self._belief.add(query, answer), located=answer.status == "located")
-        if state == "lost":
+        if state == "lost" and self._was_located_since_prior():
             self.query.forget_prior()
         elapsed_s = time.perf_counter() - begin
         return Estimate(state=state, answer=answer, registered=registered, elapsed_s=elapsed_s)
@@ -153,38 +153,54 @@ class Localizer:
 
         Raises NoScans if no scan could be used.
         """
-        return self._answer or self._since_slip()[1]
+        return self._answer or self._since_slip(self.index)[1]
 
     def restart(self) -> None:
-        """The scans do not go on from those before: what comes next is a search of its own, and a prior with
-        a time says nothing of it."""
+        """The scans do not go on from those before: what comes next is a search of its own, and a prior of an
+        earlier time says nothing of it."""
         self._belief.restart()
-        self._begin(None)
+        self._begin(self.query.anew())
 
-    def _since_slip(self) -> tuple[Query, Answer]:
+    @property
+    def _on_the_way(self) -> MapIndex:
+        """Where to look before the answer is asked: a prior without a time is about none of these scans."""
+        timeless = self.index.prior is not None and self.index.prior.stamp_ns is None
+        return self.index.whole or self.index if timeless else self.index
+
+    def _was_located_since_prior(self) -> bool:
+        """Whether the robot was located after the time of the prior, and not lost by the prior itself."""
+        begin_ns = 0 if self.index.prior is None else self.index.prior.stamp_ns or 0
+        return any(past.status == "located" and past.stamp_ns >= begin_ns for past in self._history)
+
+    def _since_slip(self, index: MapIndex) -> tuple[Query, Answer]:
         """The answer, and the query that it is about: the scans since the robot was carried away or tracking
         slipped, if that is more likely than not."""
-        query, answer = self.query, self.search(self.query)
+        query, answer = self.query, self.search(self.query, index=index)
         while answer.slipped >= POSTERIOR.likely:
             query = query.since(answer.evidence.scans_since)
-            answer = self.search(query)
+            answer = self.search(query, index=index)
         return query, answer
 
     def search(
-        self, query: Query, known: tuple[Hypothesis, ...] = (), prior_of: PriorOf | None = None
+        self,
+        query: Query,
+        known: tuple[Hypothesis, ...] = (),
+        prior_of: PriorOf | None = None,
+        index: MapIndex | None = None,
     ) -> Answer:
         """Where a query is. Nothing of it is kept.
 
         known : hypotheses to be compared, too. prior_of : of each place; None: by the searches before the
-        last metres. Raises NoScans if no scan could be used.
+        last metres. index : where to look, if not where the localizer does. Raises NoScans if no scan could
+        be used.
         """
-        seen = query.map()
+        seen, index = query.map(), index or self.index
         self._clock.lap("describe")
         part, _, carried = self._last
-        found = self.index.look_up(seen, (*(carried if part == seen.part else ()), *known))
+        found = index.look_up(seen, (*(carried if part == seen.part else ()), *known))
         self._clock.lap("look_up")
         return answer_query(
-            self.index,
+            index,
             query,
             seen,
             found,

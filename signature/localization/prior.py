@@ -51,7 +51,8 @@ class Prior:
 
     T_map_base : the centre of the region. shape_m2 : (2, 2), positions at d from the centre are inside if
     d' shape_m2^-1 d <= 1. half_yaw_rad : headings differ by at most this; pi: any.
-    stamp_ns : when; of the scans of a query the nearest one is meant. None: whenever the database is asked.
+    stamp_ns : when; of the scans of a query the nearest one is meant. From then on the region is carried by
+    the motion; before, it says nothing. None: the newest scan when `Localizer.answer` is asked.
     session : whose map frame; None if there is only one session.
 
     >>> near = Prior.around(3.0, 4.0, radius_m=2.0)
@@ -170,9 +171,15 @@ class Region:
             prior=prior, session_index=0 if prior.session is None else sessions.index(prior.session)
         )
 
+    def is_ahead(self, query: QueryMap) -> bool:
+        """Whether the time that the prior is about has not come yet."""
+        return self.prior.stamp_ns is not None and query.stamp_ns < self.prior.stamp_ns
+
     def T_odom_prior(self, query: QueryMap) -> SE2 | None:
-        """The base at the time that the prior is about; None if the motion since is not known."""
-        return query.T_odom_base if self.prior.stamp_ns is None else query.T_odom_prior
+        """The base at the time that the prior is about; None before, and if the motion since is not known."""
+        if self.prior.stamp_ns is None:
+            return query.T_odom_base
+        return None if self.is_ahead(query) else query.T_odom_prior
 
     def allows(self, query: QueryMap, T_map_query: SE2) -> bool:
         """Whether the query can lie at a pose. The motion since the time of the prior must be known."""

@@ -77,8 +77,8 @@ class QueryMap:
     grid : local map in the odom frame. views : best observed first. walls : the local map as verification
     takes it. center_m : (x, y) in the odom frame that poses of the query rotate about.
     part : number of times that registration was lost before; each part has an odom frame of its own.
-    T_odom_prior : the base at the time that a prior is about; None if it is not known in this odom frame.
-    since_prior_m : metres driven since that time.
+    T_odom_prior : the base at the scan nearest to the time that a prior is about; None if it is not known in
+    this odom frame. since_prior_m : metres driven since that scan.
     keyframes : the scans that it was drawn from, oldest first, and the last scan; none of a drawn map.
     """
 
@@ -213,7 +213,7 @@ class Query:
             self.lost_scans += 1
             self._keyframes.clear()
             self._newest = Keyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
-            self._at_prior = self._at_prior[0], None
+            self._at_prior = min(self._at_prior[0], self._off_prior(planar_scan)), None
             return
         self.lost_scans = 0
         path_m = 0.0
@@ -221,9 +221,13 @@ class Query:
             step = self._newest.T_odom_base.inverse() @ pose
             path_m = self._newest.path_m + math.hypot(step.x, step.y)
         self._newest = Keyframe(planar_scan, pose, path_m)
-        if self._prior_ns is not None and abs(planar_scan.stamp_ns - self._prior_ns) < self._at_prior[0]:
-            self._at_prior = abs(planar_scan.stamp_ns - self._prior_ns), self._newest
+        if self._off_prior(planar_scan) < self._at_prior[0]:
+            self._at_prior = self._off_prior(planar_scan), self._newest
         self._keep(self._newest)
+
+    def _off_prior(self, planar_scan: PlanarScan) -> float:
+        """Nanoseconds between a scan and the time of the prior; infinite without one."""
+        return math.inf if self._prior_ns is None else abs(planar_scan.stamp_ns - self._prior_ns)
 
     def _keep(self, newest: Keyframe) -> None:
         """Keep a scan if the robot has moved since the last one that was kept."""
@@ -235,15 +239,27 @@ class Query:
         while newest.path_m - self._keyframes[0].path_m > self._config.window_m:
             self._keyframes.popleft()
 
+    def anew(self) -> Query:
+        """The query that begins with the next scan, which does not go on from those before: a prior of an
+        earlier time says nothing of it."""
+        later = Query(
+            self._made_with, self._config, prior_ns=self._prior_ns, in_space=self.in_space is not None
+        )
+        later._at_prior = self._at_prior[0], None
+        return later
+
     def since(self, scans: int) -> Query:
         """The query that begins with the last so many `QueryMap.keyframes`: a part of its own."""
         keyframes = self.map().keyframes[-scans:]
         begin_m = keyframes[0].path_m
-        later = Query(self._made_with, self._config)
+        later = self.anew()
         later.in_space = None if self.in_space is None else self.in_space.since(self.path_m - begin_m)
         later.part, later.first_ns = self.part + 1, keyframes[0].planar_scan.stamp_ns
         later._keyframes.extend(replace(k, path_m=k.path_m - begin_m) for k in keyframes)
         later._newest = later._keyframes[-1]
+        off, at_prior = self._at_prior
+        if at_prior is not None and at_prior.path_m >= begin_m:
+            later._at_prior = off, replace(at_prior, path_m=at_prior.path_m - begin_m)
         return later
 
     def forget_prior(self) -> None:

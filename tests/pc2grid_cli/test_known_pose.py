@@ -23,6 +23,7 @@ from pc2grid_cli.json_schemas import schema
 from pc2grid_cli.main import app
 from pc2grid_cli.nav2_pose import initialpose, read_pose
 from signature.localization.pose_check import CheckStatus, PoseCheck
+from tests.helpers.field import field_log
 from tests.helpers.json_schema import closed
 from tests.helpers.recordings import ros
 from tests.helpers.rooms import RESOLUTION_M
@@ -126,6 +127,33 @@ def test_a_pose_in_the_log_or_in_a_file_is_carried_along(rooms: tuple[Path, SE2]
     assert math.dist((written.T_map_base.x, written.T_map_base.y), (truth.x, truth.y)) < 3 * RESOLUTION_M
     done = relocalize(folder, "--near-pose", tmp_path / "pose.json", "--json")
     assert done.exit_code == 0 and json.loads(done.stdout)["status"] == "located"
+
+
+def test_a_pose_without_a_time_is_one_of_the_newest_scan(rooms: tuple[Path, SE2], tmp_path: Path) -> None:
+    """A later one than that says nothing of the recording, which is told."""
+    folder, truth = rooms
+    end_ns = round(np.loadtxt(folder / "plain.tum")[-1, 0] * 1e9)
+    for name, stamp_ns in (("now", 0), ("later", end_ns + 2_000_000_000)):
+        message = initialpose(stamp_ns, truth, np.diag([0.04, 0.04, 0.01]))
+        (tmp_path / f"{name}.json").write_text(json.dumps(message))
+    done = relocalize(folder, "--near-pose", tmp_path / "now.json")
+    assert done.exit_code == 0 and done.stdout.startswith("located in twins"), done.output
+    done = relocalize(folder, "--near-pose", tmp_path / "later.json")
+    assert done.exit_code == 4 and done.stdout.startswith("ambiguous"), done.output
+    assert "lies after the last scan" in done.stderr
+
+
+def test_a_pose_acts_at_its_time(tmp_path: Path) -> None:
+    """Of a floor that looks the same when turned by 180 degrees, the pose of 18 of 24 s tells which way."""
+    drive = field_log("near_pose_before_its_time")
+    map_ = drive.with_name("near_pose_map.yaml")
+    assert pc2grid("convert", map_, "-o", tmp_path / "map.submaps").exit_code == 0
+    told = ("--near-pose", drive.with_suffix(".json"), "--json")
+    done = pc2grid("relocalize", drive, "-d", tmp_path / "map.submaps", *told)
+    document = json.loads(done.stdout)
+    assert done.exit_code == 0 and "registration was lost" not in done.stderr, done.output
+    assert math.dist((document["pose"]["x"], document["pose"]["y"]), (4.27, 0.46)) < 0.1
+    assert math.degrees(document["pose"]["yaw"]) == pytest.approx(-165.0, abs=1.0)
 
 
 def test_a_right_pose_is_fine_and_a_wrong_one_lost(rooms: tuple[Path, SE2]) -> None:

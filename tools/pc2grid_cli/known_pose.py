@@ -85,7 +85,9 @@ class KnownPose:
                 f"--near-pose: poses of {self.near_pose} have no covariance",
                 hint="--near X Y RADIUS names a region",
             )
-        return Prior.of_pose(pose.T_map_base, pose.covariance, stamp_ns=pose.stamp_ns, session=self.session)
+        # A stamp of 0 is the newest scan, as AMCL takes it.
+        stamp_ns = pose.stamp_ns or None
+        return Prior.of_pose(pose.T_map_base, pose.covariance, stamp_ns=stamp_ns, session=self.session)
 
 
 def end_s(span: TimeSpan) -> float | None:

@@ -404,6 +404,8 @@ def _warn_of_prior(answer: Answer) -> None:
     """Say what the known pose had to do with the answer, if that is not what the user expects."""
     if answer.prior == "lapsed":
         console.warn("registration was lost after the time of --near-pose, so that pose was not used")
+    if answer.prior == "ahead":
+        console.warn("the time of --near-pose lies after the last scan, so that pose was not used")
     excluded = answer.excluded
     if excluded is None or excluded.pose is None:
         return

@@ -118,6 +118,87 @@ def test_a_prior_from_before_registration_was_lost_is_not_used() -> None:
     assert (at_start.status, at_start.prior) == ("located", "lapsed")
 
 
+def estimates(index: MapIndex) -> tuple[list[tuple[int, str, float]], Answer]:
+    """Stamp, status and confidence of each estimate in the left room, and the answer at the end."""
+    localizer, found = Localizer(index), []
+    for registered, planar_scan, _ in driven(in_office=False):
+        estimate = localizer.add(registered, planar_scan)
+        if estimate is not None:
+            found.append((registered.scan.stamp_ns, estimate.answer.status, estimate.answer.confidence))
+    return found, localizer.answer()
+
+
+@functools.cache
+def alike_step_by_step() -> MapIndex:
+    """The two rooms, asked after each metre."""
+    return building({"twins": TWINS}, Config(relocalize=RelocalizeConfig(accept=0.95)))
+
+
+def test_a_prior_acts_at_its_time_and_never_before() -> None:
+    """The robot is 3 m from the region at first."""
+    free, undecided = estimates(alike_step_by_step())
+    registered, _, then = driven(in_office=False)[20]
+    prior = replace(Prior.around(then.x, then.y, 1.0), stamp_ns=registered.scan.stamp_ns)
+    found, answer = estimates(alike_step_by_step().within(prior))
+    assert undecided.status == "ambiguous" and answer.status == "located" and answer.prior == "used"
+    assert distance(answer.T_map_base, driven(in_office=False)[-1][2]) < 0.1
+    before = [k for k, (stamp_ns, _, _) in enumerate(found) if stamp_ns < registered.scan.stamp_ns]
+    assert len(before) >= 3 and found[: len(before)] == free[: len(before)]
+    assert all(status == "located" for _, status, _ in found[len(before) :])
+
+
+def test_a_prior_of_a_time_after_the_last_scan_says_nothing_yet() -> None:
+    registered, _, end = driven(in_office=False)[-1]
+    later = replace(Prior.around(end.x, end.y, 1.0), stamp_ns=registered.scan.stamp_ns + 1)
+    found, answer = estimates(alike_step_by_step().within(later))
+    assert found == estimates(alike_step_by_step())[0]
+    assert (answer.status, answer.prior) == ("ambiguous", "ahead")
+
+
+def test_a_prior_without_a_time_is_about_the_scan_at_which_the_answer_is_asked() -> None:
+    end = driven(in_office=False)[-1][2]
+    found, answer = estimates(alike_step_by_step().within(Prior.around(end.x, end.y, 1.0)))
+    assert found == estimates(alike_step_by_step())[0]
+    assert (answer.status, answer.prior) == ("located", "used")
+    assert distance(answer.T_map_base, end) < 0.1
+
+
+def test_registration_that_is_lost_before_the_time_of_a_prior_takes_nothing_from_it() -> None:
+    """But while it is lost, nothing connects the time with what comes after."""
+    scans = driven(in_office=True)
+    prior = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=scans[17][0].scan.stamp_ns)
+    for lost, became in ((range(8, 12), "used"), (range(12, 19), "lapsed"), (range(17, 18), "lapsed")):
+        localizer = Localizer(OFFICE.within(prior))
+        for k, (registered, planar_scan, _) in enumerate(scans):
+            health = Health.LOST if k in lost else Health.FINE
+            localizer.add(replace(registered, health=health), planar_scan)
+        assert localizer.answer().prior == became, lost
+
+
+def test_a_restart_takes_nothing_from_a_prior_of_a_later_time() -> None:
+    scans = driven(in_office=True)
+    for number, became in ((5, "lapsed"), (20, "used")):
+        prior = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=scans[number][0].scan.stamp_ns)
+        localizer = Localizer(OFFICE.within(prior))
+        for k, (registered, planar_scan, _) in enumerate(scans):
+            if k == 10:
+                localizer.restart()
+            localizer.add(registered, planar_scan)
+        assert localizer.answer().prior == became
+
+
+def test_a_prior_that_contradicts_where_the_robot_was_located_is_not_taken_for_lapsed() -> None:
+    scans, index = driven(in_office=True), building({"office": office()})
+    prior = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=scans[-8][0].scan.stamp_ns)
+    localizer, located = Localizer(index.within(prior)), 0
+    for registered, planar_scan, _ in scans:
+        estimate = localizer.add(registered, planar_scan)
+        located += estimate is not None and estimate.state == "located"
+    answer = localizer.answer()
+    assert located and (answer.status, answer.prior) == ("not_found", "used")
+    assert answer.excluded is not None and distance(answer.excluded.pose, scans[-1][2]) < 0.1
+
+
 def test_the_frame_of_the_prior_is_that_of_one_session() -> None:
     both = building({"twins": TWINS, "office": office()}, AT_ONCE)
     with pytest.raises(ConfigError, match="2 sessions") as caught:

@@ -39,6 +39,19 @@ def test_a_window_forgets_what_lies_farther_back() -> None:
     assert len(short.map().keyframes) < 20 < len(long.map().keyframes)
 
 
+def test_the_scans_since_a_slip_know_the_pose_of_a_later_time() -> None:
+    scans = list(drive(office(), [(1.5, 7.0), (9.5, 7.0)]))
+    for number, kept in ((-4, True), (4, False)):
+        seen = Query(OFFICE.made_with, OFFICE.config, prior_ns=scans[number][0].scan.stamp_ns)
+        for registered, planar_scan, _ in scans:
+            seen.add(registered, planar_scan)
+        whole, since = seen.map(), seen.since(10).map()
+        assert whole.T_odom_prior is not None and (since.T_odom_prior is not None) is kept
+        if kept:
+            assert since.T_odom_prior == whole.T_odom_prior
+            assert since.since_prior_m == pytest.approx(whole.since_prior_m)
+
+
 def test_standing_still_adds_nothing() -> None:
     seen = Query(OFFICE.made_with, OFFICE.config)
     registered, planar_scan, _ = next(drive(office(), [(1.5, 7.0), (9.5, 7.0)]))
