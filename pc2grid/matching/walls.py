@@ -75,11 +75,21 @@ class Walls:
     only_explain: bool = False
 
     @staticmethod
-    def of(grid: OccupancyGrid, parameters: WallParameters = WALLS, *, margin_m: float = 0.0) -> Walls:
-        """Prepare a grid; the field gets `margin_m` of unknown cells on each side."""
+    def of(
+        grid: OccupancyGrid,
+        parameters: WallParameters = WALLS,
+        *,
+        margin_m: float = 0.0,
+        drawn: bool = False,
+    ) -> Walls:
+        """Prepare a grid; the field gets `margin_m` of unknown cells on each side.
+
+        drawn : of a map that somebody else made, without what no ray can have ended in, see `_seen`.
+        """
         grid = padded_grid(grid, margin_m)
         if grid.heights is None:
-            return Walls._of(grid, grid.occupied, grid.occupied, parameters)
+            stands = _seen(grid) if drawn else grid.occupied
+            return Walls._of(grid, stands, stands, parameters)
         stands = grid.occupied | _things(grid, parameters)
         never_passed = stands & (grid.heights < 1 << SLICES)
         return replace(
@@ -96,7 +106,9 @@ class Walls:
         weights = steadiness(shown, cells, grid.resolution_m, parameters)
         weights[grid.things[cells[:, 0], cells[:, 1]]] *= parameters.movable
         return Walls(
-            field=LikelihoodField.around(stands, stands | grid.free, grid.resolution_m, grid.origin_m),
+            field=LikelihoodField.around(
+                stands, stands | grid.occupied | grid.free, grid.resolution_m, grid.origin_m
+            ),
             points_m=points_m,
             before_m=points_m,
             weights=weights,
@@ -143,6 +155,21 @@ def _things(grid: OccupancyGrid, parameters: WallParameters) -> BoolGrid:
     """(H, W) the things of a grid without grains of noise: the middle value around each cell."""
     things: BoolGrid = cv2.medianBlur(grid.things.astype(np.uint8), parameters.grain_cells) > 0
     return things
+
+
+def _seen(grid: OccupancyGrid) -> BoolGrid:
+    """The occupied cells (H, W) that a ray can have ended in: no deeper behind the face of a wall than the
+    field's standard deviation. In the thick walls of a drawn map, whatever a query has seen would fit.
+
+    A wall that no free ground is known before has no face, and stays as it is.
+    """
+    cells = cv2.distanceTransform((~grid.free).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    near = grid.occupied & (cells - 1.0 < LIKELIHOOD.sigma_m / grid.resolution_m)
+    count, labels = cv2.connectedComponents(grid.occupied.astype(np.uint8), connectivity=8)
+    with_face = np.zeros(count, bool)
+    with_face[labels[near]] = True
+    seen: BoolGrid = near | (grid.occupied & ~with_face[labels])
+    return seen
 
 
 def _edges(stands: BoolGrid) -> BoolGrid:

@@ -84,12 +84,13 @@ class SearchMap:
     images: U8
 
     @staticmethod
-    def of(grid: OccupancyGrid, *, from_below: bool = False) -> SearchMap:
+    def of(grid: OccupancyGrid, *, from_below: bool = False, drawn: bool = False) -> SearchMap:
         """Prepare a map. Everything outside it counts as unknown.
 
         from_below : for queries in a lower plane, to which its free space is as unknown ground.
+        drawn : see `Walls.of`.
         """
-        walls = Walls.of(grid, margin_m=MARGIN_M)
+        walls = Walls.of(grid, margin_m=MARGIN_M, drawn=drawn)
         values = walls.field.values
         if from_below:
             lifted = LIKELIHOOD.neutral * 255.0 + (1.0 - LIKELIHOOD.neutral) * values

@@ -126,7 +126,7 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     ('located', 4.0, 3.0)
     """
     clock = Clock()
-    query = map_as_query(grid, index.made_with, index.config)
+    query = map_as_query(grid, index.made_with, index.config, drawn=True)
     clock.lap("describe")
     found = index.look_up(query)
     clock.lap("look_up")

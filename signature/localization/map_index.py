@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -56,6 +56,7 @@ class MapIndex:
         areas_m2: Mapping[str, float] | None = None,
         stored: Callable[[str], SeenPlaces | None] = lambda session: None,
         frames: Mapping[str, BuildingFrame] | None = None,
+        drawn: Collection[str] = (),
     ) -> None:
         """grids : map of each session, in the order of `table.session_index`.
 
@@ -66,6 +67,7 @@ class MapIndex:
         stored : what is seen from the places of a session; None: it is computed from the map when it is
             needed.
         frames : where the sessions that are joined lie in their buildings.
+        drawn : the sessions whose maps somebody else made.
         """
         self.frames = dict(frames or {})
         self.made_with = made_with
@@ -84,10 +86,12 @@ class MapIndex:
             most_prepared = self.config.shortlist + self.config.hypotheses
         self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count, most)
         self.maps: LazySequence[SearchMap] = LazySequence(
-            lambda i: SearchMap.of(self.grids[i]), count, most_prepared
+            lambda i: SearchMap.of(self.grids[i], drawn=self.sessions[i] in drawn), count, most_prepared
         )
         self._from_above: LazySequence[SearchMap] = LazySequence(
-            lambda i: SearchMap.of(self.grids[i], from_below=True), count, most_prepared
+            lambda i: SearchMap.of(self.grids[i], from_below=True, drawn=self.sessions[i] in drawn),
+            count,
+            most_prepared,
         )
         self.places = Places(
             table,
@@ -128,7 +132,8 @@ class MapIndex:
         frames: Mapping[str, BuildingFrame] = {}
         with contextlib.suppress(DatabaseCorrupt):  # without them a search takes longer, and finds the same
             frames = database.frames()
-        index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored, frames)
+        drawn = {name for name, info in infos.items() if info.sensor == "map"}
+        index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored, frames, drawn)
         if is_large:
             index.places.without_histograms()
         index.surface_of = surface_reader(database)

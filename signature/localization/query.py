@@ -330,13 +330,19 @@ def query_of(
     )
 
 
-def map_as_query(grid: OccupancyGrid, made_with: Config, config: RelocalizeConfig) -> QueryMap:
+def map_as_query(
+    grid: OccupancyGrid, made_with: Config, config: RelocalizeConfig, *, drawn: bool = False
+) -> QueryMap:
     """Describe a map, or a part of one, of which it is not known from where it was seen.
 
     The origin of a map may lie anywhere, even far outside its walls. Poses turn about the best observed point
     instead: it is free, and the walls around it are known.
+
+    drawn : see `Walls.of`.
     """
     query = query_of(grid, np.empty((0, 2)), made_with, config)
+    if drawn:
+        query = replace(query, walls=Walls.of(grid, drawn=True))
     if not query.views:
         return query
     center = query.views[0].center_m

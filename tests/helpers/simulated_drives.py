@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -139,8 +139,9 @@ def building(
     config: Config | None = None,
     labels: dict[str, Label] | None = None,
     joined: dict[str, SE2] | None = None,
+    drawn: Collection[str] = (),
 ) -> MapIndex:
-    """A database in memory. joined : where sessions lie in the frame of one building."""
+    """A database in memory. joined : where sessions lie in their building. drawn : see `MapIndex`."""
     config = config or Config()
     signatures, centers, sessions, ids = [], [], [], []
     for index, grid in enumerate(grids.values()):
@@ -155,7 +156,7 @@ def building(
         name: BuildingFrame(name="building", T_building_session=T, covariance=exact)
         for name, T in (joined or {}).items()
     }
-    return MapIndex(grids, table, config, config, labels, frames=frames)
+    return MapIndex(grids, table, config, config, labels, frames=frames, drawn=drawn)
 
 
 def cut(grid: OccupancyGrid, x0: float, y0: float, x1: float, y1: float) -> OccupancyGrid:

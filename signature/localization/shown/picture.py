@@ -100,7 +100,11 @@ def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...
     """For each hypothesis of an answer, best first, what supports and what contradicts it."""
     query = Walls.of(answer.local_map)
     indices = {hypothesis.session_index for hypothesis in answer.hypotheses}
-    maps = {index: Walls.of(database.grid(answer.sessions[index])) for index in indices}
+    names = {index: answer.sessions[index] for index in indices}
+    maps = {
+        index: Walls.of(database.grid(name), drawn=not len(database.trajectory(name)))
+        for index, name in names.items()
+    }
     return tuple(
         agreement(maps[hypothesis.session_index], query, hypothesis.fit.T_map_query)
         for hypothesis in answer.hypotheses
@@ -182,11 +186,15 @@ def answer_figure(
 
     In a large map a second panel shows the place from near. Without any hypothesis there is only the map.
 
-    grid : the map. poses : the query in its own frame, empty for a map. way : path of the map's robot.
+    grid : the map. poses : the query in its own frame, empty for a map. way : path of the map's robot, empty
+    of a map that somebody else made.
     """
     best = answer.hypotheses[0] if answer.hypotheses else None
     session = answer.sessions[best.session_index if best else 0]
-    compared = agreement(Walls.of(grid), Walls.of(answer.local_map), best.fit.T_map_query) if best else None
+    compared = None
+    if best is not None:
+        walls = Walls.of(grid, drawn=way is not None and not len(way))
+        compared = agreement(walls, Walls.of(answer.local_map), best.fit.T_map_query)
     whole, close = _known(grid), None
     if best is not None and compared is not None and len(compared.points_m):
         close = _Box.around(best.fit.T_map_query.apply(compared.points_m), _CLOSE_MARGIN_M)

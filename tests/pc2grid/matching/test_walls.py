@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pc2grid.matching.likelihood_field import LIKELIHOOD
 from pc2grid.matching.walls import WALLS, WallParameters, Walls, thin_evenly
-from pc2grid.model import OCCUPIED, THING, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
 
 
 def test_a_wall_point_counts_by_the_size_of_its_object() -> None:
@@ -33,6 +34,47 @@ def test_thinning_keeps_the_first_point_of_each_square(seed: int, count: int, fa
     squares = np.floor(points / 0.4).astype(np.int64)
     first = np.unique(squares, axis=0, return_index=True)[1]
     assert np.array_equal(thin_evenly(points, 0.4), np.sort(first))
+
+
+def drawn(thick_m: float, resolution_m: float) -> OccupancyGrid:
+    """A corridor of 2 m between walls, x from 0 to 8 m, with unknown ground behind them."""
+    cells = np.full((round(6.0 / resolution_m), round(8.0 / resolution_m)), UNKNOWN, np.int8)
+    free, wall = round(2.0 / resolution_m), max(round(thick_m / resolution_m), 1)
+    cells[free - wall : 2 * free + wall] = OCCUPIED
+    cells[free : 2 * free] = FREE
+    return OccupancyGrid(cells=cells, resolution_m=resolution_m, origin_m=(0.0, 0.0))
+
+
+@pytest.mark.parametrize("resolution_m", [0.02, 0.05, 0.1])
+def test_inside_a_thick_wall_no_ray_has_ended(resolution_m: float) -> None:
+    """Points 0.4 m behind its face fit nowhere, and are no longer taken for points on the wall."""
+    grid = drawn(0.6, resolution_m)
+    inside_m, face_m = ([(x, y) for x in np.arange(1.0, 7.0, 0.1)] for y in (1.6, 2.0 - 0.5 * resolution_m))
+    whole, seen = (Walls.of(grid, drawn=only) for only in (False, True))
+    for walls, fits in ((whole, True), (seen, False)):
+        likelihood, known = walls.field.at(np.array(inside_m))
+        assert known.all() and ((likelihood > LIKELIHOOD.neutral).all() if fits else likelihood.max() < 0.05)
+        assert (walls.field.at(np.array(face_m))[0] == 1.0).all()
+    assert seen.points_m[:, 1].min() > 2.0 - 2.0 * LIKELIHOOD.sigma_m and len(seen.points_m) < len(
+        whole.points_m
+    )
+
+
+@pytest.mark.parametrize(("thick_m", "resolution_m"), [(0.1, 0.05), (0.25, 0.25), (0.1, 0.02)])
+def test_thin_walls_stay_as_they_are(thick_m: float, resolution_m: float) -> None:
+    grid = drawn(thick_m, resolution_m)
+    whole, seen = (Walls.of(grid, drawn=only) for only in (False, True))
+    assert np.array_equal(whole.points_m, seen.points_m)
+    assert np.array_equal(whole.field.values, seen.field.values)
+
+
+def test_a_wall_before_which_no_free_ground_is_known_stays_as_it_is() -> None:
+    """Far walls of a single scan: what is free between its rays is not known."""
+    cells = drawn(0.1, 0.05).cells.copy()
+    cells[100, ::7] = OCCUPIED
+    grid = OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0))
+    far = Walls.of(grid, drawn=True).points_m[:, 1] > 4.5
+    assert far.sum() == len(cells[100, ::7])
 
 
 OF_A_LASER = Walls.of(

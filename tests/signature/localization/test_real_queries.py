@@ -15,6 +15,7 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
+from pc2grid.io.nav2_map import load_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import RegisteredScan, Scan, Trajectory
@@ -23,6 +24,7 @@ from signature.config import Config
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
+from signature.localization.pose_check import check_pose
 from tests.helpers.simulated_drives import building
 
 CONFIG = Config()
@@ -96,3 +98,15 @@ def test_a_query_in_which_tracking_slips_is_not_located(first: int) -> None:
         pose = answer.T_map_base
         right = pose is not None and math.dist((pose.x, pose.y), (expected.x, expected.y)) < 0.2
         assert right if start == 4 else right or answer.status != "located"
+
+
+def test_in_the_thick_walls_of_a_drawn_map_not_everything_fits() -> None:
+    """A hall in the course's own map of the floor, whose walls are 0.3 to 0.6 m thick and bent. 26 m away, a
+    third of what the robot has seen lay within them, though a wall stood straight across a corridor there."""
+    map_ = load_map(data("laser/wean/wean.yaml"))
+    index = building({"wean": map_}, drawn={"wean"})
+    with open_log(data("laser/wean/robotdata1.mcap")) as log:
+        scans = list(follow(log.scans(0.0, 30.0), CONFIG))
+    answer = ask(scans, index)
+    assert answer.status == "not_found" and answer.confidence < 0.25
+    assert check_pose(scans, index, SE2(20.42, 11.66, math.radians(-1.7))).status != "fine"
