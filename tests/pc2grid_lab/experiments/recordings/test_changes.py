@@ -135,13 +135,15 @@ def test_the_page_shows_each_row() -> None:
     (bent,) = [line for line in text.splitlines() if line.startswith("| hall | hall | lidar")]
     assert "bent (false)" in bent and "| 0.030 |" in bent
     assert "| wean\\|3 |" in text and "internal error: KeyError |" in text
-    assert "| b | a | laser | 3 | 3 | 2 | 1 | **1** | 1 | 1 of 3 [0.01, 0.91] | 0 | 0.040 | 1/0/1 |" in text
+    assert (
+        "| b | a | laser | 3 | 3 | 2 | 1 | **1** | 0 | 1 | 1 of 3 [0.01, 0.91] | 0 | 0.040 | 1/0/1 |" in text
+    )
     assert "not in the data folder" in text
     assert "the window from 10.0 s, 5.00 m off, confidence 0.990" in text
     assert "- **worse** hall: error 0.030 -> 0.730 m" in text
     assert "2 of 2 [0.16, 1.00] (hall, intel)" in text
     widths = {line.count("|") - line.count("\\|") for line in text.splitlines() if line.startswith("| b |")}
-    assert widths == {16}
+    assert widths == {17}
 
 
 def test_intervals_are_exact() -> None:
@@ -171,6 +173,16 @@ def test_the_matrix_of_sensors_shows_its_gaps() -> None:
     assert driven["driven lidar"] == ["-", "-", "1 of 2, 1 wrong (1 building)", "-"]
     assert driven["driven depth"] == ["-", "1 of 1, 0 wrong (1 building)", "-", "-"]
     assert driven["laser"] == ["-"] * 4  # what is not driven stands in the table above
+
+
+def test_answers_that_are_not_judged_are_counted_beside_right_and_wrong() -> None:
+    located = replace(query(0, "right"), right=None)
+    row = pair_row(queries=(query(1, "right"), query(2, "refused"), located), sensors="laser in map")
+    assert (row.counts.right, row.counts.wrong, row.counts.unjudged, row.counts.refused) == (1, 0, 1, 1)
+    text = page(table(row))
+    assert "0 wrong, 1 not judged (1 building)" in text
+    assert "No answer that is judged is wrong." in text and "## Not judged" in text
+    assert "not judged" not in sensor_matrix(table(pair_row("right", "wrong")))[2]
 
 
 def test_wrong_answers_are_counted_by_confidence_and_by_drive() -> None:

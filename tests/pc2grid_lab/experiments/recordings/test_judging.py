@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.recordings import judging
-from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
+from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
 from pc2grid_lab.experiments.recordings.children import Finished
 from pc2grid_lab.experiments.recordings.drive import RecordedDrive, known_share, levelled
 from pc2grid_lab.experiments.recordings.judging import Judge, LocatedWindow
@@ -116,6 +117,42 @@ def test_answers_both_ways_judge_each_other(monkeypatch: pytest.MonkeyPatch) -> 
     assert [query.right for query in second.queries] == [True, True, False]
     del known[a_in_b]
     assert Known(known).row(B_IN_A).truth is None
+
+
+@pytest.fixture
+def driven(monkeypatch: pytest.MonkeyPatch) -> Trajectory:
+    """The own trajectory of every recording, a pose a second."""
+    poses = np.array([pose(k).lift() for k in range(6)])
+    way = Trajectory(stamps_ns=np.arange(6) * 1_000_000_000, T_session_base=poses)
+    monkeypatch.setattr(judging, "drive_of", lambda *_: RecordedDrive((way,), None))
+    return way
+
+
+@pytest.mark.usefixtures("driven")
+def test_one_pose_found_by_hand_judges_a_drive() -> None:
+    """Within what the drawn map allows; the third answer is as near, but turned."""
+    known = T_PLAN_A @ pose(1)
+    by_hand = PlacedByHand(at_s=1.1, x_m=known.x, y_m=known.y, yaw_deg=math.degrees(known.yaw), within_m=1.0)
+    pair = replace(A_IN_PLAN, windows=4, by_hand=by_hand)
+    offs = (SE2(0.8, 0.0, 0.0), SE2(1.4, 0.0, 0.0), SE2(0.0, 0.0, 0.2), SE2(-26.0, 0.0, 0.0))
+    row = Known({pair: [located("a", k, T_PLAN_A @ pose(k) @ off) for k, off in enumerate(offs)]}).row(pair)
+    assert row.truth == "hand" and [query.right for query in row.queries] == [True, False, False, False]
+    assert row.counts.unjudged == 0
+
+
+def test_later_parts_are_judged_by_the_trajectory_of_the_whole(
+    driven: Trajectory, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The map of the first three seconds has a frame of its own."""
+    begun = Trajectory(
+        stamps_ns=driven.stamps_ns[:3],
+        T_session_base=np.array([(T_A_B @ pose(k)).lift() for k in range(3)]),
+    )
+    monkeypatch.setattr(judging, "sessions", lambda *_: {"map": begun})
+    pair = Pair(query="a", map="a", kind="later part", window_s=1.0, windows=2, until_s=3.0)
+    answers = [located("a", 3, T_A_B @ pose(3)), located("a", 4, T_A_B @ pose(4) @ SE2(2.0, 0.0, 0.0))]
+    row = Known({pair: answers}).row(pair)
+    assert row.truth == "trajectory" and [query.right for query in row.queries] == [True, False]
 
 
 def test_elsewhere_nothing_is_right() -> None:

@@ -67,10 +67,12 @@ class Clue:
 class Frame:
     """How a recording lies in a map, by places that are known in both; the map may be bent.
 
-    clues : at least two of them, at different places or with headings.
+    clues : at least two of them, at different places or with headings. within_m : how far a right answer may
+    be from where they say, beside the bend.
     """
 
     clues: tuple[Clue, ...]
+    within_m: float = JUDGEMENT.right_recorded_m
 
     def place(self, T_drive_base: SE2, *, without: tuple[str, int] | None = None) -> tuple[SE2, float]:
         """Where a pose of the recording is in the map, and how far from there a right answer may be, metres.
@@ -82,7 +84,7 @@ class Frame:
         order = np.argsort(away_m, kind="stable")
         near = max(int(np.sum(away_m <= AGREEMENT.around_m)), min(2, len(clues)))
         T_map_drive = _fit([clues[k] for k in order[:near]])
-        within_m = JUDGEMENT.right_recorded_m + AGREEMENT.bend * float(away_m[order[0]])
+        within_m = self.within_m + AGREEMENT.bend * float(away_m[order[0]])
         return T_map_drive @ T_drive_base, within_m
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -13,8 +14,9 @@ from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.time_span import TimeSpan
+from pc2grid_lab.experiments.frames import nearest
 from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
-from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
+from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
 from pc2grid_lab.experiments.recordings.children import Finished, kept
 from pc2grid_lab.experiments.recordings.clouds import cloud_along, registered_clouds
 from pc2grid_lab.experiments.recordings.drive import (
@@ -176,16 +178,16 @@ class Judge:
     def _frames(
         self, pair: Pair, query: Recording, map_: Recording
     ) -> tuple[Truth | None, list[LocatedWindow], Frames]:
-        """The windows, and how the parts of the drive lie in the sessions of the map: by true poses, else by
-        the clouds of both, else by the answers.
+        """The windows, and how the parts of the drive lie in the sessions of the map: by true poses, by the
+        trajectory of the whole recording, by hand, by the clouds of both, or else by the answers.
         """
         windows = self._located_windows(pair)
         if query.poses is not None and query.poses == map_.poses:
-            placed = {
-                (-1, session): self._true_frame(map_, trajectory)
-                for session, trajectory in sessions(self._folder, pair.map_name).items()
-            }
-            return "poses", windows, {key: frame for key, frame in placed.items() if frame is not None}
+            return "poses", windows, self._by_scans(pair, map_)
+        if pair.query == pair.map:
+            return "trajectory", windows, self._by_scans(pair, map_)
+        if pair.by_hand is not None:
+            return "hand", windows, self._by_hand(query, pair.by_hand)
         if pair.until_s is None and (by_clouds := self._by_clouds(query, map_)) is not None:
             own = [replace(one, where=self._own(query, one)) for one in windows]
             return "clouds", own, {(0, _SESSION): by_clouds}
@@ -266,15 +268,27 @@ class Judge:
             for one in self._located_windows(pair)
         ]
 
-    def _true_frame(self, map_: Recording, trajectory: Trajectory) -> Frame | None:
-        """The frame of a session of the map in the world, by its own scans, one on each `_STEP_M`."""
+    def _by_scans(self, pair: Pair, map_: Recording) -> Frames:
+        """How the sessions of the map lie in the world, or in the whole drive that they are a part of: by
+        their own scans, one on each `_STEP_M`."""
         drive = drive_of(map_, self._folder)
-        clues = [
-            Clue(true, SE2.from_matrix(trajectory.T_session_base[k]))
-            for k in _steps(trajectory)
-            if (true := drive.true_pose(int(trajectory.stamps_ns[k]))) is not None
-        ]
-        return Frame(tuple(clues)) if len(clues) >= 2 else None
+        clues: dict[tuple[int, str], list[Clue]] = {}
+        for session, trajectory in sessions(self._folder, pair.map_name).items():
+            for k in _steps(trajectory):
+                where = drive.where(int(trajectory.stamps_ns[k]))
+                if where is not None:
+                    clue = Clue(where[1], SE2.from_matrix(trajectory.T_session_base[k]))
+                    clues.setdefault((where[0], session), []).append(clue)
+        return {key: Frame(tuple(found)) for key, found in clues.items() if len(found) >= 2}
+
+    def _by_hand(self, query: Recording, known: PlacedByHand) -> Frames:
+        """The frame of the recording's first part in the map, by one pose."""
+        drive = drive_of(query, self._folder).parts[0]
+        at_ns = drive.stamps_ns[0] + round(known.at_s * 1e9)
+        (k,) = nearest(drive.stamps_ns, np.array([at_ns]), math.inf)
+        T_map_base = SE2(known.x_m, known.y_m, math.radians(known.yaw_deg))
+        clue = Clue(SE2.from_matrix(drive.T_session_base[k]), T_map_base)
+        return {(0, _SESSION): Frame((clue,), known.within_m)}
 
 
 def _steps(trajectory: Trajectory) -> list[int]:

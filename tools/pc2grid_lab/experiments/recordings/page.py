@@ -130,6 +130,7 @@ _PLACES = (
         "located",
         "right",
         "wrong",
+        "not judged",
         "refused",
         "right of covered",
         "rank",
@@ -152,22 +153,26 @@ def _places(table: Table) -> list[str]:
         "covered: the map knows half of the ground that the last scan sees there. right: within 0.3 m and 3",
         "degrees. rank: places before the right one, of covered queries that are not located (-: it is not",
         "among the hypotheses). error: median of the right ones. in space: answers with which the points of",
-        "the map agree / do not tell / disagree, if it has points. judged by: true poses of both; or the",
-        "clouds of both, registered in space; or the answers themselves, which must lie on one rigid",
-        "transform of the drive's own trajectory (how many do); elsewhere: another building, where every",
-        "answer is wrong. In brackets the 95 % interval of Clopper and Pearson.",
+        "the map agree / do not tell / disagree, if it has points. judged by: true poses of both; the",
+        "trajectory of the whole recording, whose beginning is the map; a pose found by hand in a drawn",
+        "map, within 1 m; the clouds of both, registered in space; or the answers themselves, which must",
+        "lie on one rigid transform of the drive's own trajectory (how many do); elsewhere: another",
+        "building, where every answer is wrong. not judged: located, where the true place is not known.",
+        "In brackets the 95 % interval of Clopper and Pearson.",
     ]
 
 
 def _pair_cells(row: PairRow) -> list[str]:
     if row.problem:
-        return [row.query, row.map, row.sensors, *[""] * 11, row.problem]
+        return [row.query, row.map, row.sensors, *[""] * 12, row.problem]
     counts = row.counts
     judged = {
         "poses": "poses",
         "elsewhere": "elsewhere",
         "clouds": "clouds",
         "agreement": f"{row.agreeing} answers",
+        "trajectory": "trajectory",
+        "hand": "hand",
         None: "not judged",
     }[row.truth]
     failed = f" ({counts.failed} failed)" if counts.failed else ""
@@ -182,6 +187,7 @@ def _pair_cells(row: PairRow) -> list[str]:
         str(counts.located),
         str(counts.right) if known else "",
         _strong(counts.wrong) if known else "",
+        str(counts.unjudged),
         str(counts.refused),
         _share(counts.covered_right, counts.covered),
         " ".join("-" if rank is None else str(rank) for rank in row.ranks),
@@ -218,7 +224,7 @@ def sensor_matrix(table: Table) -> list[str]:
     return [
         *_matrix(groups, _SENSORS, _SENSORS),
         "",
-        "Right of covered, and wrong. -: there is no such pair of real recordings.",
+        "Right of covered, wrong, and located but not judged. -: there is no such pair of real recordings.",
         "",
         *_matrix(driven, ("laser", *_DRIVEN), (*_DRIVEN, "laser")),
         "",
@@ -245,6 +251,8 @@ def _sensor_cell(rows: Sequence[PairRow]) -> str:
     judged = f"{counts.covered_right} of {counts.covered}, {counts.wrong} wrong"
     if all(row.truth is None for row in rows):
         judged = f"{counts.located} of {counts.queries} located, not judged"
+    elif counts.unjudged:
+        judged += f", {counts.unjudged} not judged"
     return f"{judged} ({buildings} building{'s' if buildings > 1 else ''})"
 
 
@@ -259,7 +267,8 @@ def _by_building(table: Table) -> list[str]:
             "queries",
             "covered",
             "right of covered",
-            "wrong of located",
+            "wrong of judged",
+            "not judged",
             "elsewhere: wrong of asked",
         ),
         (),
@@ -293,6 +302,7 @@ def _building_cells(name: str, inside: Sequence[PairRow], outside: Sequence[Pair
         str(counts.covered),
         _share(counts.covered_right, counts.covered),
         _share(counts.wrong, counts.right + counts.wrong),
+        str(counts.unjudged),
         _share(other.wrong, other.queries),
     ]
 
@@ -389,23 +399,29 @@ def _followed_cells(row: FollowedRow) -> list[str]:
 
 
 def _failures(table: Table) -> list[str]:
-    """Every wrong answer, with what the next one needs to ask for it again."""
-    lines = [
-        f"- {row.name}, {row.kind}: the window from {query.start_s:.1f} s, "
-        + (f"{query.error_m:.2f} m off, " if query.error_m is not None else "")
-        + f"confidence {query.confidence or 0:.3f}"
-        for row in table.pairs
-        for query in row.queries
-        if query.located and query.right is False
-    ]
+    """Every wrong answer, and every one that is not judged, with what is needed to ask for it again."""
+    wrong, unjudged = (
+        [
+            f"- {row.name}, {row.kind}: the window from {query.start_s:.1f} s, "
+            + (f"{query.error_m:.2f} m off, " if query.error_m is not None else "")
+            + f"confidence {query.confidence or 0:.3f}"
+            for row in table.pairs
+            for query in row.queries
+            if query.located and query.right is right
+        ]
+        for right in (False, None)
+    )
     problems = [
         f"- {row.name}: the window from {query.start_s:.1f} s: {query.problem}"
         for row in table.pairs
         for query in row.queries
         if query.problem not in ("", NOT_RUN)
     ]
-    found = ["## Wrong answers", "", *lines, ""] if lines else ["No answer is wrong.", ""]
-    return found + (["## Failed", "", *problems, ""] if problems else [])
+    none = "No answer that is judged is wrong." if unjudged else "No answer is wrong."
+    found = ["## Wrong answers", "", *wrong, ""] if wrong else [none, ""]
+    for title, lines in (("Not judged", unjudged), ("Failed", problems)):
+        found += [f"## {title}", "", *lines, ""] if lines else []
+    return found
 
 
 def _changed(changed: Sequence[RowChange]) -> list[str]:

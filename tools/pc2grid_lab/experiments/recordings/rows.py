@@ -13,8 +13,9 @@ from pydantic import TypeAdapter
 NOT_RUN = "was not run"
 """The problem of a row whose commands were not run, because the run ended early."""
 Verdict = Literal["right", "false", "unknown"]
-Truth = Literal["poses", "clouds", "agreement", "elsewhere"]
-"""How answers are judged: by true poses of query and map, by each other, or as nothing can be right."""
+Truth = Literal["poses", "trajectory", "hand", "clouds", "agreement", "elsewhere"]
+"""How answers are judged: by true poses of query and map, by the trajectory of the recording whose beginning
+is the map, by a pose found by hand, by clouds, by each other, or as nothing can be right."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -88,8 +89,9 @@ class QueryRow:
 class Counts:
     """The queries of a row, or of several.
 
-    right, wrong : located and right, located and wrong, of those whose answer can be judged. refused : not
-        located. covered : judged, and in the map; covered_right : of those, located and right.
+    right, wrong : located and right, located and wrong, of those whose answer can be judged; unjudged :
+        located, of the others. refused : not located. covered : judged, and in the map; covered_right : of
+        those, located and right.
     """
 
     queries: int
@@ -98,6 +100,7 @@ class Counts:
     right: int
     covered_right: int
     wrong: int
+    unjudged: int
     failed: int
 
     @staticmethod
@@ -111,6 +114,7 @@ class Counts:
             right=sum(q.right is True for q in located),
             covered_right=sum(q.right is True and q.covered is True for q in located),
             wrong=sum(q.right is False for q in located),
+            unjudged=sum(q.right is None for q in located),
             failed=sum(bool(q.problem) for q in queries),
         )
 
