@@ -42,6 +42,8 @@ class CarriedParameters:
     starts : placements that a search refines in space. turned_rad : by how much these may be turned, a
         standard deviation: more than a step of the search.
     most_waiting : scans that wait for one that shows the floor, or for a motion, at most: some 50 MB.
+    standing_s : a base that stands level for so long is on wheels: a robot that waits to be located must not
+        wait for its own motion, and a hand has trembled by then.
     """
 
     least_agreement: float = 0.85
@@ -49,6 +51,7 @@ class CarriedParameters:
     starts: int = 10
     turned_rad: float = 0.1
     most_waiting: int = 100
+    standing_s: float = 5.0
 
 
 CARRIED = CarriedParameters()
@@ -213,7 +216,7 @@ def begin(scans: Iterator[Scan], parameters: CarriedParameters = CARRIED) -> Beg
     does, all of them are kept: the sensor is taken to be held level.
     """
     ahead = islice(scans, parameters.most_waiting)
-    waiting, in_hand = _until_decided(ahead)
+    waiting, in_hand = _until_decided(ahead, parameters.standing_s)
     if not in_hand:
         return Beginning(waiting)
     unknown = "no floor, and neither odometry nor an IMU says which way is up"
@@ -228,11 +231,11 @@ def begin(scans: Iterator[Scan], parameters: CarriedParameters = CARRIED) -> Beg
     return Beginning(seen, True, warning=said)
 
 
-def _until_decided(scans: Iterator[Scan]) -> tuple[list[Scan], bool]:
+def _until_decided(scans: Iterator[Scan], standing_s: float) -> tuple[list[Scan], bool]:
     """Take scans until they tell whether the sensor is in the hand; returns them, and whether it is.
 
-    A hand that stands still, or a phone on a table, may be level. So only scans count after which the base
-    has moved, or of which that is not known.
+    A hand may be level for a moment. So only scans count after which the base has moved, or of which that is
+    not known; or a base that has stood for so long.
     """
     waiting: list[Scan] = []
     moving = 0
@@ -241,7 +244,8 @@ def _until_decided(scans: Iterator[Scan]) -> tuple[list[Scan], bool]:
         if not is_rolling(scan, waiting[0]):
             return waiting, True
         moving += _has_moved(waiting[0], scan)
-        if SENSOR_MODELS[scan.sensor].planar or moving == DECIDING_SCANS:
+        stands = not moving and scan.stamp_ns - waiting[0].stamp_ns > standing_s * 1e9
+        if SENSOR_MODELS[scan.sensor].planar or moving == DECIDING_SCANS or stands:
             break
     return waiting, False
 

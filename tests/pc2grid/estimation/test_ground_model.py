@@ -115,6 +115,14 @@ def test_the_scans_of_the_first_metres_decide_whether_a_robot_is_on_wheels(
     assert len(beginning.scans) < standing + 35
 
 
+def test_a_robot_that_stands_is_not_waited_for_longer_than_some_seconds() -> None:
+    floor, walls = hall()
+    scan = replace(scan_of(np.concatenate((floor, walls)), mounted_m=1.0), T_odom_base=np.eye(4))
+    standing = [replace(scan, stamp_ns=k * 500_000_000) for k in range(60)]
+    beginning = begin(iter(standing))
+    assert not beginning.in_hand and len(beginning.scans) == 12
+
+
 def test_a_laser_and_a_tilted_sensor_are_known_from_their_first_scan() -> None:
     floor, walls = hall()
     scan = replace(scan_of(np.concatenate((floor, walls)), mounted_m=1.0), T_odom_base=np.eye(4))
