@@ -89,7 +89,7 @@ def optimise(
     non-convexity, Yang et al. 2020): large drift is taken out by loops that agree, and a false loop is
     outvoted. But together false loops still pull, each by the inverse of its error. So the graph is solved
     again with fixed weights. A loop that has kept `kept` of its weight counts in full; beyond, its pull falls
-    with the third power of its error. There is no edge of being dropped at which a map would hang on the last
+    with the fifth power of its error. There is no edge of being dropped at which a map would hang on the last
     bit of a number.
     """
     poses = np.array(poses, dtype=np.float64)
@@ -120,7 +120,7 @@ def optimise(
             if scale.max() == 1.0 and np.abs(delta).max() < parameters.converged:
                 break
             scale = np.maximum(scale / parameters.annealing, 1.0)
-        fixed = np.minimum(1.0 / (1.0 + chi2 / limit) / parameters.kept, 1.0) ** 2
+        fixed = np.minimum(1.0 / (1.0 + chi2 / limit) / parameters.kept, 1.0) ** 3
     return Solution(poses, ~loop | (chi2 <= limit))
 
 

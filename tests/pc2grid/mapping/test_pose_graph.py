@@ -79,11 +79,13 @@ def test_sixty_false_loops_of_150_leave_a_map_as_exact_as_without_them() -> None
         assert not solved[1].accepted[-FALSE_LOOPS:].any()
         errors.append([rmse_m(poses, truth) for poses in (array(tracked), *(s.poses for s in solved))])
     assert median(as_tracked_m / by_true_m for as_tracked_m, by_true_m, _ in errors) > 4.0
-    assert abs(median(with_false_m / by_true_m for _, by_true_m, with_false_m in errors) - 1.0) < 0.02
+    assert abs(median(with_false_m / by_true_m for _, by_true_m, with_false_m in errors) - 1.0) < 0.005
+    _, by_true_m, with_false_m = map(median, zip(*errors, strict=True))
+    assert abs(with_false_m / by_true_m - 1.0) < 0.01
 
 
 def test_poses_do_not_hang_on_a_loop_at_the_edge_of_being_rejected() -> None:
-    """A loop that contradicts a chain more and more: each millimetre moves the poses by less than two."""
+    """A loop that contradicts a chain more and more: each millimetre moves the poses by less than four."""
     steps = [Edge(k, k + 1, SE2(1.0), np.diag([1e4, 1e4, 1e4])) for k in range(4)]
     start = array([SE2(float(k)) for k in range(5)])
 
@@ -94,5 +96,5 @@ def test_poses_do_not_hang_on_a_loop_at_the_edge_of_being_rejected() -> None:
 
     ends_m, accepted = zip(*(end_m(0.001 * k) for k in range(1000)), strict=True)
     assert accepted[0] and not accepted[-1]
-    assert np.abs(np.diff(ends_m)).max() < 0.002
+    assert np.abs(np.diff(ends_m)).max() < 0.004
     assert abs(ends_m[-1] - 4.0) < 0.01
