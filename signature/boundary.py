@@ -9,6 +9,7 @@ whole.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,8 +54,23 @@ def boundary_histogram(points: I64, radius_m: float, resolution_m: float, config
     points : (N, 2) cells. Returns (N_hb,) float32, sum 1; all 0 if there are fewer than two points.
     Distances of 2 r and more count in the last bin.
     """
-    in_bins = points.astype(np.float64) * (resolution_m / config.boundary_bin_m)
-    return normalized(pair_distance_counts(in_bins, boundary_bins(radius_m, config)))
+    from signature import _kernels
+
+    bins = boundary_bins(radius_m, config)
+    bin_of = _bins_of_squares(resolution_m / config.boundary_bin_m, bins)
+    return normalized(_kernels.pair_counts(points, bin_of, bins))
+
+
+@lru_cache(maxsize=8)
+def _bins_of_squares(cell_bins: float, bins: int) -> NDArray[np.int32]:
+    """The bin of the distance of two cells by its square in cells: 0, 1, 2, ... up to that of the last bin.
+
+    cell_bins : width of a cell in bins.
+    """
+    squares = np.arange(math.ceil((bins / cell_bins) ** 2) + 1)
+    at = np.minimum(np.sqrt(squares) * cell_bins + ROUNDING_BINS, bins - 1).astype(np.int32)
+    at.flags.writeable = False
+    return at
 
 
 def pair_distance_counts(points: F64, bins: int) -> I64:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.arrays import F32, freeze
+from pc2grid.arrays import F32, F64, freeze
 from pc2grid.model import Submap
 from signature.boundary import boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
@@ -50,10 +50,14 @@ def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Sig
     >>> round(float(signature.boundary.sum()), 5)
     1.0
     """
+    return described(submap, shortest_paths(freespace_graph(submap, config)), config)
+
+
+def described(submap: Submap, paths_m: F64, config: SignatureConfig) -> Signature:
+    """The three signatures of a submap, given the lengths L^F (N, N) of the paths in its free space."""
     radius_m, resolution_m = submap.radius_m, submap.grid.resolution_m
     edges = boundary_edges(submap, config)
     points = boundary_points(edges, resolution_m, config)
-    paths_m = shortest_paths(freespace_graph(submap, config))
     return Signature(
         boundary=boundary_histogram(points, radius_m, resolution_m, config),
         freespace=freespace_histogram(paths_m, radius_m, config),

@@ -77,16 +77,26 @@ def visibility_graph(
     longer than `config.freespace_join_m` are left out.
     """
     import networkx as nx
-    from scipy.spatial.distance import pdist
-
-    from signature import _kernels
 
     graph = nx.Graph()
     graph.add_nodes_from(
         (node, {"center_m": (x, y)}) for node, (x, y) in enumerate(grid.to_point(cells).tolist())
     )
-    if len(cells) < 2:
-        return graph
+    first, second, length_m = _edges(grid, cells, config)
+    graph.add_weighted_edges_from(
+        zip(first.tolist(), second.tolist(), length_m.tolist(), strict=True), weight="length_m"
+    )
+    return graph
+
+
+def _edges(
+    grid: OccupancyGrid, cells: I64, config: SignatureConfig
+) -> tuple[NDArray[np.intp], NDArray[np.intp], F64]:
+    """The edges of `visibility_graph`: their nodes i < j (E,) and (E,), and their lengths (E,) in metres."""
+    from scipy.spatial.distance import pdist
+
+    from signature import _kernels
+
     # Both list the pairs i < j in the same order.
     first, second = np.triu_indices(len(cells), 1)
     length_m = pdist(cells) * grid.resolution_m
@@ -95,11 +105,7 @@ def visibility_graph(
         first, second, length_m = first[near], second[near], length_m[near]
     occupied = np.ascontiguousarray(grid.occupied)
     joined = _kernels.in_sight(occupied, np.ascontiguousarray(cells), first, second)
-    graph.add_weighted_edges_from(
-        zip(first[joined].tolist(), second[joined].tolist(), length_m[joined].tolist(), strict=True),
-        weight="length_m",
-    )
-    return graph
+    return first[joined], second[joined], length_m[joined]
 
 
 def shortest_paths(graph: nx.Graph) -> F64:
@@ -120,6 +126,23 @@ def shortest_paths(graph: nx.Graph) -> F64:
     starts = np.cumsum([0, *map(len, neighbours)], dtype=np.int32)
     weights = csr_array((np.array(lengths_m, np.float64), ends, starts), shape=(len(graph), len(graph)))
     return np.asarray(floyd_warshall(weights), np.float64)
+
+
+def freespace_paths(submap: Submap, config: SignatureConfig = SignatureConfig()) -> F64:
+    """Lengths (N, N) as of `shortest_paths(freespace_graph(submap, config))`, from its edges alone.
+
+    For experiments that describe tens of thousands of submaps: the graph takes a quarter of the time.
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import floyd_warshall
+
+    cells = freespace_nodes(submap, config)
+    if not len(cells):
+        return np.empty((0, 0))
+    first, second, length_m = _edges(submap.grid, cells, config)
+    starts = np.searchsorted(first, np.arange(len(cells) + 1))
+    weights = csr_array((length_m, second, starts), shape=(len(cells), len(cells)))
+    return np.asarray(floyd_warshall(weights, directed=False), np.float64)
 
 
 def freespace_bins(radius_m: float, config: SignatureConfig) -> int:

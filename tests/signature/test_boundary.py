@@ -12,6 +12,8 @@ from signature.boundary import (
     boundary_edges,
     boundary_histogram,
     boundary_points,
+    normalized,
+    pair_distance_counts,
 )
 from signature.config import SignatureConfig
 from tests.helpers.rooms import RESOLUTION_M, rectangle, submap_of
@@ -70,6 +72,23 @@ def test_matches_brute_force(seed: int, count: int, bin_m: float) -> None:
     points = np.random.default_rng(seed).integers(0, 226, (count, 2))
     found = boundary_histogram(points, 8.0, RESOLUTION_M, config)
     assert found == pytest.approx(brute_force(points, config), abs=1e-6)
+
+
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(0, 200),
+    cell_m=st.sampled_from([0.05, 0.05000000074505806, 0.1, 0.03]),
+    bin_m=st.sampled_from([0.1, 0.2, 0.3, 0.25]),
+)
+@settings(max_examples=40, deadline=None)
+def test_the_compiled_counts_of_cells_are_those_of_their_distances(
+    seed: int, count: int, cell_m: float, bin_m: float
+) -> None:
+    """Of squares in whole cells as of distances as floating point, bit for bit; some are longer than 2 r."""
+    config = SignatureConfig(boundary_bin_m=bin_m)
+    points = np.random.default_rng(seed).integers(0, 400, (count, 2))
+    plain = pair_distance_counts(points * (cell_m / bin_m), boundary_bins(8.0, config))
+    assert np.array_equal(boundary_histogram(points, 8.0, cell_m, config), normalized(plain))
 
 
 def test_only_clearly_occupied_cells_are_boundary() -> None:

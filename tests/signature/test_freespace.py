@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from pc2grid.arrays import I64, BoolGrid
-from pc2grid.model import FREE, OCCUPIED
+from pc2grid.model import FREE, OCCUPIED, UNKNOWN
 from signature import _kernels
 from signature.config import SignatureConfig
 from signature.freespace import (
@@ -20,6 +20,7 @@ from signature.freespace import (
     freespace_graph,
     freespace_histogram,
     freespace_nodes,
+    freespace_paths,
     shortest_paths,
     visibility_graph,
 )
@@ -93,6 +94,22 @@ def test_path_lengths_are_those_of_networkx_dijkstra(seed: int) -> None:
     plain = dict(nx.all_pairs_dijkstra_path_length(graph, weight="length_m"))
     for i, j in itertools.product(range(len(nodes)), repeat=2):
         assert lengths[i, j] == pytest.approx(plain[i].get(j, np.inf), rel=1e-5)
+
+
+@given(seed=st.integers(0, 500), join_m=st.sampled_from([None, 1.5]))
+@settings(max_examples=12, deadline=None)
+def test_paths_without_a_graph_are_those_of_the_graph(seed: int, join_m: float | None) -> None:
+    submap, config = submap_of(random_rooms(seed)), SignatureConfig(freespace_join_m=join_m)
+    lengths = shortest_paths(freespace_graph(submap, config))
+    assert len(lengths) > 2 and np.array_equal(freespace_paths(submap, config), lengths)
+
+
+@pytest.mark.parametrize("size_m", [0.0, 0.8])
+def test_no_node_and_one_node_have_no_path(size_m: float) -> None:
+    submap = submap_of(rectangle(size_m, size_m) if size_m else np.full((321, 321), UNKNOWN, np.int8))
+    lengths = freespace_paths(submap, CONFIG)
+    assert lengths.shape == (int(size_m > 0),) * 2 and not lengths.any()
+    assert np.array_equal(lengths, shortest_paths(freespace_graph(submap, CONFIG)))
 
 
 @given(seed=st.integers(0, 500))

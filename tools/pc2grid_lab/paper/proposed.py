@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from pc2grid.arrays import F64
 from pc2grid.model import Submap
 from signature.config import SignatureConfig
-from signature.describe import describe
+from signature.describe import Signature, described
+from signature.freespace import freespace_paths
 from signature.similarity import SignatureTable, distances, similarity
 
 
@@ -20,7 +21,7 @@ class Proposed:
 
     def fit(self, submaps: Sequence[Submap]) -> _Table:
         """Describe every submap."""
-        signatures = [describe(submap, self.config) for submap in submaps]
+        signatures = [signature_of(submap, self.config) for submap in submaps]
         return _Table(SignatureTable.of(signatures, [submap.center_m for submap in submaps]), self.config)
 
 
@@ -30,4 +31,9 @@ class _Table:
     config: SignatureConfig
 
     def similarities(self, query: Submap) -> F64:
-        return similarity(distances(describe(query, self.config), self.table, self.config))
+        return similarity(distances(signature_of(query, self.config), self.table, self.config))
+
+
+def signature_of(submap: Submap, config: SignatureConfig) -> Signature:
+    """The signature that `signature.describe` gives, without a graph that would only be unpacked."""
+    return described(submap, freespace_paths(submap, config), config)
