@@ -20,6 +20,7 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.model import Submap
+from pc2grid_lab.paper.rivals import _kernels
 
 _GRID, _ORIENTATIONS = 4, 8
 """SIFT's layout (Lowe 2004): 4 x 4 fields with 8 directions each."""
@@ -68,10 +69,12 @@ class DistanceFeatures:
     def fit(self, submaps: Sequence[Submap]) -> _FeatureTable:
         """Find and describe the keypoints of every submap."""
         features = [self.features(submap) for submap in submaps]
+        descriptors = np.concatenate([f.descriptors for f in features])
         return _FeatureTable(
             self,
             np.concatenate([f.places_m for f in features]),
-            np.concatenate([f.descriptors for f in features]),
+            descriptors,
+            (descriptors**2).sum(axis=1),
             np.cumsum([0, *(len(f.places_m) for f in features)]),
         )
 
@@ -83,10 +86,13 @@ class DistanceFeatures:
         distance = distance_function(submap, self.smooth_m)
         keypoints = self._keypoints(distance, submap)
         gradient_y, gradient_x = (np.asarray(g, np.float32) for g in np.gradient(distance, resolution))
-        directions = _directions(keypoints, gradient_x, gradient_y, self.orient_m / resolution)
-        window, step = self.window_m / resolution, self.smooth_m / resolution
-        shares = _orientation_shares(keypoints, directions, gradient_x, gradient_y, window, step)
-        mean_m = _mean_distances(keypoints, directions, distance, window, step)
+        strength, turns = np.hypot(gradient_x, gradient_y), _turns(gradient_x, gradient_y)
+        directions = _directions(keypoints, strength, turns, self.orient_m / resolution)
+        step = self.smooth_m / resolution
+        half = int(self.window_m / resolution / step)
+        samples = _samples(keypoints, directions, distance.shape, half, step)
+        shares = _orientation_shares(samples, directions, strength, turns, half)
+        mean_m = _mean_distances(samples, distance)
         descriptors = np.column_stack((shares, self.distance_weight * mean_m)).astype(np.float32)
         return Features((keypoints[:, ::-1] * resolution).astype(np.float32), descriptors)
 
@@ -118,6 +124,7 @@ class _FeatureTable:
     method: DistanceFeatures
     places_m: F32
     descriptors: F32
+    squares: F32
     starts: I64
 
     def similarities(self, query: Submap) -> F64:
@@ -126,17 +133,18 @@ class _FeatureTable:
         if len(wanted.places_m) == 0 or len(self.places_m) == 0:
             return np.zeros(n)
         # |a - b|^2 without |a|^2, which is the same for every b and does not change which is the nearest.
-        costs = (self.descriptors**2).sum(axis=1) - 2 * (wanted.descriptors @ self.descriptors.T)
-        nearest = _nearest(costs, self.starts)
-        inliers = np.array([self._agreeing(wanted, column[column >= 0], column >= 0) for column in nearest.T])
+        costs = wanted.descriptors @ self.descriptors.T
+        costs *= -2
+        costs += self.squares
+        inliers = _consensus(
+            wanted.places_m,
+            self.places_m,
+            _nearest(costs, self.starts),
+            self.method.apart_m,
+            self.method.iterations,
+        )
         # The larger number of keypoints, so that a submap with few is not similar to all that contain it.
         return np.asarray(inliers / np.maximum(len(wanted.places_m), np.diff(self.starts)))
-
-    def _agreeing(self, wanted: Features, matches: I64, matched: BoolGrid) -> int:
-        """How many of the matches of the wanted keypoints one rigid motion explains."""
-        return _consensus(
-            wanted.places_m[matched], self.places_m[matches], self.method.apart_m, self.method.iterations
-        )
 
 
 def _turns(gx: F32, gy: F32) -> F64:
@@ -144,23 +152,14 @@ def _turns(gx: F32, gy: F32) -> F64:
     return np.asarray(np.arctan2(gy.astype(np.float64), gx) / (2 * math.pi) % 1.0)
 
 
-def _directions(keypoints: I64, gx: F32, gy: F32, radius: float) -> F64:
+def _directions(keypoints: I64, strength: F32, turns: F64, radius: float) -> F64:
     """Main direction (K,), radians, of the gradient (H, W) in the `radius` (cells) of keypoints (K, 2)."""
     bins, reach = _DIRECTION_BINS, int(radius)
-    down, across = (axis.ravel() for axis in np.mgrid[-reach : reach + 1, -reach : reach + 1])
-    squared = down**2 + across**2
+    offsets = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
+    squared = (offsets**2).sum(axis=1)
     near = squared <= radius * radius
-    rows, columns, inside = _cells_inside(
-        keypoints[:, :1] + down[near], keypoints[:, 1:] + across[near], gx.shape
-    )
-    weights = np.hypot(gx, gy)[rows, columns] * np.exp(-2.0 * squared[near] / (radius * radius)) * inside
-    turn = (_turns(gx, gy) * bins)[rows, columns]
-    low = np.floor(turn).astype(np.int64)
-    owner = np.arange(len(keypoints))[:, None] * bins
-    votes = np.zeros(len(keypoints) * bins)
-    for at, share in ((low, 1 - (turn - low)), (low + 1, turn - low)):
-        votes += np.bincount((owner + at % bins).ravel(), (weights * share).ravel(), len(votes))
-    rings = votes.reshape(len(keypoints), bins)
+    falloff = np.exp(-2.0 * squared[near] / (radius * radius))
+    rings = _kernels.ring_votes(keypoints, offsets[near], falloff, strength, turns, bins)
     smooth = np.roll(rings, 1, axis=1) + 2 * rings + np.roll(rings, -1, axis=1)
     peak = smooth.argmax(axis=1)
     before, at_peak, after = (smooth[np.arange(len(smooth)), (peak + k) % bins] for k in (-1, 0, 1))
@@ -170,85 +169,82 @@ def _directions(keypoints: I64, gx: F32, gy: F32, radius: float) -> F64:
     return np.asarray((peak + shift) * (2 * math.pi / bins))
 
 
-def _cells_inside(rows: I64, columns: I64, shape: tuple[int, ...]) -> tuple[I64, I64, BoolGrid]:
-    """Cells moved to (0, 0) where they lie outside an image of a shape, and whether they lie inside."""
-    inside = (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
-    return np.where(inside, rows, 0), np.where(inside, columns, 0), inside
-
-
 def _samples(
-    keypoints: I64, directions: F64, shape: tuple[int, ...], window: float, step: float
+    keypoints: I64, directions: F64, shape: tuple[int, ...], half: int, step: float
 ) -> tuple[I64, I64, BoolGrid]:
-    """Cells (K, S) of the samples in a square around each keypoint, turned with it; as of `_cells_inside`."""
-    half = int(window / step)
+    """Cells (K, S) of the samples in a square around each keypoint, turned with it, as rows and columns, and
+    whether they lie inside an image of a shape; those outside are moved to (0, 0).
+
+    half : samples on either side of the keypoint. step : from one to the next, cells.
+    """
     v, u = (axis.ravel() for axis in np.mgrid[-half : half + 1, -half : half + 1])
     c, s = np.cos(directions)[:, None], np.sin(directions)[:, None]
     rows = np.floor(keypoints[:, :1] + (s * u + c * v) * step + 0.5).astype(np.int64)
     columns = np.floor(keypoints[:, 1:] + (c * u - s * v) * step + 0.5).astype(np.int64)
-    return _cells_inside(rows, columns, shape)
+    inside = (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
+    return np.where(inside, rows, 0), np.where(inside, columns, 0), inside
 
 
-def _mean_distances(keypoints: I64, directions: F64, distance: F32, window: float, step: float) -> F64:
+def _mean_distances(samples: tuple[I64, I64, BoolGrid], distance: F32) -> F64:
     """Mean (K,) of D over the samples of each keypoint that lie inside the map."""
-    rows, columns, inside = _samples(keypoints, directions, distance.shape, window, step)
+    rows, columns, inside = samples
     sums = (distance.astype(np.float64)[rows, columns] * inside).sum(axis=1)
     return np.asarray(sums / np.maximum(inside.sum(axis=1), 1))
 
 
-def _orientation_shares(keypoints: I64, directions: F64, gx: F32, gy: F32, window: float, step: float) -> F64:
+def _orientation_shares(
+    samples: tuple[I64, I64, BoolGrid], directions: F64, strength: F32, turns: F64, half: int
+) -> F64:
     """Orientation histograms (K, 128) of length 1 on 4 x 4 fields that are turned with the keypoint.
 
-    window, step : half the width of the square and the step of its samples, cells. A sample counts in the
-    nearest fields and directions by linear interpolation. All 0 where D does not change.
+    A sample counts in the nearest fields and directions by linear interpolation. All 0 where D does not
+    change.
     """
-    rows, columns, inside = _samples(keypoints, directions, gx.shape, window, step)
-    half = int(window / step)
     steps = np.arange(-half, half + 1)
     centers = (steps / (2 * half + 1) + 0.5) * _GRID - 0.5
     shares = np.maximum(0.0, 1.0 - np.abs(centers[:, None] - np.arange(_GRID)))
     fields = np.kron(shares, shares)  # (S, 16): how much each sample counts in each field
     falloff = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2).ravel() / (half * half))
-    weights = np.hypot(gx, gy)[rows, columns] * falloff * inside
-    turn = (_turns(gx, gy)[rows, columns] - directions[:, None] / (2 * math.pi)) % 1.0 * _ORIENTATIONS
-    found = np.empty((len(keypoints), _GRID * _GRID, _ORIENTATIONS))
-    for k in range(_ORIENTATIONS):
-        apart = np.abs((turn - k + _ORIENTATIONS / 2) % _ORIENTATIONS - _ORIENTATIONS / 2)
-        found[:, :, k] = (weights * np.maximum(0.0, 1.0 - apart)) @ fields
-    histograms = found.reshape(len(keypoints), _GRID * _GRID * _ORIENTATIONS)
+    own = directions / (2 * math.pi)
+    parts = _kernels.direction_shares(*samples, own, falloff, strength, turns, _ORIENTATIONS)
+    found = np.stack([part @ fields for part in parts], axis=-1)
+    histograms = found.reshape(len(directions), _GRID * _GRID * _ORIENTATIONS)
     lengths = np.linalg.norm(histograms, axis=1, keepdims=True)
     return np.asarray(histograms / np.where(lengths > 0, lengths, 1.0))
 
 
 def _nearest(costs: F32, starts: I64) -> I64:
-    """For each wanted keypoint (row) the cheapest of each submap, (K, N); -1 if the submap has none."""
-    out = np.full((len(costs), len(starts) - 1), -1, np.int64)
+    """For each submap the cheapest for each wanted keypoint (row), (N, K); -1 if the submap has none."""
+    out = np.full((len(starts) - 1, len(costs)), -1, np.int64)
     for s, (start, stop) in enumerate(itertools.pairwise(starts.tolist())):
         if stop > start:
-            out[:, s] = start + costs[:, start:stop].argmin(axis=1)
+            out[s] = start + costs[:, start:stop].argmin(axis=1)
     return out
 
 
-def _consensus(a: F32, b: F32, inlier_m: float, iterations: int) -> int:
-    """RANSAC: the most matches a[i] ~ b[i], (M, 2) each, that one rigid motion of the plane explains.
+def _consensus(a: F32, b: F32, nearest: I64, inlier_m: float, iterations: int) -> I64:
+    """RANSAC: for each submap the most matches a[m] ~ b[nearest[s, m]] that one rigid motion explains: (N,).
 
-    The motion follows from two matches; the same pairs are drawn on every call.
+    a (M, 2), b (D, 2), nearest (N, M) : -1 where a submap has no keypoints. The motion follows from two
+    matches; the same pairs are drawn on every call.
     """
+    counts = np.zeros(len(nearest), np.int64)
     if len(a) < 2:
-        return 0
+        return counts
     i, j = np.random.default_rng(0).integers(0, len(a), (2, iterations))
-    along_a, along_b = a[j] - a[i], b[j] - b[i]
-    length_a, length_b = np.hypot(*along_a.T), np.hypot(*along_b.T)
+    # Points as complex numbers: the rotation is the quotient of the directions of both pairs.
+    za, zb = (points[:, 0] + 1j * points[:, 1] for points in (a, b))
+    matched = zb[nearest]
+    length_a = np.hypot(*(a[j] - a[i]).T)
+    length_b = np.hypot(*(b[nearest[:, j]] - b[nearest[:, i]]).transpose(2, 0, 1))
     # Pairs of different lengths do not follow from a rigid motion.
     usable = np.minimum(length_a, length_b) >= _LEAST_PAIR_M
     usable &= np.abs(length_a - length_b) <= 2 * inlier_m
-    if not usable.any():
-        return 0
-    i, j = i[usable], j[usable]
-    # Points as complex numbers: the rotation is the quotient of the directions of both pairs.
-    za, zb = a[:, 0] + 1j * a[:, 1], b[:, 0] + 1j * b[:, 1]
-    rotation = (zb[j] - zb[i]) * np.conj(za[j] - za[i])
+    usable &= (nearest[:, 0] >= 0)[:, None]
+    submap, pair = np.nonzero(usable)
+    i, j = i[pair], j[pair]
+    rotation = (matched[submap, j] - matched[submap, i]) * np.conj(za[j] - za[i])
     rotation /= np.abs(rotation)
-    shift = (zb[i] + zb[j]) / 2 - rotation * (za[i] + za[j]) / 2
-    errors = rotation[:, None] * za + shift[:, None] - zb
-    agreeing = errors.real**2 + errors.imag**2 <= inlier_m**2
-    return int(agreeing.sum(axis=1).max())
+    shift = (matched[submap, i] + matched[submap, j]) / 2 - rotation * (za[i] + za[j]) / 2
+    _kernels.most_agreeing(za, matched, submap, rotation, shift, inlier_m, counts)
+    return counts

@@ -8,12 +8,11 @@ published.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64
+from pc2grid.arrays import F32, F64
+from pc2grid_lab.paper.rivals import _kernels
 
 _SECTORS = 36
 """Directions in which the sector of 60 degrees is tried for the orientation; chosen by hand."""
@@ -49,7 +48,7 @@ def describe_points(image: NDArray[np.uint8], points: F64) -> F32:
     c, s = np.cos(turn), np.sin(turn)
     v, u = (axis.ravel() + 0.5 for axis in np.mgrid[-10:10, -10:10])
     half = np.maximum(1, np.floor(scale + 0.5)).astype(np.int64)
-    dx, dy = _haar(integral, y + scale * (s * u + c * v), x + scale * (c * u - s * v), half)
+    dx, dy = _kernels.haar(integral, y + scale * (s * u + c * v), x + scale * (c * u - s * v), half)
     weights = np.exp(-(u**2 + v**2) / (2 * 3.3**2))
     along, across = weights * (c * dx + s * dy), weights * (c * dy - s * dx)
     responses = np.stack((along, across, np.abs(along), np.abs(across)), axis=-1)
@@ -65,35 +64,11 @@ def orientations(integral: F64, points: F64) -> F64:
     i, j = (axis.reshape(-1, 1) for axis in np.mgrid[-6:7, -6:7])
     near = (i**2 + j**2 < 36)[:, 0]
     i, j = i[near], j[near]
-    half = np.maximum(1, np.floor(2 * scale + 0.5)).astype(np.int64)
-    dx, dy = _haar(integral, y + i * scale, x + j * scale, half)
+    half = np.maximum(1, np.floor(2 * scale + 0.5)).astype(np.int64)[None]
+    dx, dy = _kernels.haar(integral, y + i * scale, x + j * scale, half)
     weights = np.exp(-(i**2 + j**2) / (2 * 2.5 * 2.5))
     dx, dy = weights * dx, weights * dy
-    angles = np.arctan2(dy, dx)
-    sums = np.empty((_SECTORS, 2, len(points)))
-    for k in range(_SECTORS):
-        ahead = angles - (k * math.pi / (_SECTORS / 2) - math.pi)
-        inside = ((ahead >= 0) & (ahead < math.pi / 3)) | (ahead + 2 * math.pi < math.pi / 3)
-        sums[k] = (dx * inside).sum(axis=0), (dy * inside).sum(axis=0)
+    sums = _kernels.sector_sums(np.arctan2(dy, dx), dx, dy, _SECTORS)
     best = (sums**2).sum(axis=1).argmax(axis=0)
     sum_x, sum_y = sums[best, :, np.arange(len(points))].T
     return np.asarray(np.arctan2(sum_y, sum_x))
-
-
-def _haar(integral: F64, y: F64, x: F64, half: I64) -> tuple[F64, F64]:
-    """Haar wavelets in x and y, 2 * half pixels wide, at places y, x; all broadcast with `half`.
-
-    They are 0 where the wavelet would leave the image.
-    """
-    rows, columns = np.floor(y + 0.5).astype(np.int64), np.floor(x + 0.5).astype(np.int64)
-    height, width = integral.shape
-    inside = (rows >= half) & (columns >= half) & (rows + half < height) & (columns + half < width)
-    # Integral image at the nine corners of the four quarters of the wavelet.
-    r = [np.where(inside, rows + step * half, 0) for step in (-1, 0, 1)]
-    c = [np.where(inside, columns + step * half, 0) for step in (-1, 0, 1)]
-    at = [[integral[r[a], c[b]] for b in range(3)] for a in range(3)]
-    left = at[2][1] - at[0][1] - at[2][0] + at[0][0]
-    right = at[2][2] - at[0][2] - at[2][1] + at[0][1]
-    upper = at[1][2] - at[0][2] - at[1][0] + at[0][0]
-    lower = at[2][2] - at[1][2] - at[2][0] + at[1][0]
-    return right - left, lower - upper
