@@ -5,21 +5,27 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from pc2grid.config import PartitionConfig
 from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.io.nav2_map import save_map
+from pc2grid.submaps.partition import partition
 from pc2grid_cli import console
-from pc2grid_lab.paper.cells import paper_tasks
+from pc2grid_lab.paper import experiment
+from pc2grid_lab.paper.cells import cells_of, paper_tasks, read_map, that_share_submaps
 from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES
 from pc2grid_lab.paper.command import compare_paper_command
-from pc2grid_lab.paper.experiment import BestMatches
-from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES
+from pc2grid_lab.paper.experiment import BestMatches, Experiment, draw_queries, evaluate
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods
+from pc2grid_lab.paper.noise import NOISE_LEVELS
 from pc2grid_lab.paper.published import MAPS, TABLE_3, TABLE_4
+from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
 from signature.config import SignatureConfig
 from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
 
@@ -65,6 +71,40 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
     assert "Table III, AUC and R@1" in second.stdout and "Table IV" in second.stdout
     # AUC of the paper, ours, the difference, its interval; then R@1, which the paper does not give.
     assert re.search(r"^ *0 +proposed +965 +\d+ +[-+]\d+ \+-\d+ +\d+ \+-\d+", second.stdout, re.MULTILINE)
+
+
+def test_queries_are_drawn_once_a_level_and_databases_fitted_once(
+    maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And the matches are those of each method, fitted to the map again and asked alone."""
+    tasks = list(
+        paper_tasks([maps / "intel.yaml"], methods=["proposed", "sdf"], offsets_m=[1.0], queries=4, seed=1)
+    )
+    groups = that_share_submaps(tasks)
+    assert sorted(map(len, groups)) == [1, 1, 6]  # 6 and 10 m; 2 methods at 3 levels
+    fitted, drawn = [], []
+
+    def drawing(*arguments: Any) -> Any:
+        drawn.append(arguments)
+        return draw_queries(*arguments)
+
+    def fitting(self: DistanceFeatures, submaps: Any) -> Any:
+        fitted.append(self)
+        return fit(self, submaps)
+
+    fit = DistanceFeatures.fit
+    with monkeypatch.context() as patched:
+        patched.setattr(experiment, "draw_queries", drawing)
+        patched.setattr(DistanceFeatures, "fit", fitting)
+        found = cells_of(groups[0], tmp_path)
+    assert (len(fitted), len(drawn)) == (1, 3)
+    grid = read_map(maps / "intel.yaml")
+    submaps = partition(grid, PartitionConfig.paper())
+    for cell in found:
+        name, level = cell.task.method, NOISE_LEVELS[cell.task.level]
+        alone = evaluate(make_methods([name]), grid, submaps, Experiment(queries=4), level)[name]
+        assert np.array_equal(cell.matches.similarity, alone.similarity)
+        assert np.array_equal(cell.matches.correct, alone.correct)
 
 
 def test_the_ablation_and_any_floor(tmp_path: Path) -> None:
@@ -118,4 +158,4 @@ def test_the_first_choices_together_are_the_paper_to_the_letter() -> None:
 @pytest.mark.parametrize("method", METHOD_NAMES + EXTRA_METHOD_NAMES)
 def test_every_method_that_can_be_asked_for_is_run(method: str) -> None:
     tasks = list(paper_tasks([Path("intel.yaml")], methods=[method], queries=1, seed=1))
-    assert {m for task in tasks for m in task.methods} == {method}
+    assert {task.method for task in tasks} == {method}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,46 +18,35 @@ from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.submaps.partition import partition
 from pc2grid_lab.experiments.stored import once
 from pc2grid_lab.paper.choices import SettingChoice
-from pc2grid_lab.paper.experiment import BestMatches, Experiment, MatchMeasures, evaluate
+from pc2grid_lab.paper.experiment import BestMatches, Experiment, MatchMeasures, best_matches
 from pc2grid_lab.paper.methods import METHOD_NAMES, OURS, make_methods
 from pc2grid_lab.paper.noise import NOISE_LEVELS
 from pc2grid_lab.paper.proposed import Proposed
+from pc2grid_lab.paper.protocol import Method
 from pc2grid_lab.paper.published import MAPS, SIZE_PX, TABLE_3, TABLE_4, Measures
 from signature.config import SignatureConfig
 
+Overrides = tuple[tuple[str, Any], ...]
 RADII_M = (6.0, 8.0, 10.0)
 """Table IV."""
-
-TOGETHER = (
-    ("proposed",),
-    ("as_used_here",),
-    ("sdf",),
-    ("sift_bow", "sift_tfidf"),
-    ("surf_bow", "surf_tfidf"),
-    ("shape_context",),
-    ("as_used_here_centres",),
-    ("boundary_centres",),
-    ("shape_context_centres",),
-)
-"""Methods that share their features and therefore run together."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperTask:
-    """Methods on one map at one noise level.
+    """A method on one map at one noise level.
 
     overrides : fields of SignatureConfig that differ from their defaults, for the method as it is used here.
     speckle_sigma_m : spread of the boundary noise, which the paper leaves open.
     """
 
     map_path: Path
-    methods: tuple[str, ...]
+    method: str
     level: int
     radius_m: float
     offset_m: float
     queries: int
     seed: int
-    overrides: tuple[tuple[str, Any], ...] = ()
+    overrides: Overrides = ()
     speckle_sigma_m: float = NOISE_LEVELS[0].speckle_sigma_m
 
     @property
@@ -69,7 +58,7 @@ class PaperTask:
         """The file of the results."""
         changed = "".join(f".{key}={value}" for key, value in self.overrides)
         return folder / (
-            f"{self.map_name}.{'+'.join(self.methods)}.noise{self.level}.r{self.radius_m:g}.offset{self.offset_m:g}"
+            f"{self.map_name}.{self.method}.noise{self.level}.r{self.radius_m:g}.offset{self.offset_m:g}"
             f".q{self.queries}.seed{self.seed}.speckles{self.speckle_sigma_m:g}{changed}.pickle"
         )
 
@@ -83,15 +72,22 @@ def paper_tasks(
     **setting: Any,
 ) -> Iterator[PaperTask]:
     """Every task of Tables III and IV, and those that measure other `choices`. setting : of all tasks."""
-    groups = [tuple(name for name in together if name in methods) for together in TOGETHER]
-    for offset_m, group, path in itertools.product(offsets_m, filter(None, groups), maps):
-        task = PaperTask(map_path=path, methods=group, level=0, radius_m=8.0, offset_m=offset_m, **setting)
+    for offset_m, method, path in itertools.product(offsets_m, methods, maps):
+        task = PaperTask(map_path=path, method=method, level=0, radius_m=8.0, offset_m=offset_m, **setting)
         yield from (replace(task, level=level) for level in range(len(NOISE_LEVELS)))
-        if group[0] in OURS:
+        if method in OURS:
             yield from (replace(task, level=1, radius_m=r) for r in RADII_M if r != task.radius_m)
-        if group == ("as_used_here",):
+        if method == "as_used_here":
             for choice, level in itertools.product(choices, (0, 2)):
                 yield replace(task, level=level, overrides=choice.overrides)
+
+
+def that_share_submaps(tasks: Iterable[PaperTask]) -> list[list[PaperTask]]:
+    """The tasks of each map and radius, for `cells_of`: by the queries that they share; the most first."""
+    groups: dict[tuple[Path, float], list[PaperTask]] = {}
+    for task in sorted(tasks, key=lambda task: (task.offset_m, task.level)):
+        groups.setdefault((task.map_path, task.radius_m), []).append(task)
+    return sorted(groups.values(), key=len, reverse=True)
 
 
 def read_map(path: Path) -> OccupancyGrid:
@@ -127,7 +123,6 @@ class PaperCell:
     """
 
     task: PaperTask
-    method: str
     submaps: int
     matches: BestMatches
     measures: MatchMeasures
@@ -140,7 +135,7 @@ class PaperCell:
         if task.overrides or task.map_name not in MAPS:
             return None
         if task.radius_m == 8.0:
-            method = "proposed" if self.method in OURS else self.method
+            method = "proposed" if task.method in OURS else task.method
             return TABLE_3[task.level].get(method, {}).get(task.map_name)
         return TABLE_4[int(task.radius_m)].get(task.map_name)
 
@@ -150,26 +145,42 @@ class PaperCell:
         half = {f"{name}_half_width": value for name, value in self.half_widths._asdict().items()}
         published = None if self.published is None else self.published._asdict()
         measures = {**self.measures._asdict(), **half, "published": published}
-        return {**task, "method": self.method, "submaps": self.submaps, **measures}
+        return {**task, "submaps": self.submaps, **measures}
 
 
-def cells_of(task: PaperTask, folder: Path) -> list[PaperCell]:
-    """The results of a task, which are kept in a folder. Raises MapFileError, OutputError."""
-    return once(task.file(folder), partial(_run, task))
+def cells_of(tasks: Sequence[PaperTask], folder: Path) -> list[PaperCell]:
+    """The results of tasks of one map and radius, kept in a folder. Raises MapFileError, OutputError.
+
+    Methods are fitted once for all levels, and queries drawn once for all methods of a level: tasks that
+    share queries stand together.
+    """
+    made = _run([task for task in tasks if not task.file(folder).exists()])
+    return [once(task.file(folder), partial(next, made)) for task in tasks]
 
 
-def _run(task: PaperTask) -> list[PaperCell]:
-    grid = read_map(task.map_path)
-    submaps = partition(grid, PartitionConfig.paper(task.radius_m))
-    experiment = Experiment(queries=task.queries, offset_m=task.offset_m, seed=task.seed)
-    noise = replace(NOISE_LEVELS[task.level], speckle_sigma_m=task.speckle_sigma_m)
-    methods = make_methods(task.methods)
-    if task.overrides:
-        methods = {"as_used_here": Proposed(SignatureConfig(**dict(task.overrides)))}
-    return [
-        PaperCell(task, method, len(submaps), matches, matches.measures(), matches.half_widths())
-        for method, matches in evaluate(methods, grid, submaps, experiment, noise).items()
-    ]
+def _run(tasks: Sequence[PaperTask]) -> Iterator[PaperCell]:
+    if not tasks:
+        return
+    grid = read_map(tasks[0].map_path)
+    submaps = partition(grid, PartitionConfig.paper(tasks[0].radius_m))
+    matchers = {key: method.fit(submaps) for key, method in _methods_of(tasks).items()}
+    for shared, some in itertools.groupby(tasks, lambda task: replace(task, method="", overrides=())):
+        by_method = {(task.method, task.overrides): task for task in some}
+        experiment = Experiment(queries=shared.queries, offset_m=shared.offset_m, seed=shared.seed)
+        noise = replace(NOISE_LEVELS[shared.level], speckle_sigma_m=shared.speckle_sigma_m)
+        asked = {key: matchers[key] for key in by_method}
+        for key, matches in best_matches(asked, grid, submaps, experiment, noise).items():
+            yield PaperCell(by_method[key], len(submaps), matches, matches.measures(), matches.half_widths())
+
+
+def _methods_of(tasks: Sequence[PaperTask]) -> dict[tuple[str, Overrides], Method]:
+    """The methods of tasks, those of the same features made together."""
+    found: dict[tuple[str, Overrides], Method] = {}
+    for task in tasks:
+        if task.overrides:
+            found[task.method, task.overrides] = Proposed(SignatureConfig(**dict(task.overrides)))
+    plain = dict.fromkeys(task.method for task in tasks if not task.overrides)
+    return found | {(name, ()): method for name, method in make_methods(plain).items()}
 
 
 def known_maps(path: Path) -> list[Path]:

@@ -15,7 +15,7 @@ from pc2grid_cli.output_files import make_folder
 from pc2grid_lab.compare import options as options
 from pc2grid_lab.experiments.program import BACK, FRONT, LABORATORY, digest_of_sources
 from pc2grid_lab.experiments.stored import in_processes, write_text
-from pc2grid_lab.paper.cells import cells_of, known_maps, paper_tasks
+from pc2grid_lab.paper.cells import cells_of, known_maps, paper_tasks, that_share_submaps
 from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES
 from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
 from pc2grid_lab.paper.report import draw_figure, print_tables
@@ -75,8 +75,10 @@ def compare_paper_command(
     tasks = list(paper_tasks(found, methods=chosen, offsets_m=offsets_m, choices=choices, **setting))
     with of(context).progress(f"{len(tasks)} cells of the tables") as advance:
         kept = _kept_in(out, found)
-        cells = in_processes(cells_of, [(task, kept) for task in tasks], jobs=jobs, advance=advance)
-    results = list(itertools.chain.from_iterable(cells))
+        groups = [(group, kept) for group in that_share_submaps(tasks)]
+        cells = itertools.chain.from_iterable(in_processes(cells_of, groups, jobs=jobs, advance=advance))
+    by_task = {cell.task: cell for cell in cells}
+    results = [by_task[task] for task in tasks]
     document = {**setting, "cells": [cell.summary() for cell in results]}
     write_text(out / "results.json", json_text(document) + "\n")
     pictures = [draw_figure(results, offset_m, out) for offset_m in offsets_m]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -15,7 +15,9 @@ from sklearn.metrics import auc, precision_recall_curve
 from pc2grid.arrays import F64
 from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
 from pc2grid_lab.paper.noise import Noise, add_noise
-from pc2grid_lab.paper.protocol import Method
+from pc2grid_lab.paper.protocol import Matcher, Method
+
+Key = TypeVar("Key")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -194,14 +196,25 @@ def evaluate(
     """
     if not submaps:
         raise ValueError("a map without submaps cannot be evaluated")
-    centers_m = np.array([submap.center_m for submap in submaps])
     matchers = {name: method.fit(submaps) for name, method in methods.items()}
-    similarity = {name: np.empty(experiment.queries) for name in methods}
-    correct = {name: np.empty(experiment.queries, np.bool_) for name in methods}
+    return best_matches(matchers, grid, submaps, experiment, noise)
+
+
+def best_matches(
+    matchers: Mapping[Key, Matcher],
+    grid: OccupancyGrid,
+    submaps: Sequence[Submap],
+    experiment: Experiment,
+    noise: Noise,
+) -> dict[Key, BestMatches]:
+    """The same of methods that were fitted to the submaps."""
+    centers_m = np.array([submap.center_m for submap in submaps])
+    similarity = {key: np.empty(experiment.queries) for key in matchers}
+    correct = {key: np.empty(experiment.queries, np.bool_) for key in matchers}
     for i, query in enumerate(draw_queries(grid, centers_m, submaps[0].radius_m, experiment, noise)):
-        for name, matcher in matchers.items():
+        for key, matcher in matchers.items():
             scores = matcher.similarities(query)
             best = int(np.argmax(scores))
-            similarity[name][i] = scores[best]
-            correct[name][i] = math.dist(centers_m[best], query.center_m) <= experiment.correct_m
-    return {name: BestMatches(similarity=similarity[name], correct=correct[name]) for name in methods}
+            similarity[key][i] = scores[best]
+            correct[key][i] = math.dist(centers_m[best], query.center_m) <= experiment.correct_m
+    return {key: BestMatches(similarity=similarity[key], correct=correct[key]) for key in matchers}

@@ -55,7 +55,7 @@ def _table_3(
     title = " and ".join(map(_title, measures))
     shown = table(f"Table III, {title}, {where}", ("noise", "method"), headings)
     for level, method in itertools.product(range(len(_LEVELS)), methods):
-        row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == (method, level, 8.0)]
+        row = [r for r in plain if (r.task.method, r.task.level, r.task.radius_m) == (method, level, 8.0)]
         shown.add_row(str(level), method, *_cells(row, maps, measures))
     return shown
 
@@ -63,7 +63,7 @@ def _table_3(
 def _table_4(plain: Sequence[PaperCell], maps: Sequence[str], where: str) -> Table:
     shown = table(f"Table IV (noise level 1), {where}", ("radius", "method", "measure"), maps)
     for radius_m, method, measure in itertools.product(RADII_M, OURS, MatchMeasures._fields):
-        row = [r for r in plain if (r.method, r.task.level, r.task.radius_m) == (method, 1, radius_m)]
+        row = [r for r in plain if (r.task.method, r.task.level, r.task.radius_m) == (method, 1, radius_m)]
         shown.add_row(f"{radius_m:g} m", method, _title(measure), *_cells(row, maps, [measure]))
     return shown
 
@@ -99,7 +99,9 @@ def _print_choices(
     shown = table(title, ("choice", "the paper says", "we do", "noise"), (*maps, "mean", "mean R@1"))
     for level in (0, 2):
         here = [
-            r for r in results if (r.method, r.task.level, r.task.radius_m) == ("as_used_here", level, 8.0)
+            r
+            for r in results
+            if (r.task.method, r.task.level, r.task.radius_m) == ("as_used_here", level, 8.0)
         ]
         base = {r.task.map_name: _auc_and_right(r) for r in here if not r.task.overrides}
         shown.add_row("all three", "", "Eq. 6", str(level), *_with_means(base, maps, ""))
@@ -141,7 +143,7 @@ def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Pat
                 if len(curve.recall):
                     # Like the area under the curve: from recall 0 at the precision of the first point.
                     recall, precision = [0.0, *curve.recall], [curve.precision[0], *curve.precision]
-                    axis.plot(recall, precision, label=cell.method, linewidth=1.2)
+                    axis.plot(recall, precision, label=cell.task.method, linewidth=1.2)
             axis.set_title(f"{name}, {title}", fontsize=9)
             axis.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="recall", ylabel="precision")
             axis.label_outer()
