@@ -72,8 +72,7 @@ pictures: demo
 	$(BIN)/pc2grid export demo_out/office.submaps --map demo_out/office --force
 	$(BIN)/python examples/signature_of_a_submap.py demo_out/office.yaml --out docs/signatures.png
 	$(BIN)/pc2grid compare paper --maps $(REAL_DATA)/maps --offset 1.0 --queries 200 --methods proposed \
-		--methods as_used_here --methods shape_context --methods boundary_centres \
-		--methods shape_context_centres --out results/paper
+		--methods proposed_ln_bc --methods shape_context --methods sdf --methods learned --out results/paper
 	cp results/paper/figure-9-offset-1.png examples/paper.png
 
 modules: $(READY)

@@ -35,7 +35,7 @@ wall points, up to twice of it. On sessions of office 1, csail and fr079 the rig
 
 def boundary_edges(submap: Submap, config: SignatureConfig) -> BoolGrid:
     """The edge map S^E (H, W): clearly occupied cells (III-B 1), thinned to one pixel (III-B 2)."""
-    return thin(submap.grid.occupied, config.thinning)
+    return thin(submap.grid.occupied, config.boundary_thinning)
 
 
 def boundary_points(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> I64:

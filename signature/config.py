@@ -10,6 +10,8 @@ from typing_extensions import Self
 import pc2grid.config
 from pc2grid.config import PartitionConfig, Section
 
+Thinning = Literal["guo_hall", "zhang_suen"]
+
 ShortlistBy = Literal[
     "signatures",
     "boundary",
@@ -30,8 +32,10 @@ class SignatureConfig(Section):
     Names in brackets are the paper's; their defaults are Table II's. The rest the paper leaves open.
     """
 
-    thinning: Literal["guo_hall", "zhang_suen"] = Field(
-        "guo_hall", description="of boundary and free space; guo_hall treats all directions of a line alike"
+    thinning: Literal["guo_hall", "zhang_suen", "as_cited"] = Field(
+        "guo_hall",
+        description="of boundary and free space; guo_hall treats all directions of a line alike; as_cited: "
+        "guo_hall of the boundary, zhang_suen of the free space",
     )
 
     boundary_bin_m: float = Field(0.2, gt=0, description="bin width of the boundary histogram (delta_b)")
@@ -44,7 +48,7 @@ class SignatureConfig(Section):
         0.2,
         ge=0,
         description="free space is eroded by this before thinning; less than half a door, so that obstacles "
-        "in the way leave a way around them",
+        "in the way leave a way around them; III-C names no erosion",
     )
     freespace_cell_m: float = Field(
         0.1, gt=0, description="cells in which the free-space skeleton is found; fine enough for the spacing"
@@ -107,21 +111,37 @@ class SignatureConfig(Section):
     symmetry_sigma: float = Field(120.0, gt=0, description="larger: symmetry counts less in Eq. 8 (sigma)")
     histogram_distance: Literal["hellinger", "bhattacharyya"] = Field(
         "hellinger",
-        description="sqrt(1 - BC), bounded by 1 where histograms share no bin; or -ln BC, capped at 20",
+        description="sqrt(1 - BC), which OpenCV calls Bhattacharyya's, 1 where histograms share no bin; or "
+        "-ln BC, capped at 20",
     )
+
+    @property
+    def boundary_thinning(self) -> Thinning:
+        """Of the boundary (III-B 2, which cites another work than III-A)."""
+        return "guo_hall" if self.thinning == "as_cited" else self.thinning
+
+    @property
+    def freespace_thinning(self) -> Thinning:
+        """Of the free space (III-C 1, which refers to III-A)."""
+        return "zhang_suen" if self.thinning == "as_cited" else self.thinning
 
     @classmethod
     def paper(cls) -> Self:
-        """The paper to the letter: -ln BC as d of Eq. 6, the thinning of III-A everywhere and at full
-        resolution, no limit in S^G, one vote for each segment. What the paper leaves open stays as it is.
+        """The paper to the letter: two thinnings, free space not eroded (III-C) and at full resolution, no
+        limit in S^G, one vote for each segment.
 
-        >>> SignatureConfig.paper().histogram_distance
-        'bhattacharyya'
+        The paper leaves open: which d of Eq. 6 it calls Bhattacharyya's (here OpenCV's, sqrt(1 - BC); the
+        other reading is `histogram_distance="bhattacharyya"`); which of the two thinnings is which; how
+        far apart points and nodes are; the parameters of Hough's transform, how far apart the axes lie, and
+        the blur. These are as in the default.
+
+        >>> SignatureConfig.paper().histogram_distance, SignatureConfig.paper().freespace_thinning
+        ('hellinger', 'zhang_suen')
         """
         return cls(
-            histogram_distance="bhattacharyya",
-            thinning="zhang_suen",
+            thinning="as_cited",
             freespace_cell_m=0.05,
+            freespace_clearance_m=0.0,
             symmetry_limited=False,
             axis_vote="plain",
         )

@@ -51,7 +51,7 @@ def freespace_nodes(submap: Submap, config: SignatureConfig) -> I64:
     block = max(1, round(config.freespace_cell_m / grid.resolution_m))
     free = _all_in_blocks(grid.free, block)
     cell_m = block * grid.resolution_m
-    skeleton = skeleton_of(free, cell_m, config.freespace_clearance_m, config.thinning)
+    skeleton = skeleton_of(free, cell_m, config.freespace_clearance_m, config.freespace_thinning)
     return sample_evenly(cells_of(skeleton), config.freespace_spacing_m / cell_m) * block + block // 2
 
 

@@ -11,9 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pc2grid.arrays import I64, BoolGrid
+from pc2grid.arrays import I64, BoolGrid, cells_of
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN
+from pc2grid.submaps.sampling import sample_evenly
+from pc2grid.submaps.skeleton import thin
 from signature import _kernels
+from signature.boundary import boundary_edges
 from signature.config import SignatureConfig
 from signature.freespace import (
     freespace_bins,
@@ -25,6 +28,7 @@ from signature.freespace import (
     visibility_graph,
 )
 from tests.helpers.rooms import (
+    RESOLUTION_M,
     grid_of,
     random_rooms,
     rectangle,
@@ -110,6 +114,17 @@ def test_no_node_and_one_node_have_no_path(size_m: float) -> None:
     lengths = freespace_paths(submap, CONFIG)
     assert lengths.shape == (int(size_m > 0),) * 2 and not lengths.any()
     assert np.array_equal(lengths, shortest_paths(freespace_graph(submap, CONFIG)))
+
+
+def test_the_letter_erodes_no_free_space_and_has_two_thinnings() -> None:
+    """III-C 1 names binarization, distance transform and thinning, as III-A; III-B cites another work."""
+    submap, config = submap_of(random_rooms(3)), SignatureConfig.paper()
+    skeleton = thin(submap.grid.free, "zhang_suen")
+    expected = sample_evenly(cells_of(skeleton), config.freespace_spacing_m / RESOLUTION_M)
+    assert np.array_equal(freespace_nodes(submap, config), expected)
+    walls = submap.grid.occupied
+    assert np.array_equal(boundary_edges(submap, config), thin(walls, "guo_hall"))
+    assert not np.array_equal(thin(walls, "guo_hall"), thin(walls, "zhang_suen"))
 
 
 @given(seed=st.integers(0, 500))

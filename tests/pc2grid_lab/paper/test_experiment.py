@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.model import FREE, OccupancyGrid
+from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
 from pc2grid.submaps.partition import submap_at
 from pc2grid_lab.paper.experiment import (
     Experiment,
@@ -75,6 +75,20 @@ def test_noise_has_the_given_counts_and_places() -> None:
     reach = np.linalg.norm(added[:, None] - walls[None], axis=2).min(axis=1) * 0.05
     assert 0 < reach.max() < 0.6
     assert 100 < len(added) <= 300
+
+
+def test_obstacles_stand_on_unknown_cells_too() -> None:
+    """The paper puts them on unoccupied pixels. Here one in ten is free; all lie within the disc."""
+    cells = canvas()
+    cells[:, 145:177] = FREE
+    cells[100:220, 140] = OCCUPIED
+    submap = submap_of(cells)
+    noisy = add_noise(submap, Noise(boundary=0, freespace=200), np.random.default_rng(0))
+    added = noisy.grid.occupied & ~submap.grid.occupied
+    on_free = added & submap.grid.free
+    assert on_free.any() and on_free.sum() < 0.3 * added.sum()
+    reach = np.linalg.norm(np.argwhere(added) - 160, axis=1) * 0.05
+    assert 7.5 < reach.max() <= 8.0
 
 
 def test_the_paper_method_finds_rooms_that_differ() -> None:

@@ -35,7 +35,7 @@ RADII_M = (6.0, 8.0, 10.0)
 class PaperTask:
     """A method on one map at one noise level.
 
-    overrides : fields of SignatureConfig that differ from their defaults, for the method as it is used here.
+    overrides : fields of SignatureConfig that differ from those of the method to the letter.
     speckle_sigma_m : spread of the boundary noise, which the paper leaves open.
     """
 
@@ -77,7 +77,7 @@ def paper_tasks(
         yield from (replace(task, level=level) for level in range(len(NOISE_LEVELS)))
         if method in OURS:
             yield from (replace(task, level=1, radius_m=r) for r in RADII_M if r != task.radius_m)
-        if method == "as_used_here":
+        if method == "proposed":
             for choice, level in itertools.product(choices, (0, 2)):
                 yield replace(task, level=level, overrides=choice.overrides)
 
@@ -130,13 +130,14 @@ class PaperCell:
 
     @property
     def published(self) -> Measures | None:
-        """What the paper has printed for it; None if it has nothing."""
+        """What the paper has printed for it, or for its own method if it does not have this one; None of maps
+        and settings that it does not have."""
         task = self.task
         if task.overrides or task.map_name not in MAPS:
             return None
         if task.radius_m == 8.0:
-            method = "proposed" if task.method in OURS else task.method
-            return TABLE_3[task.level].get(method, {}).get(task.map_name)
+            rows = TABLE_3[task.level]
+            return rows.get(task.method, rows["proposed"])[task.map_name]
         return TABLE_4[int(task.radius_m)].get(task.map_name)
 
     def summary(self) -> dict[str, Any]:
@@ -178,7 +179,8 @@ def _methods_of(tasks: Sequence[PaperTask]) -> dict[tuple[str, Overrides], Metho
     found: dict[tuple[str, Overrides], Method] = {}
     for task in tasks:
         if task.overrides:
-            found[task.method, task.overrides] = Proposed(SignatureConfig(**dict(task.overrides)))
+            config = SignatureConfig.paper().model_copy(update=dict(task.overrides))
+            found[task.method, task.overrides] = Proposed(config)
     plain = dict.fromkeys(task.method for task in tasks if not task.overrides)
     return found | {(name, ()): method for name, method in make_methods(plain).items()}
 

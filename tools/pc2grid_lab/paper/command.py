@@ -49,10 +49,10 @@ def compare_paper_command(
     ] = None,
     open_choices: Annotated[
         bool,
-        typer.Option("--open-choices", help="Also what each departure and open parameter moves."),
+        typer.Option("--open-choices", help="Also what each open choice moves of the method to the letter."),
     ] = False,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="Also the method as used here without some of its signatures.")
+        bool, typer.Option("--ablation", help="Also the method to the letter without some of its signatures.")
     ] = False,
     speckles: Annotated[
         float,

@@ -19,7 +19,8 @@ class Noise:
     """How much noise of both kinds, and of which size.
 
     boundary : N_b, occupied cells around which speckles are put.
-    freespace : N_f, free cells on which obstacles are put.
+    freespace : N_f, unoccupied cells on which obstacles are put: the paper calls them so, and half or more of
+        them are unknown. Its sentence is read as printed.
     speckles : number of occupied cells put around each of the N_b, with normally distributed offsets.
     speckle_sigma_m : standard deviation of these offsets, per axis.
     obstacle_m : r_n, radius of the circles and half the width of the squares; both are filled, and equally
@@ -42,16 +43,19 @@ NOISE_LEVELS = (
 
 
 def add_noise(submap: Submap, noise: Noise, rng: np.random.Generator) -> Submap:
-    """The submap with noise inside its radius. Boundary noise needs occupied cells, free-space noise free
-    ones.
+    """The submap with noise inside its radius. Boundary noise needs occupied cells, free-space noise
+    unoccupied ones.
     """
     grid = submap.grid
     image = np.ascontiguousarray(grid.cells).astype(np.int16)
-    occupied, free = np.argwhere(grid.occupied), np.argwhere(grid.free)
-    if noise.freespace and len(free):
+    center = (np.array(image.shape) - 1) / 2
+    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
+    beyond = (rows - center[0]) ** 2 + (columns - center[1]) ** 2 > (submap.radius_m / grid.resolution_m) ** 2
+    occupied, unoccupied = np.argwhere(grid.occupied), np.argwhere(~(grid.occupied | beyond))
+    if noise.freespace and len(unoccupied):
         half = round(noise.obstacle_m / grid.resolution_m)
         for (row, column), circle in zip(
-            free[rng.integers(len(free), size=noise.freespace)].tolist(),
+            unoccupied[rng.integers(len(unoccupied), size=noise.freespace)].tolist(),
             (rng.random(noise.freespace) < 0.5).tolist(),
             strict=True,
         ):
@@ -69,9 +73,6 @@ def add_noise(submap: Submap, noise: Noise, rng: np.random.Generator) -> Submap:
         cells = (at[:, None] + np.rint(spread).astype(np.int64)).reshape(-1, 2)
         cells = cells[((cells >= 0) & (cells < image.shape)).all(axis=1)]
         image[cells[:, 0], cells[:, 1]] = OCCUPIED
-    center = (np.array(image.shape) - 1) / 2
-    rows, columns = np.ogrid[: image.shape[0], : image.shape[1]]
-    beyond = (rows - center[0]) ** 2 + (columns - center[1]) ** 2 > (submap.radius_m / grid.resolution_m) ** 2
     image[beyond] = UNKNOWN
     noisy = OccupancyGrid(cells=image.astype(np.int8), resolution_m=grid.resolution_m, origin_m=grid.origin_m)
     return replace(submap, grid=noisy)

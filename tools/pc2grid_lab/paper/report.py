@@ -92,17 +92,14 @@ def _cell(cell: PaperCell, measure: str) -> str:
 def _print_choices(
     results: Sequence[PaperCell], maps: Sequence[str], title: str, choices: Sequence[SettingChoice]
 ) -> None:
-    """A table of some choices: what the paper says, what the default does, and what the choice moves: AUC on
+    """A table of some choices: what the paper says, what the letter does, and what the choice moves: AUC on
     each map, and the means of AUC and R@1, in thousandths."""
     if {choice.overrides for choice in choices}.isdisjoint(r.task.overrides for r in results):
         return
-    shown = table(title, ("choice", "the paper says", "we do", "noise"), (*maps, "mean", "mean R@1"))
+    shown = table(title, ("choice", "the paper says", "the letter", "noise"), (*maps, "mean", "mean R@1"))
     for level in (0, 2):
-        here = [
-            r
-            for r in results
-            if (r.task.method, r.task.level, r.task.radius_m) == ("as_used_here", level, 8.0)
-        ]
+        wanted = ("proposed", level, 8.0)
+        here = [r for r in results if (r.task.method, r.task.level, r.task.radius_m) == wanted]
         base = {r.task.map_name: _auc_and_right(r) for r in here if not r.task.overrides}
         shown.add_row("all three", "", "Eq. 6", str(level), *_with_means(base, maps, ""))
         for choice in choices:
@@ -111,7 +108,7 @@ def _print_choices(
                 for r in here
                 if r.task.overrides == choice.overrides
             }
-            words = (choice.name, choice.paper, choice.ours, str(level))
+            words = (choice.name, choice.paper, choice.letter, str(level))
             shown.add_row(*words, *_with_means(moved, maps, "+"))
     show(shown)
 
