@@ -57,12 +57,12 @@ def boundary_histogram(points: I64, radius_m: float, resolution_m: float, config
     from signature import _kernels
 
     bins = boundary_bins(radius_m, config)
-    bin_of = _bins_of_squares(resolution_m / config.boundary_bin_m, bins)
+    bin_of = bins_of_squares(resolution_m / config.boundary_bin_m, bins)
     return normalized(_kernels.pair_counts(points, bin_of, bins))
 
 
 @lru_cache(maxsize=8)
-def _bins_of_squares(cell_bins: float, bins: int) -> NDArray[np.int32]:
+def bins_of_squares(cell_bins: float, bins: int) -> NDArray[np.int32]:
     """The bin of the distance of two cells by its square in cells: 0, 1, 2, ... up to that of the last bin.
 
     cell_bins : width of a cell in bins.

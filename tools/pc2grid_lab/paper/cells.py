@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from pc2grid.arrays import F64
 from pc2grid.config import PartitionConfig
 from pc2grid.errors import MapFileError
 from pc2grid.io.nav2_map import load_map
@@ -19,6 +20,7 @@ from pc2grid.submaps.partition import partition
 from pc2grid_lab.experiments.stored import once
 from pc2grid_lab.paper.choices import SettingChoice
 from pc2grid_lab.paper.experiment import BestMatches, Experiment, MatchMeasures, best_matches
+from pc2grid_lab.paper.learned import LEARNED, differences
 from pc2grid_lab.paper.methods import METHOD_NAMES, OURS, make_methods
 from pc2grid_lab.paper.noise import NOISE_LEVELS
 from pc2grid_lab.paper.proposed import Proposed
@@ -155,16 +157,16 @@ def cells_of(tasks: Sequence[PaperTask], folder: Path) -> list[PaperCell]:
     Methods are fitted once for all levels, and queries drawn once for all methods of a level: tasks that
     share queries stand together.
     """
-    made = _run([task for task in tasks if not task.file(folder).exists()])
+    made = _run([task for task in tasks if not task.file(folder).exists()], folder)
     return [once(task.file(folder), partial(next, made)) for task in tasks]
 
 
-def _run(tasks: Sequence[PaperTask]) -> Iterator[PaperCell]:
+def _run(tasks: Sequence[PaperTask], folder: Path) -> Iterator[PaperCell]:
     if not tasks:
         return
     grid = read_map(tasks[0].map_path)
     submaps = partition(grid, PartitionConfig.paper(tasks[0].radius_m))
-    matchers = {key: method.fit(submaps) for key, method in _methods_of(tasks).items()}
+    matchers = {key: method.fit(submaps) for key, method in _methods_of(tasks, folder).items()}
     for shared, some in itertools.groupby(tasks, lambda task: replace(task, method="", overrides=())):
         by_method = {(task.method, task.overrides): task for task in some}
         experiment = Experiment(queries=shared.queries, offset_m=shared.offset_m, seed=shared.seed)
@@ -174,15 +176,36 @@ def _run(tasks: Sequence[PaperTask]) -> Iterator[PaperCell]:
             yield PaperCell(by_method[key], len(submaps), matches, matches.measures(), matches.half_widths())
 
 
-def _methods_of(tasks: Sequence[PaperTask]) -> dict[tuple[str, Overrides], Method]:
-    """The methods of tasks, those of the same features made together."""
+def _methods_of(tasks: Sequence[PaperTask], folder: Path) -> dict[tuple[str, Overrides], Method]:
+    """The methods of tasks of one map, those of the same features made together."""
     found: dict[tuple[str, Overrides], Method] = {}
     for task in tasks:
         if task.overrides:
             config = SignatureConfig.paper().model_copy(update=dict(task.overrides))
             found[task.method, task.overrides] = Proposed(config)
     plain = dict.fromkeys(task.method for task in tasks if not task.overrides)
-    return found | {(name, ()): method for name, method in make_methods(plain).items()}
+    within = None if LEARNED.keys().isdisjoint(plain) else _within(tasks[0], folder)
+    return found | {(name, ()): method for name, method in make_methods(plain, within).items()}
+
+
+def _within(task: PaperTask, folder: Path) -> F64:
+    """`differences` of the other maps in the folder of a map, each kept in a file. Raises MapFileError."""
+    others = [path for path in known_maps(task.map_path.parent) if path.stem != task.map_name]
+    if not others:
+        raise MapFileError(
+            f"{task.map_path.parent}: no other map to learn from",
+            hint="put other maps beside it, or leave out the methods that learn",
+        )
+    found = []
+    for path in others:
+        file = folder / f"differences.{path.stem}.r{task.radius_m:g}.seed{task.seed}.pickle"
+        found.append(once(file, partial(_differences, path, task.radius_m, task.seed)))
+    return np.concatenate(found)
+
+
+def _differences(path: Path, radius_m: float, seed: int) -> F64:
+    grid = read_map(path)
+    return differences(grid, partition(grid, PartitionConfig.paper(radius_m)), seed)
 
 
 def known_maps(path: Path) -> list[Path]:

@@ -87,8 +87,9 @@ def compare_paper_command(
 
 
 def _kept_in(out: Path, maps: Sequence[Path]) -> Path:
-    """The folder of the results of these sources and these maps."""
-    images = [file for path in maps for file in path.parent.glob(f"{path.stem}.*")]
+    """The folder of the results of these sources, these maps, and those beside them to learn from."""
+    beside = {path for folder in {path.parent for path in maps} for path in known_maps(folder)}
+    images = {file for path in {*maps, *beside} for file in path.parent.glob(f"{path.stem}.*")}
     return out / "cells" / digest_of_sources((FRONT, BACK, LABORATORY, *sorted(images)))
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 
 from pc2grid import extras
+from pc2grid.arrays import F64
+from pc2grid_lab.paper.learned import LEARNED, UNLEARNED, Learned, Unlearned, Vectors
 from pc2grid_lab.paper.proposed import Proposed
 from pc2grid_lab.paper.protocol import Method
 from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
@@ -31,12 +33,15 @@ OURS = (*METHOD_NAMES[:2], "as_used_here")
 
 EXTRA_METHOD_NAMES = (
     "as_used_here",
+    *LEARNED,
+    "unlearned",
     "as_used_here_centres",
     "boundary_centres",
     "shape_context_centres",
 )
-"""Beyond the paper: the default settings; places described from several centres, by Eq. 6, by its boundary
-alone, and by the shape context."""
+"""Beyond the paper: the default settings; the boundary at several radii with a learned metric, with more and
+fewer parts, and nothing learned; places described from several centres, by Eq. 6, by its boundary alone, and
+by the shape context."""
 
 
 def require_packages(names: Collection[str]) -> None:
@@ -46,12 +51,14 @@ def require_packages(names: Collection[str]) -> None:
         extras.require({"paper": ", ".join(wanted)})
 
 
-def make_methods(names: Iterable[str]) -> dict[str, Method]:
+def make_methods(names: Iterable[str], within: F64 | None = None) -> dict[str, Method]:
     """Methods by name, with the paper's parameters.
 
-    Methods with the same local features share them when they are made together, so that the features of a
-    submap are extracted once. Raises KeyError for a name that is not known.
+    Methods with the same features share them when they are made together, so that the features of a submap
+    are extracted once. within : `learned.differences` of other maps, without which no method can be made that
+    learns. Raises KeyError for a name that is not known.
     """
+    vectors = Vectors()
     sift_words, surf_words = Vocabulary(sift), Vocabulary(surf)
     # A spread of 1e6 makes Omega of Eq. 6 equal to 1.
     boundary = Proposed(SignatureConfig(weight_boundary=1.0, symmetry_sigma=1e6))
@@ -66,8 +73,11 @@ def make_methods(names: Iterable[str]) -> dict[str, Method]:
         "sift_tfidf": Words(sift_words, tfidf=True),
         "surf_tfidf": Words(surf_words, tfidf=True),
         "sdf": DistanceFeatures(),
+        "unlearned": Unlearned(vectors, UNLEARNED),
         "as_used_here_centres": SeveralCentres(method=Proposed()),
         "boundary_centres": SeveralCentres(method=boundary),
         "shape_context_centres": SeveralCentres(method=ShapeContext()),
     }
+    if within is not None:
+        known |= {name: Learned(vectors, parts, within) for name, parts in LEARNED.items()}
     return {name: known[name] for name in names}
