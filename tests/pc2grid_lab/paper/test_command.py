@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,10 +22,11 @@ from pc2grid_lab.paper import experiment
 from pc2grid_lab.paper.cells import cells_of, paper_tasks, read_map, that_share_submaps
 from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES
 from pc2grid_lab.paper.command import compare_paper_command
-from pc2grid_lab.paper.experiment import BestMatches, Experiment, draw_queries, evaluate
+from pc2grid_lab.paper.experiment import BestMatches, Experiment, MatchMeasures, draw_queries, evaluate
 from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods
 from pc2grid_lab.paper.noise import NOISE_LEVELS
 from pc2grid_lab.paper.published import MAPS, TABLE_3, TABLE_4
+from pc2grid_lab.paper.report import _cell
 from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
 from signature.config import SignatureConfig
 from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
@@ -68,9 +70,49 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
     assert second.exit_code == 0, second.output
     assert len(written) == 10
     assert written == {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").rglob("*.pickle")}
-    assert "Table III, AUC and R@1" in second.stdout and "Table IV" in second.stdout
-    # AUC of the paper, ours, the difference, its interval; then R@1, which the paper does not give.
-    assert re.search(r"^ *0 +proposed +965 +\d+ +[-+]\d+ \+-\d+ +\d+ \+-\d+", second.stdout, re.MULTILINE)
+    # Of the one map and of the mean: AUC of the paper, ours, the difference, its interval; R@1 is not in the
+    # paper.
+    of_auc, of_right = r"965 +\d+ +[-+]\d+ \+-\d+", r"\d+ \+-\d+"
+    for measure, cell in (("AUC", of_auc), ("R@1", of_right)):
+        row = rf"^ *0 +{measure} +proposed +{cell} +{cell} *$"
+        assert re.search(row, second.stdout, re.MULTILINE), (measure, second.stdout)
+
+
+def test_the_tables_answer_one_question_after_the_other(maps: Path, tmp_path: Path) -> None:
+    arguments = ["--maps", str(maps), "--out", str(tmp_path), "--queries", "3", "--jobs", "1", "--ablation"]
+    arguments += ["--offset", "1.0"]
+    for method in ("unlearned", "proposed_ln_bc", "sdf", "proposed"):
+        arguments += ["--methods", method]
+    shown = runner.invoke(app, arguments).stdout
+    titles = ["does it hold", "Table IV", "its rivals", "What beats it", "What each signature adds"]
+    assert sorted(titles, key=shown.index) == titles
+    parts = re.split("|".join(titles), shown)
+    for part, methods in zip(parts[1:4], ({"proposed", "proposed_ln_bc"},) * 2 + ({"sdf"},), strict=True):
+        assert set(re.findall(r"AUC +(\w+)", part)) == methods
+    assert set(re.findall(r"AUC +(\w+) +965", parts[4])) == {"unlearned"}
+
+
+def test_of_several_maps_the_mean_difference_has_a_narrower_interval(maps: Path, tmp_path: Path) -> None:
+    """By independence: of n equal maps the interval of the mean is that of one by the root of n."""
+    (task,) = [
+        t
+        for t in paper_tasks([maps / "intel.yaml"], methods=["unlearned"], offsets_m=[1.0], queries=4, seed=1)
+        if t.level == 0
+    ]
+    (cell,) = cells_of([task], tmp_path)
+    half = MatchMeasures(0.02, 0.02, 0.02, 0.02)
+    cells = [
+        replace(cell, task=replace(task, map_path=Path(f"{name}.yaml")), half_widths=half)
+        for name in ("fr079", "intel", "csail", "aces")
+    ]
+    mean_auc = 1000 * np.mean([TABLE_3[0]["proposed"][cell.task.map_name].auc for cell in cells])
+    ours = 1000 * cell.measures.auc
+    assert _cell(cells, "auc").split() == [
+        f"{mean_auc:.0f}",
+        f"{ours:.0f}",
+        f"{ours - mean_auc:+.0f}",
+        "+-10",
+    ]
 
 
 def test_queries_are_drawn_once_a_level_and_databases_fitted_once(

@@ -7,22 +7,24 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from rich.table import Table
 
 from pc2grid.arrays import F64
 from pc2grid_cli.tables import show, table
 from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.paper.cells import RADII_M, PaperCell
 from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES, SettingChoice
-from pc2grid_lab.paper.experiment import MatchMeasures
-from pc2grid_lab.paper.methods import OURS
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, OURS
 from pc2grid_lab.paper.published import SUBMAPS
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
+_MEASURES = ("auc", "rp9", "f1", "r_at_1")
+"""Those that the paper has come first."""
 
 
 def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
-    """Tables I, III and IV on stdout: published, ours and the difference, in thousandths."""
+    """Tables I, III and IV on stdout, in the order of a reader's questions: does the method hold, how do its
+    rivals do, what beats it, and what do its parts and open choices move.
+    """
     maps = list(dict.fromkeys(r.task.map_name for r in results))
     counts = {r.task.map_name: r.submaps for r in results if r.task.radius_m == 8.0}
     first = table("Table I, number of submaps", ["map"], ["paper", "ours"])
@@ -31,62 +33,59 @@ def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
     show(
         first,
         "Of three numbers: paper, ours, difference, in thousandths; +-: half of the interval from 5 to 95 %,"
-        " by bootstrap over the queries.",
+        " by bootstrap over the queries. Methods that the paper does not have stand beside its own.",
     )
+    ours, rivals, beyond = (
+        [name for name in methods if name in group] for group in (OURS, METHOD_NAMES, EXTRA_METHOD_NAMES)
+    )
+    rivals, beyond = ([name for name in group if name not in OURS] for group in (rivals, beyond))
     for offset_m in dict.fromkeys(r.task.offset_m for r in results):
         of_offset = [r for r in results if r.task.offset_m == offset_m]
         plain = [r for r in of_offset if not r.task.overrides]
         where = f"queries within {offset_m:g} m of a submap centre"
-        for measures in (("auc", "r_at_1"), ("rp9", "f1")):
-            show(_table_3(plain, maps, methods, measures, where))
-        show(_table_4(plain, maps, where))
+        at_8_m = [(str(level), level, 8.0) for level in range(len(_LEVELS))]
+        _print_measures(f"Table III, does it hold: {where}", "noise", at_8_m, plain, maps, ours)
+        by_radius = [(f"{radius_m:g} m", 1, radius_m) for radius_m in RADII_M]
+        _print_measures(f"Table IV, noise level 1: {where}", "radius", by_radius, plain, maps, ours)
+        _print_measures(f"Table III, its rivals: {where}", "noise", at_8_m, plain, maps, rivals)
+        _print_measures(f"What beats it: {where}", "noise", at_8_m, plain, maps, beyond)
         _print_choices(of_offset, maps, f"What each signature adds: {where}", ABLATION)
         _print_choices(of_offset, maps, f"What other choices move: {where}", OPEN_CHOICES)
 
 
-def _table_3(
+def _print_measures(
+    title: str,
+    heading: str,
+    settings: Sequence[tuple[str, int, float]],
     plain: Sequence[PaperCell],
     maps: Sequence[str],
     methods: Sequence[str],
-    measures: Sequence[str],
-    where: str,
-) -> Table:
-    headings = [f"{name} {_title(measure)}" for name, measure in itertools.product(maps, measures)]
-    title = " and ".join(map(_title, measures))
-    shown = table(f"Table III, {title}, {where}", ("noise", "method"), headings)
-    for level, method in itertools.product(range(len(_LEVELS)), methods):
-        row = [r for r in plain if (r.task.method, r.task.level, r.task.radius_m) == (method, level, 8.0)]
-        shown.add_row(str(level), method, *_cells(row, maps, measures))
-    return shown
+) -> None:
+    """A table of some methods: a row for each measure and setting (its name, noise level and radius), a
+    column for each map and one for their mean."""
+    shown = table(title, (heading, "measure", "method"), (*maps, "mean"))
+    for (name, level, radius_m), measure, method in itertools.product(settings, _MEASURES, methods):
+        wanted = (method, level, radius_m)
+        row = {r.task.map_name: r for r in plain if (r.task.method, r.task.level, r.task.radius_m) == wanted}
+        if row:
+            title_of = "R@1" if measure == "r_at_1" else measure.upper()
+            cells = [_cell([row[m]], measure) if m in row else "" for m in maps]
+            shown.add_row(name, title_of, method, *cells, _cell(list(row.values()), measure))
+    if shown.row_count:
+        show(shown)
 
 
-def _table_4(plain: Sequence[PaperCell], maps: Sequence[str], where: str) -> Table:
-    shown = table(f"Table IV (noise level 1), {where}", ("radius", "method", "measure"), maps)
-    for radius_m, method, measure in itertools.product(RADII_M, OURS, MatchMeasures._fields):
-        row = [r for r in plain if (r.task.method, r.task.level, r.task.radius_m) == (method, 1, radius_m)]
-        shown.add_row(f"{radius_m:g} m", method, _title(measure), *_cells(row, maps, [measure]))
-    return shown
-
-
-def _title(measure: str) -> str:
-    return "R@1" if measure == "r_at_1" else measure.upper()
-
-
-def _cells(row: Sequence[PaperCell], maps: Sequence[str], measures: Sequence[str]) -> list[str]:
-    """A text for each map and measure."""
-    by_map = {r.task.map_name: r for r in row}
-    wanted = itertools.product(maps, measures)
-    return [_cell(by_map[name], measure) if name in by_map else "" for name, measure in wanted]
-
-
-def _cell(cell: PaperCell, measure: str) -> str:
-    ours = round(1000 * getattr(cell.measures, measure))
-    spread = f"+-{round(1000 * getattr(cell.half_widths, measure)):<2d}"
-    published = getattr(cell.published, measure, None)
-    if published is None:
-        return f"{ours} {spread}"
-    there = round(1000 * published)
-    return f"{there:3d} {ours:4d} {ours - there:+4d} {spread}"
+def _cell(cells: Sequence[PaperCell], measure: str) -> str:
+    """The mean over maps: paper, ours, difference and interval; only ours if the paper lacks one of them."""
+    ours = 1000 * float(np.mean([getattr(cell.measures, measure) for cell in cells]))
+    halves = [getattr(cell.half_widths, measure) for cell in cells]
+    # The queries of the maps are independent of each other.
+    spread = f"+-{1000 * float(np.linalg.norm(halves)) / len(cells):<2.0f}"
+    published = [p for cell in cells if (p := getattr(cell.published, measure, None)) is not None]
+    if len(published) < len(cells):
+        return f"{ours:.0f} {spread}"
+    there = 1000 * float(np.mean(published))
+    return f"{there:3.0f} {ours:4.0f} {ours - there:+4.0f} {spread}"
 
 
 def _print_choices(
