@@ -16,8 +16,8 @@ from pc2grid.submaps.partition import partition
 from pc2grid_lab.paper import learned
 from pc2grid_lab.paper.cells import cells_of, paper_tasks, read_map
 from pc2grid_lab.paper.learned import COLUMNS, CONFIG, Learned, Unlearned, Vectors, vector, weight
-from pc2grid_lab.paper.proposed import signature_of
 from signature.boundary import boundary_edges, boundary_points
+from signature.describe import describe
 from tests.helpers.field import DATA
 from tests.helpers.rooms import (
     RESOLUTION_M,
@@ -51,7 +51,7 @@ def test_a_vector_has_the_shares_of_weighed_pairs() -> None:
         np.testing.assert_allclose(found[COLUMNS[part]], np.sqrt(sums / sums.sum())[:size], atol=1e-9)
     rings = np.bincount(np.minimum(away_m / 0.8, 9).astype(int), minlength=10)
     np.testing.assert_allclose(found[COLUMNS["radial"]] ** 2, rings / rings.sum(), atol=1e-12)
-    signature = signature_of(submap, CONFIG)
+    signature = describe(submap, CONFIG)
     np.testing.assert_allclose(found[COLUMNS["boundary"]] ** 2, signature.boundary, atol=1e-6)
     np.testing.assert_allclose(found[COLUMNS["freespace"]] ** 2, signature.freespace, atol=1e-6)
     np.testing.assert_allclose(found[COLUMNS["symmetry"]] * 255, signature.symmetry, rtol=1e-6)

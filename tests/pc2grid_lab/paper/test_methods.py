@@ -12,10 +12,13 @@ from pc2grid.model import Submap
 from pc2grid_lab.paper.experiment import rotated_submap
 from pc2grid_lab.paper.learned import vector
 from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods
+from pc2grid_lab.paper.proposed import Proposed
 from pc2grid_lab.paper.protocol import Matcher, Method
 from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
 from pc2grid_lab.paper.rivals.shape_context import ShapeContext
 from pc2grid_lab.paper.several_centres import SeveralCentres, lattice, smaller_disc
+from signature.config import SignatureConfig
+from signature.freespace import freespace_paths
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
 ALL = METHOD_NAMES + EXTRA_METHOD_NAMES
@@ -88,6 +91,29 @@ def test_unknown_methods_are_named() -> None:
     with pytest.raises(KeyError, match="orb"):
         make_methods(["orb_bow"])
     assert all(isinstance(method, Method) for method in make_methods(METHOD_NAMES).values())
+
+
+def test_methods_that_differ_in_comparing_share_the_description_of_a_query(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The two readings of the distance do; other signatures are not mistaken for these."""
+    submaps, query = rooms()[:3], submap_of(random_rooms(5))
+    names = ("proposed", "proposed_ln_bc")
+    shared = make_methods(names)
+    coarse = Proposed(
+        SignatureConfig.paper().model_copy(update={"boundary_bin_m": 0.4}), shared["proposed"].signatures
+    )
+    matchers = [method.fit(submaps) for method in (*shared.values(), coarse)]
+    described = []
+    monkeypatch.setattr(
+        "pc2grid_lab.paper.proposed.freespace_paths",
+        lambda *of: described.append(of) or freespace_paths(*of),
+    )
+    found = [matcher.similarities(query) for matcher in matchers]
+    assert len(described) == 2
+    for matcher, method in zip(found, (*shared.values(), coarse), strict=True):
+        alone = Proposed(method.config).fit(submaps).similarities(query)
+        assert np.array_equal(matcher, alone)
 
 
 def test_shape_context_of_one_wall_by_hand() -> None:

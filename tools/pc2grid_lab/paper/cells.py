@@ -23,7 +23,7 @@ from pc2grid_lab.paper.experiment import BestMatches, Experiment, MatchMeasures,
 from pc2grid_lab.paper.learned import LEARNED, differences
 from pc2grid_lab.paper.methods import METHOD_NAMES, OURS, make_methods
 from pc2grid_lab.paper.noise import NOISE_LEVELS
-from pc2grid_lab.paper.proposed import Proposed
+from pc2grid_lab.paper.proposed import Proposed, Signatures
 from pc2grid_lab.paper.protocol import Method
 from pc2grid_lab.paper.published import MAPS, SIZE_PX, TABLE_3, TABLE_4, Measures
 from signature.config import SignatureConfig
@@ -178,14 +178,16 @@ def _run(tasks: Sequence[PaperTask], folder: Path) -> Iterator[PaperCell]:
 
 def _methods_of(tasks: Sequence[PaperTask], folder: Path) -> dict[tuple[str, Overrides], Method]:
     """The methods of tasks of one map, those of the same features made together."""
-    found: dict[tuple[str, Overrides], Method] = {}
+    plain = dict.fromkeys(task.method for task in tasks if not task.overrides)
+    within = None if LEARNED.keys().isdisjoint(plain) else _within(tasks[0], folder)
+    signatures = Signatures()
+    made = make_methods(plain, within, signatures)
+    found: dict[tuple[str, Overrides], Method] = {(name, ()): method for name, method in made.items()}
     for task in tasks:
         if task.overrides:
             config = SignatureConfig.paper().model_copy(update=dict(task.overrides))
-            found[task.method, task.overrides] = Proposed(config)
-    plain = dict.fromkeys(task.method for task in tasks if not task.overrides)
-    within = None if LEARNED.keys().isdisjoint(plain) else _within(tasks[0], folder)
-    return found | {(name, ()): method for name, method in make_methods(plain, within).items()}
+            found[task.method, task.overrides] = Proposed(config, signatures)
+    return found
 
 
 def _within(task: PaperTask, folder: Path) -> F64:

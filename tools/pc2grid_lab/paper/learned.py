@@ -21,7 +21,7 @@ from pc2grid.model import OccupancyGrid, Submap
 from pc2grid_lab.paper import _kernels
 from pc2grid_lab.paper.experiment import Experiment, draw_queries
 from pc2grid_lab.paper.noise import NOISE_LEVELS
-from pc2grid_lab.paper.proposed import signature_of
+from pc2grid_lab.paper.proposed import Signatures
 from signature.boundary import bins_of_squares, boundary_edges, boundary_points
 from signature.config import SignatureConfig
 
@@ -75,7 +75,7 @@ def vector(submap: Submap) -> F64:
     bin_of = bins_of_squares(resolution_m / CONFIG.boundary_bin_m, bins)
     whole, soft, near = _kernels.weighed_pairs(cells, weights, bin_of, bins)
     rings = np.bincount(np.minimum((away_m / _RING_M).astype(np.int64), _RINGS - 1), minlength=_RINGS)
-    signature = signature_of(submap, CONFIG)
+    signature = Signatures().of(submap, CONFIG)
     counts = (whole, soft, near[:_NEAR_BINS], rings, signature.freespace)
     roots = [np.sqrt(c / max(c.sum(), 1e-9)) for c in counts]
     return np.concatenate((*roots, signature.symmetry / 255))

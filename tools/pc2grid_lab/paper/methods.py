@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable
 from pc2grid import extras
 from pc2grid.arrays import F64
 from pc2grid_lab.paper.learned import LEARNED, UNLEARNED, Learned, Unlearned, Vectors
-from pc2grid_lab.paper.proposed import Proposed
+from pc2grid_lab.paper.proposed import Proposed, Signatures
 from pc2grid_lab.paper.protocol import Method
 from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
 from pc2grid_lab.paper.rivals.shape_context import ShapeContext
@@ -51,21 +51,23 @@ def require_packages(names: Collection[str]) -> None:
         extras.require({"paper": ", ".join(wanted)})
 
 
-def make_methods(names: Iterable[str], within: F64 | None = None) -> dict[str, Method]:
+def make_methods(
+    names: Iterable[str], within: F64 | None = None, signatures: Signatures | None = None
+) -> dict[str, Method]:
     """Methods by name, with the paper's parameters.
 
     Methods with the same features share them when they are made together, so that the features of a submap
     are extracted once. within : `learned.differences` of other maps, without which no method can be made that
     learns. Raises KeyError for a name that is not known.
     """
-    vectors = Vectors()
+    signatures, vectors = signatures or Signatures(), Vectors()
     sift_words, surf_words = Vocabulary(sift), Vocabulary(surf)
     # A spread of 1e6 makes Omega of Eq. 6 equal to 1.
     boundary = Proposed(SignatureConfig(weight_boundary=1.0, symmetry_sigma=1e6))
     ln_bc = SignatureConfig.paper().model_copy(update={"histogram_distance": "bhattacharyya"})
     known: dict[str, Method] = {
-        "proposed": Proposed(SignatureConfig.paper()),
-        "proposed_ln_bc": Proposed(ln_bc),
+        "proposed": Proposed(SignatureConfig.paper(), signatures),
+        "proposed_ln_bc": Proposed(ln_bc, signatures),
         "as_used_here": Proposed(),
         "shape_context": ShapeContext(),
         "sift_bow": Words(sift_words, tfidf=False),

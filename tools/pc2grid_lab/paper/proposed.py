@@ -12,28 +12,45 @@ from signature.describe import Signature, described
 from signature.freespace import freespace_paths
 from signature.similarity import SignatureTable, distances, similarity
 
+_OF_COMPARING = {"weight_boundary", "symmetry_scale", "symmetry_sigma", "histogram_distance"}
+"""Fields of a configuration that do not change a signature."""
+
+
+@dataclass(slots=True)
+class Signatures:
+    """Signatures, with those of the last submap cached: methods that share them describe a query once."""
+
+    _read: Submap | None = None
+    _found: dict[str, Signature] = field(default_factory=dict)
+
+    def of(self, submap: Submap, config: SignatureConfig) -> Signature:
+        """The signature that `signature.describe` gives, without a graph that would only be unpacked."""
+        if self._read is not submap:
+            self._read, self._found = submap, {}
+        key = config.model_dump_json(exclude=_OF_COMPARING)
+        if key not in self._found:
+            self._found[key] = described(submap, freespace_paths(submap, config), config)
+        return self._found[key]
+
 
 @dataclass(frozen=True, slots=True)
 class Proposed:
     """Three signatures, compared by Eq. 6."""
 
     config: SignatureConfig = field(default_factory=SignatureConfig)
+    signatures: Signatures = field(default_factory=Signatures)
 
     def fit(self, submaps: Sequence[Submap]) -> _Table:
         """Describe every submap."""
-        signatures = [signature_of(submap, self.config) for submap in submaps]
-        return _Table(SignatureTable.of(signatures, [submap.center_m for submap in submaps]), self.config)
+        signatures = [self.signatures.of(submap, self.config) for submap in submaps]
+        return _Table(self, SignatureTable.of(signatures, [submap.center_m for submap in submaps]))
 
 
 @dataclass(frozen=True, slots=True)
 class _Table:
+    method: Proposed
     table: SignatureTable
-    config: SignatureConfig
 
     def similarities(self, query: Submap) -> F64:
-        return similarity(distances(signature_of(query, self.config), self.table, self.config))
-
-
-def signature_of(submap: Submap, config: SignatureConfig) -> Signature:
-    """The signature that `signature.describe` gives, without a graph that would only be unpacked."""
-    return described(submap, freespace_paths(submap, config), config)
+        config = self.method.config
+        return similarity(distances(self.method.signatures.of(query, config), self.table, config))
