@@ -73,7 +73,7 @@ class DistanceFeatures:
         return _FeatureTable(
             self,
             np.concatenate([f.places_m for f in features]),
-            descriptors,
+            -2 * descriptors,
             (descriptors**2).sum(axis=1),
             np.cumsum([0, *(len(f.places_m) for f in features)]),
         )
@@ -121,9 +121,11 @@ def distance_function(submap: Submap, smooth_m: float) -> F32:
 
 @dataclass(frozen=True, slots=True)
 class _FeatureTable:
+    """places_m (D, 2), minus_twice (D, 129) of the descriptors b of all submaps: -2 b and |b|^2 (D,)."""
+
     method: DistanceFeatures
     places_m: F32
-    descriptors: F32
+    minus_twice: F32
     squares: F32
     starts: I64
 
@@ -133,8 +135,7 @@ class _FeatureTable:
         if len(wanted.places_m) == 0 or len(self.places_m) == 0:
             return np.zeros(n)
         # |a - b|^2 without |a|^2, which is the same for every b and does not change which is the nearest.
-        costs = wanted.descriptors @ self.descriptors.T
-        costs *= -2
+        costs = wanted.descriptors @ self.minus_twice.T
         costs += self.squares
         inliers = _consensus(
             wanted.places_m,
