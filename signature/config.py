@@ -131,9 +131,10 @@ class SignatureConfig(Section):
         limit in S^G, one vote for each segment.
 
         The paper leaves open: which d of Eq. 6 it calls Bhattacharyya's (here OpenCV's, sqrt(1 - BC); the
-        other reading is `histogram_distance="bhattacharyya"`); which of the two thinnings is which; how
-        far apart points and nodes are; the parameters of Hough's transform, how far apart the axes lie, and
-        the blur. These are as in the default.
+        other reading is `histogram_distance="bhattacharyya"`); which of the two thinnings is which (Guo and
+        Hall's in III-A would give killian 187 submaps, where Table I has 91); how far apart points and nodes
+        are; the parameters of Hough's transform, how far apart the axes lie, and the blur. What is not named
+        here is as in the default.
 
         >>> SignatureConfig.paper().histogram_distance, SignatureConfig.paper().freespace_thinning
         ('hellinger', 'zhang_suen')

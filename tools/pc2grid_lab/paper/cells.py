@@ -157,8 +157,11 @@ def cells_of(tasks: Sequence[PaperTask], folder: Path) -> list[PaperCell]:
     Methods are fitted once for all levels, and queries drawn once for all methods of a level: tasks that
     share queries stand together.
     """
-    made = _run([task for task in tasks if not task.file(folder).exists()], folder)
-    return [once(task.file(folder), partial(next, made)) for task in tasks]
+    made: dict[PaperTask, PaperCell] = {}
+    for cell in _run([task for task in tasks if not task.file(folder).exists()], folder):
+        made[cell.task] = cell
+        once(cell.task.file(folder), partial(made.__getitem__, cell.task))
+    return [once(task.file(folder), partial(made.__getitem__, task)) for task in tasks]
 
 
 def _run(tasks: Sequence[PaperTask], folder: Path) -> Iterator[PaperCell]:

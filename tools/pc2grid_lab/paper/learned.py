@@ -30,7 +30,7 @@ CONFIG = SignatureConfig.paper().model_copy(update={"thinning": "zhang_suen"})
 boundary is right for .93 of 200 queries with it, and for .91 with Guo and Hall's."""
 
 LEARNED_FROM = 400
-"""Queries of each other map, from whose own stream of the experiment they are."""
+"""Queries of each other map: the first of its own stream in the experiment."""
 _SHRUNK = 0.6
 """The covariance is shrunk by this share to its diagonal; .3, .6 and .8 gave the same within .01."""
 _RIDGE = 1e-6
