@@ -11,11 +11,12 @@ from pc2grid.arrays import F64
 from pc2grid.errors import FrameError, NoScans, TopicError
 from pc2grid.geometry import SE2, pose_from_xyz_quat
 from pc2grid.io import topics
+from pc2grid.io.first_messages import tolerant
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.message_source import MessageSource, RawMessage, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, PoseStamped, Seven, valid_pose
-from pc2grid.io.read_plan import tolerant
+from pc2grid.io.robots import Namespaces
 
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """x, y and yaw among x, y, z, roll, pitch, yaw."""
@@ -126,7 +127,7 @@ class _TfPoses:
     """
 
     def __init__(self, known: Sequence[TopicInfo], channel: TopicInfo, base_frame: str) -> None:
-        self._decoders = {(t.topic, t.type): decoder_for(t) for t in topics.tf_topics(channel, known)}
+        self._decoders = {(t.topic, t.type): decoder_for(t) for t in Namespaces(channel, known).tf_topics()}
         self._base_frame = base_frame
         self._tree = FrameTree()
         self._newest_ns: dict[str, int] = {}

@@ -24,13 +24,16 @@ from pc2grid.errors import (
 )
 from pc2grid.geometry import invert_pose
 from pc2grid.io.attitude import Attitude
+from pc2grid.io.base_frame import registered
+from pc2grid.io.first_messages import tolerant
+from pc2grid.io.found_sensors import Sensor
 from pc2grid.io.frames import PARAMETERS as FRAMES
 from pc2grid.io.frames import FrameTree, PoseTrack
 from pc2grid.io.further_scans import FurtherScans, Received, together
 from pc2grid.io.message_source import GAP_NS, MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import CameraInfo, Imu, Odometry, ScanMessage, Transform
-from pc2grid.io.read_plan import Plan, Sensor, registered, tolerant
+from pc2grid.io.read_plan import Plan
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.sensors.scan_decoder import ScanDecoder
 from pc2grid.model import Scan

@@ -1,10 +1,9 @@
-"""Which topic of a log the scans come from, and which others belong to the same robot."""
+"""What is on the topics of a log, by their types and names, and which of them hold scans."""
 
 from __future__ import annotations
 
 import difflib
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from pc2grid.errors import NoScans, TopicError, UnsupportedSchema
 from pc2grid.io.message_source import TopicInfo
@@ -46,12 +45,12 @@ _ADVICE = {
 
 
 def scan_topics(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[list[TopicInfo], str]:
-    """The topics that hold scans, of those that `wanted` names only these; and a sentence that says why.
+    """Return the topics that hold scans, only those that `wanted` names if it does; and a sentence why.
 
     Raises TopicError if one is missing or of another kind of sensor than the first, NoScans if none holds
     scans, UnsupportedSchema if one is of a type that holds none.
     """
-    fitting = [t for t in topics if _fits(t, topics)]
+    fitting = [t for t in topics if holds_scans(t, topics)]
     if names := names_in(wanted):
         found = [_named(topics, fitting, name) for name in names]
         for other in found:
@@ -72,7 +71,7 @@ def scan_topics(topics: Sequence[TopicInfo], wanted: str | None) -> tuple[list[T
 
 
 def several(found: Sequence[TopicInfo], measured: Sequence[TopicInfo]) -> TopicError:
-    """The error where several topics hold scans. measured : those to propose, one of each sensor."""
+    """Return the error where several topics hold scans. measured : those to propose, one of each sensor."""
     alike = [t.topic for t in measured if t.type == measured[0].type]
     both = f", or one of each sensor: --topic {','.join(alike[:4])}" if len(alike) > 1 else ""
     return TopicError(
@@ -81,7 +80,7 @@ def several(found: Sequence[TopicInfo], measured: Sequence[TopicInfo]) -> TopicE
 
 
 def is_fixed(frame: str) -> bool:
-    """Whether a frame has the name of one that does not move with the robot."""
+    """Return whether a frame has the name of one that does not move with the robot."""
     return frame.rpartition("/")[2] in _FIXED
 
 
@@ -89,22 +88,22 @@ def _no_scans(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo]) -> NoSc
     if fitting:
         return NoScans(f"{listed(fitting)}: no message in the log")
     if image := next((t for t in topics if _is_depth_image(t)), None):
-        return _no_camera_info(image)
+        return no_camera_info(image)
     there = listed(topics) if topics else "the log has no topics at all"
     return NoScans(f"no topic with scans; there is: {there}", hint=_advice_on(topics))
 
 
 def _advice_on(topics: Sequence[TopicInfo]) -> str:
-    """What to do to get scans from topics that hold none."""
+    """Return what to do to get scans from topics that hold none."""
     found = ((t, advice) for t in topics for part, advice in _ADVICE.items() if part in t.type)
     topic, advice = next(found, (None, _SCANS_ARE))
     return advice if topic is None else f"{topic.topic} is {topic.type}: {advice}"
 
 
 def proposed(image: TopicInfo, topics: Sequence[TopicInfo]) -> NoScans:
-    """The error for a log whose only scans are depth images on a topic whose name does not say so."""
+    """Return the error for a log whose only scans are depth images on a topic whose name does not say so."""
     if not any(t.type in CAMERA_INFOS for t in topics):
-        return _no_camera_info(image)
+        return no_camera_info(image)
     return NoScans(
         f"no topic with scans by its name, but {image.topic} ({image.type}) holds depth images",
         hint=f"--topic {image.topic} uses them",
@@ -112,111 +111,24 @@ def proposed(image: TopicInfo, topics: Sequence[TopicInfo]) -> NoScans:
 
 
 def names_in(wanted: str | None) -> list[str]:
-    """The topics of a list such as `/front,/rear`; no topic of ROS has a comma in its name."""
+    """Return the topics of a list such as `/front,/rear`; no topic of ROS has a comma in its name."""
     return list(dict.fromkeys(name.strip() for name in (wanted or "").split(",") if name.strip()))
 
 
 def usable(topics: Sequence[TopicInfo], wanted: str | None) -> list[TopicInfo]:
-    """The topics that scans may be read from, silent ones among them; of those that `wanted` names only
-    these."""
+    """Return the topics that scans may be read from, silent ones among them; only those that `wanted` names
+    if it does."""
     names = names_in(wanted)
-    fitting = [t for t in topics if (t.topic in names if names else _fits(t, topics))]
+    fitting = [t for t in topics if (t.topic in names if names else holds_scans(t, topics))]
     return [t for t in fitting if t.type in SENSORS]
 
 
 def may_be_used(topic: TopicInfo, topics: Sequence[TopicInfo], wanted: str | None) -> bool:
-    """Whether the messages of a topic are of use, as far as one can say before the first message.
+    """Return whether the messages of a topic are of use, as far as one can say before the first message.
 
     wanted : the topic that scans are to be read from; None: any.
     """
     return topic.type in (*TF, *ODOMETRY, *IMU, *CAMERA_INFOS) or topic in usable(topics, wanted)
-
-
-def belongs(topic: TopicInfo, scans: TopicInfo, topics: Sequence[TopicInfo]) -> bool | None:
-    """Return whether a topic is of the robot that the scans are of, by their namespaces; None: it may as well
-    be of another robot.
-
-    A namespace with transforms is a robot's, beside others with transforms; but one above it without scans is
-    shared by all. In a namespace without transforms, what stands beside other scans may be of their robot.
-    """
-    return _owner(scans, topics)(topic)
-
-
-def _owner(scans: TopicInfo, topics: Sequence[TopicInfo]) -> Callable[[TopicInfo], bool | None]:
-    """`belongs` for any topic."""
-    roots = {_namespace(t) for t in topics if t.type in TF and t.message_count != 0}
-    of_scans = {_namespace(t) for t in topics if _fits(t, topics)}
-    above_scans = {space[:k] for space in of_scans for k in range(1, len(space) + 1)}
-
-    def root(space: tuple[str, ...]) -> tuple[str, ...] | None:
-        return next((space[:k] for k in range(len(space), -1, -1) if space[:k] in roots), None)
-
-    home, with_scans = root(_namespace(scans)), set(map(root, of_scans))
-    others = {r for r in roots - {home} if home is not None and (home[: len(r)] != r or r in with_scans)}
-
-    def is_own(topic: TopicInfo) -> bool | None:
-        space = _namespace(topic)
-        if (there := root(space)) in others:
-            return False
-        unsure = there != home and (others or (home is None and len(roots) > 1))
-        beside = not is_above(topic, scans) and space[: _shared(topic, scans) + 1] in above_scans
-        return None if unsure or beside else True
-
-    return is_own
-
-
-def rivals(topic: TopicInfo, scans: TopicInfo, topics: Sequence[TopicInfo]) -> list[TopicInfo]:
-    """Return the other topics of scans that a topic stands beside, in a namespace that `scans` is not in."""
-    if is_above(topic, scans):
-        return []
-    branch = _namespace(topic)[: _shared(topic, scans) + 1]
-    return [t for t in topics if _namespace(t)[: len(branch)] == branch and _fits(t, topics)]
-
-
-def is_above(topic: TopicInfo, scans: TopicInfo) -> bool:
-    """Return whether the scans are in the namespace of a topic, or in one below it."""
-    return len(_namespace(topic)) == _shared(topic, scans)
-
-
-def are_namesakes(topic: TopicInfo, other: TopicInfo) -> bool:
-    """Return whether two topics have the same name in two namespaces that stand beside each other."""
-    a, b = (t.topic.lstrip("/").split("/")[_shared(topic, other) :] for t in (topic, other))
-    return len(a) > 1 and a[0] != b[0] and a[1:] == b[1:]
-
-
-def shared_parts(name: str, other: str) -> int:
-    """Return how many parts two names share from the beginning on, without the last part of each: 1 for
-    robot1/odom and robot1/camera/depth."""
-    parts = (n.lstrip("/").split("/")[:-1] for n in (name, other))
-    return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
-
-
-def _namespace(topic: TopicInfo) -> tuple[str, ...]:
-    return tuple(topic.topic.lstrip("/").split("/")[:-1])
-
-
-def _shared(topic: TopicInfo, scans: TopicInfo) -> int:
-    return shared_parts(topic.topic, scans.topic)
-
-
-def _nearest(found: Sequence[TopicInfo], scans: TopicInfo, topics: Sequence[TopicInfo]) -> list[TopicInfo]:
-    """Of some topics those that are not another robot's: first those of the robot of the scans, and of these
-    those that share most of its namespace; otherwise in their order."""
-    is_own = _owner(scans, topics)
-    own = (t for t in found if is_own(t) is not False)
-    return sorted(own, key=lambda t: (is_own(t) is None, -_shared(t, scans)))
-
-
-def tf_topics(scans: TopicInfo, topics: Sequence[TopicInfo]) -> list[TopicInfo]:
-    """Return the topics of the transforms that place the sensor of the scans on its robot.
-
-    Of several robots' transforms, a robot's own go before those that all of them share, which may have
-    frames of the same names.
-    """
-    found = _nearest([t for t in topics if t.type in TF and t.message_count != 0], scans, topics)
-    is_own = _owner(scans, topics)
-    own = {is_static(t) for t in found if is_own(t)}
-    return [t for t in found if is_own(t) or is_static(t) not in own]
 
 
 def is_static(topic: TopicInfo) -> bool:
@@ -224,41 +136,12 @@ def is_static(topic: TopicInfo) -> bool:
     return topic.topic.endswith("tf_static")
 
 
-def camera_info_topic(image: TopicInfo, topics: Sequence[TopicInfo]) -> TopicInfo:
-    """Return the CameraInfo that belongs to a depth image: the one that shares most of its namespace.
-
-    Raises NoScans if there is none.
-    """
-    infos = sorted((t for t in topics if t.type in CAMERA_INFOS), key=lambda t: t.topic, reverse=True)
-    infos.sort(key=lambda t: "depth" not in t.topic)
-    own = [t for t in _nearest(infos, image, topics) if belongs(t, image, topics)]
-    if not own:
-        raise _no_camera_info(image)
-    return own[0]
-
-
-def _no_camera_info(image: TopicInfo) -> NoScans:
+def no_camera_info(image: TopicInfo) -> NoScans:
+    """Return the error for a depth image without a calibration."""
     return NoScans(
         f"{image.topic}: a depth image without a CameraInfo topic",
         hint="record the camera_info topic next to the image",
     )
-
-
-def odometry_topics(scans: TopicInfo, topics: Sequence[TopicInfo], wanted: str | None) -> list[TopicInfo]:
-    """Return the topics that may hold the odometry of the robot of the scans, the best first; odometry in tf
-    is found by `read_plan`.
-
-    Raises TopicError if `wanted` is missing.
-    """
-    if wanted is not None:
-        named = _named_of(topics, wanted, "odometry", ODOMETRY, TF)
-        return [named] if named else []
-
-    def rank(topic: TopicInfo) -> tuple[bool, int, str]:
-        name = topic.topic.strip("/").split("/")[_shared(topic, scans) :]
-        return name not in (["odom"], ["odometry"]), len(topic.topic), topic.topic
-
-    return _nearest(sorted(with_odometry(topics), key=rank), scans, topics)
 
 
 def with_odometry(topics: Sequence[TopicInfo]) -> list[TopicInfo]:
@@ -266,28 +149,17 @@ def with_odometry(topics: Sequence[TopicInfo]) -> list[TopicInfo]:
     return [t for t in topics if t.message_count != 0 and _holds_odometry(t)]
 
 
-def imu_topics(scans: TopicInfo, topics: Sequence[TopicInfo], wanted: str | None) -> list[TopicInfo]:
-    """Return the topics of IMUs that are on the robot of the scans, the best first.
-
-    Raises TopicError if `wanted` is missing.
-    """
-    if wanted is not None:
-        named = _named_of(topics, wanted, "imu", IMU)
-        return [named] if named else []
-    found = [t for t in topics if t.message_count != 0 and t.type in IMU]
-    found.sort(key=lambda t: (len(t.topic), t.topic))
-    return _nearest(found, scans, topics)
-
-
-def _named_of(
+def named_of(
     topics: Sequence[TopicInfo], wanted: str, what: str, types: Sequence[str], also: Sequence[str] = ()
-) -> TopicInfo | None:
-    """The topic that is wanted, of one of the types; None for "none". Those of `also` are not proposed."""
+) -> list[TopicInfo]:
+    """Return the topic that is wanted, of one of the types; none for "none". `also` : not proposed.
+
+    Raises TopicError if it is missing.
+    """
     if wanted.lower() == "none":
-        return None
-    for topic in topics:
-        if topic.topic == wanted and topic.type in (*types, *also):
-            return topic
+        return []
+    if found := [t for t in topics if t.topic == wanted and t.type in (*types, *also)]:
+        return found[:1]
     there = listed([t for t in topics if t.type in types])
     raise TopicError(
         f"no {what} topic {wanted}; there is: {there or 'none'}", hint=f"--{what} none goes without"
@@ -299,7 +171,8 @@ def _holds_odometry(topic: TopicInfo) -> bool:
     return topic.type in ODOMETRY and (topic.type != "foxglove.PoseInFrame" or "odom" in topic.topic.lower())
 
 
-def _fits(topic: TopicInfo, topics: Sequence[TopicInfo]) -> bool:
+def holds_scans(topic: TopicInfo, topics: Sequence[TopicInfo]) -> bool:
+    """Return whether a topic of a log holds scans, by its type and name."""
     if is_image(topic):
         return _is_depth_image(topic) and any(t.type in CAMERA_INFOS for t in topics)
     return topic.type in SENSORS
@@ -310,13 +183,13 @@ def _is_depth_image(topic: TopicInfo) -> bool:
 
 
 def is_image(topic: TopicInfo) -> bool:
-    """Whether a topic holds images, of depths or of colours."""
+    """Return whether a topic holds images, of depths or of colours."""
     kind = SENSORS.get(topic.type)
     return kind is not None and SENSOR_MODELS[kind].image
 
 
 def depth_unit_topic(topics: Sequence[TopicInfo]) -> TopicInfo | None:
-    """The topic on which librealsense records the unit of its depth images, an option of the sensor."""
+    """Return the topic on which librealsense records the unit of its depth images, if there is one."""
     named = (t for t in topics if "/option/depth_units/value" in t.topic.lower().replace(" ", "_"))
     return next((t for t in named if t.type == "std_msgs/Float32" and t.message_count != 0), None)
 
@@ -338,20 +211,20 @@ def _named(topics: Sequence[TopicInfo], fitting: Sequence[TopicInfo], wanted: st
 
 
 def missing(topics: Sequence[TopicInfo], wanted: str, hint: str) -> TopicError:
-    """The error for a topic that is not there; it proposes the one with the most similar name."""
+    """Return the error for a topic that is not there; it proposes the one with the most similar name."""
     close = difflib.get_close_matches(wanted, [t.topic for t in topics], n=1, cutoff=0.5)
     guess = f"; did you mean {close[0]}?" if close else ""
     return TopicError(f"no topic {wanted} in the log{guess}", hint=hint)
 
 
 def listed(topics: Sequence[TopicInfo]) -> str:
-    """Topics and their types, of many the first ones."""
+    """Return topics and their types, of many the first ones."""
     shown = [f"{t.topic} ({t.type or 'no type'})" for t in topics[:20]]
     return ", ".join(shown) + (f" and {len(topics) - 20} more" if len(topics) > 20 else "")
 
 
 def _is_copy(topic: TopicInfo, full: Sequence[TopicInfo]) -> bool:
-    """Whether a topic holds the images of another one, compressed."""
+    """Return whether a topic holds the images of another one, compressed."""
     return topic.type.endswith("CompressedImage") and any(
         topic.topic.startswith(t.topic + "/") for t in full if not t.type.endswith("CompressedImage")
     )

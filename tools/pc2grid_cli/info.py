@@ -19,7 +19,7 @@ from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io import open_log
 from pc2grid.io.message_source import Choice, LogInfo
-from pc2grid.io.topics import camera_info_topic, tf_topics
+from pc2grid.io.robots import Namespaces, camera_info_topic
 from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid_cli.console import LOSSY, print_result, warn
@@ -207,7 +207,7 @@ def _show(info: Info) -> None:
     uses: dict[str | None, str] = {}
     if choice is not None:
         scans = next(t for t in info.topics if t.topic == choice.topic)
-        uses = {t.topic: "transforms" for t in tf_topics(scans, info.topics)}
+        uses = {t.topic: "transforms" for t in Namespaces(scans, info.topics).tf_topics()}
         uses |= {choice.camera_topic: "calibration", choice.imu_topic: "gravity"}
         uses |= {choice.odometry_topic: "odometry", choice.topic: f"scans ({choice.sensor})"}
     for topic in info.topics:
