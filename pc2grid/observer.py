@@ -95,14 +95,14 @@ def bars_on_stderr(*columns: str | ProgressColumn) -> Progress:
     from rich.console import Console
     from rich.progress import Progress
 
-    console, on_terminal = Console(stderr=True), sys.stderr.isatty()
+    console = Console(stderr=True)
     return Progress(
         *columns,
         console=console,
         transient=True,
         redirect_stdout=sys.stdout.isatty(),
-        redirect_stderr=on_terminal,
-        disable=not (on_terminal or console.is_jupyter),
+        redirect_stderr=console.is_terminal,
+        disable=not (console.is_terminal or console.is_jupyter),
         get_time=time.monotonic,
     )
 

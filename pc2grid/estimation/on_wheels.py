@@ -113,7 +113,8 @@ class SensorOnWheels:
 
     def fits_last(self, belief: Belief) -> bool:
         """See `PlacingSensor`."""
-        return self._matched_with_last(belief).credible
+        fit = self._matched_with_last(belief)
+        return fit.credible and fit.measured
 
     def _matched_with_last(self, belief: Belief) -> Fit:
         """The planar scan matched with a map of the last scans alone."""

@@ -229,11 +229,12 @@ class BaseSearch:
         frames = (sensor.frame or "" for sensor in self._sensors.seen)
         for frame in (f for f in frames if self._frames.ambiguous(base, f)):
             if twins := self._twins(frame):
+                without = f"--odometry none --set read.base_frame={frame}"
                 raise TopicError(
                     f"static transforms put frame {frame} in two places, and {twins} has scans in a frame of "
                     "that name, too: these may be of two robots",
                     hint="record the transforms of each robot in its namespace, or its name before its "
-                    f"frames; --odometry none --set read.base_frame={frame} goes without",
+                    f"frames; without them: {without}",
                 )
             self._first.tally.warn(
                 f"static transforms put frame {frame} in two places on {base}: the latest counts"

@@ -150,7 +150,8 @@ def _first_page(address: str) -> Iterator[Browser]:
 
     with urlopen(f"http://{address}/json/list") as reply:
         (page, *_) = [target for target in json.load(reply) if target["type"] == "page"]
-    with connect(page["webSocketDebuggerUrl"], max_size=None) as socket:
+    # On a busy machine the browser may be slow to answer a ping; each call has a limit of its own.
+    with connect(page["webSocketDebuggerUrl"], max_size=None, ping_interval=None) as socket:
         browser = Browser(socket)
         for domain in ("Page", "Runtime", "Log"):
             browser.call(f"{domain}.enable")
