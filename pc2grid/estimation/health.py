@@ -67,11 +67,14 @@ class Standstill:
     def left(self, scan: Scan, *, sure: bool) -> bool:
         """Take in the next scan; returns whether the base leaves a place whose walls have changed.
 
-        sure : it fits the local map well.
+        sure : it fits the local map well; not so the first scan of a map, which fits in any case. Where no
+        scan has fitted well yet, as behind glass, nothing can be said to have changed.
         """
-        known, T_odom_base = self._known, scan.T_odom_base
+        T_odom_base = scan.T_odom_base
+        if sure and T_odom_base is not None:
+            self._known = scan.stamp_ns, T_odom_base
+        known = self._known
         if sure or known is None or T_odom_base is None:
-            self._known = None if T_odom_base is None else (scan.stamp_ns, T_odom_base)
             return False
         p, (distance_m, turn_rad) = self._parameters, motion_size(invert_pose(known[1]) @ T_odom_base)
         if distance_m <= p.standing_m and turn_rad <= p.standing_rad:

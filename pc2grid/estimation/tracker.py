@@ -116,7 +116,8 @@ class Tracker:
         estimate = self._estimated(placed, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
         health = self._judged(placed, estimate, evidence)
-        if self._standstill.left(scan, sure=placed.sure) and self._sensor.fits_last(expected[0]):
+        sure = placed.sure and not placed.first
+        if self._standstill.left(scan, sure=sure) and self._sensor.fits_last(expected[0]):
             self._walls_changed, health = True, self._health.give_up()
         pose = self._sensor.levelled(estimate.pose)
         tracked = self._finish(scan, points, pose, health)
