@@ -13,7 +13,11 @@ def at(second: float, x_m: float) -> Scan:
     pose = np.eye(4)
     pose[0, 3] = x_m
     return Scan(
-        stamp_ns=int(second * 1e9), sensor="laser", points_m=np.zeros((1, 3), np.float32), T_odom_base=pose
+        stamp_ns=int(second * 1e9),
+        points_m=np.zeros((1, 3), np.float32),
+        T_base_sensor=np.eye(4),
+        sensor="laser",
+        T_odom_base=pose,
     )
 
 
