@@ -82,6 +82,19 @@ class SignatureTable:
             center_m=np.asarray(center_m, np.float64).reshape(n, 2),
         )
 
+    @staticmethod
+    def bare(center_m: F64, session_index: I32) -> SignatureTable:
+        """Places that are told apart by what is seen from them alone: centres (N, 2) of sessions (N,)."""
+        none = np.empty((len(center_m), 0), np.float32)
+        return SignatureTable(
+            boundary=none,
+            freespace=none,
+            symmetry=none,
+            session_index=session_index,
+            submap_id=np.arange(len(center_m), dtype=np.int32),
+            center_m=center_m,
+        )
+
     def without_histograms(self) -> SignatureTable:
         """The rows with their ids and positions, and no bins: 36 bytes instead of some 400 each."""
         none = np.empty((len(self), 0), np.float32)

@@ -129,13 +129,13 @@ class MapIndex:
             return None
 
         table, made_with = database.signatures(), database.config()
+        if is_large:
+            table = table.without_histograms()
         frames: Mapping[str, BuildingFrame] = {}
         with contextlib.suppress(DatabaseCorrupt):  # without them a search takes longer, and finds the same
             frames = database.frames()
         drawn = {name for name, info in infos.items() if info.sensor == "map"}
         index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored, frames, drawn)
-        if is_large:
-            index.places.without_histograms()
         index.surface_of = surface_reader(database)
         with observer.step("prepare places"):
             index.places.index(observer.on_progress)

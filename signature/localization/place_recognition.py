@@ -118,10 +118,9 @@ class SessionRecognizer:
         self._stored.append(
             (zlib.compress(layers.tobytes(), 1), layers.shape, grid.resolution_m, grid.origin_m)
         )
-        table = SignatureTable.of(
-            [view.signature for view in query.views],
-            [view.center_m for view in query.views],
-            session_index=np.full(len(query.views), index),
+        table = SignatureTable.bare(
+            np.array([view.center_m for view in query.views]).reshape(-1, 2),
+            np.full(len(query.views), index, np.int32),
         )
         if not len(table):
             return

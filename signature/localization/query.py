@@ -10,7 +10,7 @@ import math
 from collections import deque
 from copy import copy
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import numpy as np
 
@@ -26,11 +26,9 @@ from pc2grid.matching.walls import Walls
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.submaps.isovist import HIDDEN, isovist, look_around
-from pc2grid.submaps.partition import view_at
 from pc2grid.submaps.sampling import sample_evenly
 from pc2grid.submaps.skeleton import skeleton_of
 from signature.config import Config, RelocalizeConfig
-from signature.describe import Signature, describe
 from signature.retrieval.view import View
 from signature.seen_places import PROFILE_BEARINGS
 
@@ -312,11 +310,7 @@ def query_of(
     T_odom_base = T_odom_base or SE2()
     radius_m = made_with.partition.radius_m
     views = tuple(
-        View(
-            center_m=center,
-            profile=isovist(grid, center, radius_m, bearings=PROFILE_BEARINGS),
-            describe=partial(_signature_at, grid, center, made_with),
-        )
+        View(center_m=center, profile=isovist(grid, center, radius_m, bearings=PROFILE_BEARINGS))
         for center in best_observed(grid, path_xy_m, radius_m, config)
     )
     return QueryMap(
@@ -347,10 +341,6 @@ def map_as_query(
         return query
     center = query.views[0].center_m
     return replace(query, T_odom_base=SE2(*center), center_m=center)
-
-
-def _signature_at(grid: OccupancyGrid, center_m: tuple[float, float], made_with: Config) -> Signature:
-    return describe(view_at(grid, center_m, made_with.partition), made_with.signature)
 
 
 def best_observed(

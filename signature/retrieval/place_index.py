@@ -4,7 +4,6 @@ Each viewpoint has a short vector of its three signatures (`signature.seen_likel
 direction. The positions of a query's views relative to each other do contain one. So
 
 1. each view is compared with the viewpoints, by one matrix product, and stands at those that are most alike;
-   those of places that a first look leaves out (`signature.retrieval.place_signatures`) are not compared;
 2. each of these, at each of some headings, is a pose of the whole query: it says at which viewpoints the
    other views stand. The log-likelihoods of all views there are added up;
 3. the best heading of each pose says where the robot stands: the places that it stands next to in the best
@@ -21,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid
+from pc2grid.arrays import F32, F64, I64
 from signature.retrieval.view import View
 from signature.seen import seen_signatures
 from signature.seen_likelihood import SeenWeights, Spread, seen_spread, seen_weights
@@ -163,12 +162,8 @@ class PlaceIndex:
         columns = (self.vectors, self.hidden, self.at_m, self.block, self.row, self.raster.at)
         return sum(column.nbytes for column in columns)
 
-    def scores(self, views: Sequence[View], compared: I64 | None = None) -> F32:
-        """(K, V) log-likelihood ratio of each viewpoint and each view showing one place, by signatures.
-
-        compared : (C,) the viewpoints that are compared, by default all; the others have
-        `PoseParameters.least`.
-        """
+    def scores(self, views: Sequence[View]) -> F32:
+        """(K, V) log-likelihood ratio of each viewpoint and each view showing one place, by signatures."""
         signatures = seen_signatures(
             np.stack([view.profile.ranges_m for view in views]),
             np.stack([view.profile.ends for view in views]),
@@ -176,32 +171,27 @@ class PlaceIndex:
         )
         queries, hidden = self.weights.of_queries(signatures), 1.0 - signatures[:, -1]
         squares = np.einsum("vd,vd->v", queries, queries)
-        found = np.full((len(self), len(views)), POSES.least, np.float32)
-        every = np.arange(len(self)) if compared is None else compared
-        for at in range(0, len(every), _AT_ONCE):
-            part = every[at : at + _AT_ONCE]
+        found = np.empty((len(self), len(views)), np.float32)
+        for at in range(0, len(self), _AT_ONCE):
+            part = slice(at, at + _AT_ONCE)
             vectors = self.vectors[part].astype(np.float32)
             squared = squares - 2.0 * (vectors @ queries.T)
             squared += np.einsum("kd,kd->k", vectors, vectors)[:, None]
             found[part] = self.spread.log_ratio(squared, hidden + self.hidden[part, None])
         return found
 
-    def poses(
-        self, views: Sequence[View], base_m: tuple[float, float], among: BoolGrid | None = None
-    ) -> Poses:
+    def poses(self, views: Sequence[View], base_m: tuple[float, float]) -> Poses:
         """Poses of the query that its views propose.
 
-        base_m : (x, y) of the robot in the query's frame. among : (N,) the places that are compared, by
-        default all.
+        base_m : (x, y) of the robot in the query's frame.
         """
         from signature.retrieval._kernels import best_headings
 
-        compared = np.arange(len(self)) if among is None else np.flatnonzero(among[self.row])
-        if not views or not len(compared):
+        if not views or not len(self):
             return Poses(np.empty(0, np.float32), np.empty((0, 2)), np.empty(0, np.int32))
-        most = min(POSES.proposed, len(compared))
-        scores = self.scores(views, compared)
-        likeliest = [compared[np.argpartition(-column, most - 1)[:most]] for column in scores[compared].T]
+        most = min(POSES.proposed, len(self))
+        scores = self.scores(views)
+        likeliest = [np.argpartition(-column, most - 1)[:most] for column in scores.T]
         viewpoint, view = np.concatenate(likeliest), np.repeat(np.arange(len(views)), most)
         found, heading = np.empty(len(viewpoint), np.float32), np.empty(len(viewpoint), np.int64)
         floored = np.maximum(scores, np.float32(POSES.least))

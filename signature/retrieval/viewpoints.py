@@ -1,7 +1,7 @@
 """The places of a database: which of them a robot may stand next to, and the free ground there.
 
-A first look at the signatures of all places leaves out most, the signatures of viewpoints select from the
-rest. Walls are aligned on the free ground next to the selected places alone.
+The signatures of viewpoints select them. Walls are aligned on the free ground next to the selected places
+alone.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from pc2grid.model import OccupancyGrid
 from signature.config import RelocalizeConfig, ShortlistBy
 from signature.retrieval.lazy_maps import LazySequence
 from signature.retrieval.place_index import PlaceBlock, PlaceIndex, Poses
-from signature.retrieval.place_signatures import PlaceSignatures
 from signature.retrieval.view import View
 from signature.seen_likelihood import seen_spread, seen_weights
 from signature.seen_places import SeenPlaces
@@ -78,7 +77,7 @@ class Places:
         self._session_of_block = np.unique(table.session_index)
         self.ground: LazySequence[tuple[F64, I64]] = LazySequence(self._ground, len(grids), _KEPT_SESSIONS)
         """By session, the squares (K, 2) that hold free ground, and the places next to them (K,)."""
-        self._controls: dict[ShortlistBy, tuple[PlaceIndex, PlaceSignatures | None]] = {}
+        self._controls: dict[ShortlistBy, PlaceIndex] = {}
         self._selected: tuple[Sequence[View], RelocalizeConfig, I64] | None = None
 
     @property
@@ -88,9 +87,8 @@ class Places:
 
     def select(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> I64:
         """The places (R,) that the robot at `base_m` most likely stands next to, likeliest first,
-        `shortlist_size` of them: by `PlaceSignatures.likely` and then `PlaceIndex.poses`, or by a control
-        (`RelocalizeConfig.shortlist_by`). In a large database those in the likeliest maps, up to
-        `AT_ONCE_M2`.
+        `shortlist_size` of them: by `PlaceIndex.poses`, or by a control (`RelocalizeConfig.shortlist_by`). In
+        a large database those in the likeliest maps, up to `AT_ONCE_M2`.
         """
         if self._selected is None or self._selected[0] is not views or self._selected[1] is not config:
             self._selected = views, config, self._select(views, base_m, config)
@@ -103,26 +101,22 @@ class Places:
             return every[:0]
         if config.shortlist_by == "random":
             return self._at_once(self._chance.permutation(every)[:most])
-        index, first_look = self._searched(config.shortlist_by)
-        among = None if first_look is None else first_look.likely(views, most)
-        return self._at_once(self.next_to(index.poses(views, base_m, among), most))
+        return self._at_once(self.next_to(self._searched(config.shortlist_by).poses(views, base_m), most))
 
-    def _searched(self, by: ShortlistBy) -> tuple[PlaceIndex, PlaceSignatures | None]:
-        """The viewpoints, and the places for a first look, by all signatures or as a control wants them.
-        There is no first look at places that were made with other bins."""
+    def _searched(self, by: ShortlistBy) -> PlaceIndex:
+        """The viewpoints, by all signatures or as a control wants them."""
         if by == "signatures":
-            return self.index(), self._first_look
+            return self.index()
         if by not in self._controls:
             self._controls[by] = self._control(by)
         return self._controls[by]
 
-    def _control(self, by: ShortlistBy) -> tuple[PlaceIndex, PlaceSignatures | None]:
+    def _control(self, by: ShortlistBy) -> PlaceIndex:
         """What `_searched` says of a control; made anew."""
         if by == "shuffled":
-            return self.index().shuffled(self._chance), None
+            return self.index().shuffled(self._chance)
         names = by.split("+")
-        index = PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names))
-        return index, PlaceSignatures.of(self.table, names)
+        return PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names))
 
     def next_to(self, poses: Poses, most: int) -> I64:
         """The `most` places (R,) that the robot stands next to in the likeliest poses, likeliest first; if
@@ -142,16 +136,6 @@ class Places:
         areas_m2 = self._areas_m2[sessions]
         kept: I64 = rows[np.isin(of, sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])])]
         return kept
-
-    @cached_property
-    def _first_look(self) -> PlaceSignatures | None:
-        return PlaceSignatures.of(self.table)
-
-    def without_histograms(self) -> None:
-        """Forget the histograms of the places, which a large database has no memory for; their short vectors
-        stay."""
-        assert self._first_look is None or len(self._first_look.vectors) == len(self.table)
-        self.table = self.table.without_histograms()
 
     def index(self, on_progress: Callable[[float], None] = lambda share: None) -> PlaceIndex:
         """The viewpoints of all places with their signatures; made when first asked for.

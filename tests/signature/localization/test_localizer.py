@@ -10,12 +10,10 @@ import pytest
 
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
-from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan, Submap
+from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan
 from pc2grid_cli.relocalize import as_text
-from signature.config import Config, SignatureConfig
+from signature.config import Config
 from signature.database import Label
-from signature.describe import Signature, describe
-from signature.localization import query as query_module
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
@@ -192,27 +190,6 @@ def test_a_query_is_drawn_from_the_newest_scans_alone() -> None:
     whole, last = (query.map() for query in queries)
     assert last.T_odom_base == whole.T_odom_base and last.path_m == whole.path_m
     assert 0 < last.walls.weight < 0.7 * whole.walls.weight
-
-
-@pytest.mark.parametrize(("shortlist", "uses_them"), [(40, True), (1000, False)])
-def test_views_are_described_by_the_papers_signatures_only_where_these_leave_places_out(
-    shortlist: int, uses_them: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a map with fewer places than are looked for, none can be left out at a first look."""
-    described = []
-
-    def counted(submap: Submap, config: SignatureConfig) -> Signature:
-        described.append(submap)
-        return describe(submap, config)
-
-    monkeypatch.setattr(query_module, "describe", counted)
-    config = Config()
-    few = {"shortlist": shortlist, "shortlist_share": 0.0}
-    settings = config.model_copy(update={"relocalize": config.relocalize.model_copy(update=few)})
-    index = MapIndex({"office": office()}, OFFICE.places.table, config, settings)
-    answer, _ = ask(index, office(), ROUTE)
-    assert answer.status == "located"
-    assert bool(described) == uses_them
 
 
 @pytest.mark.parametrize("slip_deg", [0.0, 40.0])

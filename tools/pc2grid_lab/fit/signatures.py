@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 import typer
 from scipy.spatial import cKDTree
+from signature.retrieval.place_signatures import table_rows, view_rows
 
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
@@ -33,7 +34,6 @@ from pc2grid_lab.fit.queries import MAPPED_S, Drawn, office_floor, pairs_of, que
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.freespace import freespace_bins
-from signature.retrieval.place_signatures import table_rows, view_rows
 from signature.seen_likelihood import Pairs, SeenStatistics, fitted_spreads
 
 _SIMULATED = 0.2
