@@ -31,6 +31,10 @@ RANGE_BINS, PAIR_BINS = 20, 40
 wall points, up to twice of it. On sessions of office 1, csail and fr079 the right place came earlier with
 40 bins of pairs than with 20: as number 63, 37 and 24 of 30,000 instead of 101, 37 and 34, after 1, 3 and
 8 m."""
+RIMS = ((1.0, 1.0), (0.25, 1.0), (0.4, 0.64), (0.2, 0.4))
+"""Radii within which pairs of wall points are counted, as shares of the limit of sight: walls count in full
+up to the first, not at all from the second on. Where most is hidden, the walls nearby are still seen. Their
+worth is in docs/method.md."""
 
 
 def boundary_edges(submap: Submap, config: SignatureConfig) -> BoolGrid:
@@ -90,19 +94,37 @@ def normalized(counts: NDArray[np.generic]) -> F32:
 def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
     """The boundary of what is seen from N viewpoints: distances from there, and of all pairs of wall points.
 
-    ranges_m, ends : (N, B) of isovists. Returns (N, Kb) square roots of shares. A ray without a wall within
-    sight has no distance, but says that there is none: such rays, pairs with one and pairs of two have bins
-    of their own.
+    ranges_m, ends : (N, B) of isovists. Returns (N, Kb) square roots of shares: of the distances, and of the
+    pairs within each of `RIMS`. A ray without a wall within sight, or within a rim, has no distance, but says
+    that there is none: such rays, pairs with one and pairs of two have bins of their own. A ray whose end is
+    hidden is known to be free up to there.
     """
+    from signature import _kernels
+
     at = np.minimum((ranges_m / sight_m * RANGE_BINS).astype(np.int64), RANGE_BINS - 1)
     ranges = shares(np.where(ends == OPEN, RANGE_BINS, at), ends != HIDDEN, RANGE_BINS + 1)
+    inside = np.stack([within(ranges_m / sight_m, *rim) for rim in RIMS], axis=1)
+    inside = np.where((ends == OPEN)[:, None], 0.0, inside)
+    pairs = np.zeros((len(ranges_m), len(RIMS), PAIR_BINS + 2))
     points = ray_ends(ranges_m) * (PAIR_BINS / (2.0 * sight_m))
-    pairs = np.empty((len(ranges_m), PAIR_BINS + 2))
-    for counts, at_ends, wall in zip(pairs, points, ends == WALL, strict=True):
-        counts[:PAIR_BINS] = pair_distance_counts(at_ends[wall], PAIR_BINS)
-    walls, opens = (np.count_nonzero(ends == kind, axis=1) for kind in (WALL, OPEN))
-    pairs[:, PAIR_BINS], pairs[:, PAIR_BINS + 1] = walls * opens, opens * (opens - 1) // 2
-    return np.sqrt(np.concatenate((ranges, as_shares(pairs)), axis=1))
+    _kernels.weighed_pairs(points, inside * (ends == WALL)[:, None], 1.0 - inside, pairs)
+    pairs = pairs / np.maximum(pairs.sum(axis=2, keepdims=True), 1e-9)
+    filled = [pairs[:, number, rim_columns(rim)] for number, rim in enumerate(RIMS)]
+    return np.sqrt(np.concatenate((ranges, *filled), axis=1))
+
+
+def within(share: NDArray[np.floating], full: float, none: float) -> F64:
+    """How much distances count, 0..1: in full up to `full`, less and less up to `none`, as a cosine."""
+    if full == none:
+        return np.where(share <= full, 1.0, 0.0)
+    outside = np.clip((share - full) / (none - full), 0.0, 1.0)
+    return np.asarray(0.5 + 0.5 * np.cos(np.pi * outside), np.float64)
+
+
+def rim_columns(rim: tuple[float, float]) -> I64:
+    """The bins of pairs that a rim can fill: of two wall points within it, and of what is open."""
+    bins = min(math.ceil(rim[1] * PAIR_BINS), PAIR_BINS)
+    return np.r_[np.arange(bins), PAIR_BINS, PAIR_BINS + 1]
 
 
 def shares(at: NDArray[np.int64], valid: NDArray[np.bool_], bins: int) -> F64:

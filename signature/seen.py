@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32
 from pc2grid.submaps.isovist import HIDDEN
-from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_seen
+from signature.boundary import RANGE_BINS, RIMS, boundary_seen, rim_columns
 from signature.freespace import DETOUR_BINS, PATH_BINS, STEPS_M, freespace_seen
 from signature.symmetry import BESIDE, QUANTILES, symmetry_seen
 
@@ -26,7 +26,7 @@ _AT_ONCE = 4096
 def parts() -> dict[str, slice]:
     """Which columns of `seen_signatures` belong to which of the three signatures."""
     sizes = {
-        "boundary": RANGE_BINS + 1 + PAIR_BINS + 2,
+        "boundary": RANGE_BINS + 1 + sum(len(rim_columns(rim)) for rim in RIMS),
         "freespace": PATH_BINS + DETOUR_BINS + len(STEPS_M) + 1,
         "symmetry": len(BESIDE) + 2 + len(QUANTILES) + 1,
     }

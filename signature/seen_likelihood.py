@@ -2,11 +2,12 @@
 
 Two sensors at one place do not fill the bins equally, and some bins differ more than others. A bin tells
 places apart if it varies more between places than between sensors. Both were measured: `within`, the
-covariance of the difference between a query and a map at one place, over all pairs of sensors, and
-`between`, that of different places. Fisher's linear discriminant, the generalized eigenvalue problem
-`between v = q within v`, gives in closed form the directions v with the largest quotients q, along which the
-differences at one place have unit variance. Along these the distance is Euclidean: there is one short vector
-for each place and view, and an index can search them.
+covariance of the difference between a query and a map at one place, over real drives in maps of another time,
+and `between`, that of different places. By the whole of `within` the distance is Mahalanobis'. Fisher's
+linear discriminant, the generalized eigenvalue problem `between v = q within v`, gives in closed form the
+directions v with the largest quotients q, along which the differences at one place have unit variance. Along
+these the distance is Euclidean: there is one short vector for each place and view, and an index can search
+them.
 
 A squared distance D^2 says less the less was seen. With u, the share of rays hidden from one side plus that
 hidden from the other, ln D^2 has the mean a + b u + c u^2 at one place and a' + b' u at two; both were
@@ -31,13 +32,20 @@ from pc2grid.io.atomic import replace_file
 from signature.seen import parts, signature_columns
 
 DIMENSIONS = 24
-"""Length of the vectors. Of 24, 40 and 64, chosen on sessions of office 1 and csail; longer were no
-better."""
-_RIDGE = 1e-2
-"""Added to the diagonal of `within`, as a share of its mean, so that bins that are always empty stay finite.
-With 0.001 and 0.1, a twentieth fewer queries of real buildings that were left out found their place."""
-_LEAST_SEEN = 0.5
-"""The weights are learned from pairs of which both sides have seen at least this share of the rays."""
+"""Length of the vectors. On real windows of buildings that were left out, 48, 96 and all, which is
+Mahalanobis' distance, find as many places: docs/method.md."""
+_SHRINK = 0.6
+"""So much of `within` is its diagonal alone, as there are few pairs for so many bins; 0.2 and 0.9 gave 0.01
+and 0.02 less recall among the first 20 of real windows that were left out, which is little."""
+_RIDGE = 1e-3
+"""Added to the diagonal of `within`, as a share of its mean, so that bins that are always empty stay finite;
+0.01 and 0.0001 gave the same."""
+_LEAST_SEEN = 0.7
+"""The weights are learned from pairs of which both sides have seen at least this share of the rays. With 0.5
+and 0.3, 0.01 and 0.03 fewer of real views that were left out found their place among the first 20."""
+_FOLDS = 8
+"""How much a distance says is learned from each of so many parts of the pairs, by weights of the others:
+the pairs that weights are learned from are nearer to each other than those of another building."""
 _TOO_LITTLE = 0.15
 """Share of the rays; a view that has seen less is not used to learn how much a distance says."""
 COMBINATIONS = tuple(c for n in (1, 2, 3) for c in itertools.combinations(parts(), n))
@@ -63,7 +71,6 @@ class SeenStatistics:
 
     query_mean, place_mean (C,) : means over queries and over places of maps. within, between (C, C) :
     covariances, see above. spreads (7, 7) : the numbers of a `Spread` for each of `COMBINATIONS`.
-    sizes (3,) : how many of the columns are of the boundary, the free space and the symmetry.
     """
 
     query_mean: F64
@@ -71,7 +78,6 @@ class SeenStatistics:
     within: F64
     between: F64
     spreads: F64
-    sizes: I64
 
     def __post_init__(self) -> None:
         freeze(self, "query_mean", np.float64, (None,))
@@ -79,34 +85,32 @@ class SeenStatistics:
         for name in ("within", "between"):
             freeze(self, name, np.float64, (len(self.query_mean), len(self.query_mean)))
         freeze(self, "spreads", np.float64, (len(COMBINATIONS), 7))
-        freeze(self, "sizes", np.int64, (len(parts()),))
 
     @staticmethod
-    def of(pairs: Pairs, sizes: Sequence[int] = (), *, seed: int = 0) -> SeenStatistics:
-        """The weights from pairs of which enough was seen, how much a distance says from all.
+    def of(pairs: Pairs, *, seed: int = 0) -> SeenStatistics:
+        """The weights from pairs of which enough was seen, how much a distance says from all; pairs of one
+        recording are side by side."""
+        return replace(SeenStatistics.without_spreads(pairs), spreads=fitted_spreads(pairs, seed=seed))
 
-        sizes : as above, by default those of `signature.seen.parts`.
-        """
+    @staticmethod
+    def without_spreads(pairs: Pairs) -> SeenStatistics:
+        """What the weights are made of, alone."""
         enough = (pairs.queries[:, -1] >= _LEAST_SEEN) & (pairs.same[:, -1] >= _LEAST_SEEN)
         queries, same = (rows[enough][:, signature_columns()].astype(np.float64) for rows in pairs[:2])
         apart = (queries - queries.mean(axis=0)) - (same - same.mean(axis=0))
         places = np.concatenate((pairs.other[:, signature_columns()], same)).astype(np.float64)
         every = places - places.mean(axis=0)
-        statistics = SeenStatistics(
+        return SeenStatistics(
             query_mean=queries.mean(axis=0),
             place_mean=places.mean(axis=0),
             within=apart.T @ apart / len(apart),
             between=every.T @ every / len(every),
             spreads=np.zeros((len(COMBINATIONS), 7)),
-            sizes=np.array(sizes or [part.stop - part.start for part in parts().values()], np.int64),
         )
-        return replace(statistics, spreads=fitted_spreads(statistics, pairs, seed=seed))
 
     def columns(self, names: Sequence[str] = ()) -> I64:
         """The columns of the signatures `names`, by default of all."""
-        numbers = np.split(np.arange(len(self.query_mean)), np.cumsum(self.sizes)[:-1])
-        chosen = [part for name, part in zip(parts(), numbers, strict=True) if not names or name in names]
-        return np.concatenate(chosen)
+        return np.concatenate([np.r_[part] for name, part in parts().items() if not names or name in names])
 
     def spread(self, names: Sequence[str] = ()) -> Spread:
         """How much the distance by some of the signatures says."""
@@ -114,34 +118,19 @@ class SeenStatistics:
         a, b, c, d, e, one, two = self.spreads[COMBINATIONS.index(chosen)].tolist()
         return Spread(one_place=(a, b, c), two_places=(d, e), one_shape=one, two_shape=two)
 
-    @staticmethod
-    def save(path: Path, **each: SeenStatistics) -> None:
-        """Write statistics to one .npz file, each under its name."""
-        content = {
-            f"{name}.{field.name}": getattr(statistics, field.name).astype(np.float32)
-            for name, statistics in each.items()
-            for field in fields(statistics)
-        }
+    def save(self, path: Path) -> None:
+        """Write them to an .npz file."""
+        content = {field.name: getattr(self, field.name).astype(np.float32) for field in fields(self)}
         with replace_file(path) as draft, draft.open("wb") as file:
             np.savez_compressed(file, **content)
 
     @staticmethod
-    def load(name: str = "viewpoints", path: Path = _FILE) -> SeenStatistics:
-        """Read what `save` has written under a name; by default the statistics that come with the program: of
-        `viewpoints`, and of `places`, by which the first look is taken.
-
-        `python -m pc2grid_lab.fit.simulated FOLDER office:1 fr079.yaml intel.yaml` has made a fifth of the
-        variation within one viewpoint: 18 simulated sessions in each of these plans, 6 each by lidar, laser
-        and depth camera, after 1, 3 and 8 m of travel, in the maps of all three sensors, with 30 pieces of
-        clutter and a fifth of the doors and of the furniture changed in each session. All else is of the real
-        logs of fr079, intel, csail and killian, by `pc2grid_lab.fit.signatures`.
-        """
+    def load(path: Path = _FILE) -> SeenStatistics:
+        """Read what `save` has written; by default the statistics that come with the program, which
+        `pc2grid_lab.fit.signatures` has learned from real logs."""
         with np.load(path, allow_pickle=False) as file:
             return SeenStatistics(
-                **{
-                    field.name: file[f"{name}.{field.name}"].astype(np.float64)
-                    for field in fields(SeenStatistics)
-                }
+                **{field.name: file[field.name].astype(np.float64) for field in fields(SeenStatistics)}
             )
 
 
@@ -164,7 +153,8 @@ class SeenWeights:
         columns = statistics.columns(names)
         chosen = np.ix_(columns, columns)
         within = statistics.within[chosen]
-        within = within + _RIDGE * np.trace(within) / len(within) * np.eye(len(within))
+        variances = np.diag(within)
+        within = (1.0 - _SHRINK) * within + np.diag(_SHRINK * variances + _RIDGE * variances.mean())
         quotients, directions = eigh(statistics.between[chosen], within)
         matrix = np.zeros((len(statistics.query_mean), min(DIMENSIONS, len(columns))))
         matrix[columns] = directions[:, np.argsort(-quotients)[: matrix.shape[1]]]
@@ -180,27 +170,59 @@ class SeenWeights:
 
 
 learned = functools.cache(SeenStatistics.load)
-"""The statistics that come with the program, of `viewpoints` and of `places`; read once."""
+"""The statistics that come with the program; read once."""
 
 
 @functools.cache
-def seen_weights(*names: str, of: str = "viewpoints") -> SeenWeights:
+def seen_weights(*names: str) -> SeenWeights:
     """The weights of all three signatures, or of those named, by the statistics that come with the
     program."""
-    return SeenWeights.of(learned(of), names)
+    return SeenWeights.of(learned(), names)
 
 
-def fitted_spreads(statistics: SeenStatistics, pairs: Pairs, *, seed: int = 0) -> F64:
-    """(7, 7) the numbers of a `Spread` for each of `COMBINATIONS`, by the weights of the statistics."""
-    rng = np.random.default_rng(seed)
-    spreads = [Spread.of_pairs(pairs, SeenWeights.of(statistics, names), rng) for names in COMBINATIONS]
-    return np.array([spread.numbers() for spread in spreads])
+def fitted_spreads(pairs: Pairs, *, seed: int = 0) -> F64:
+    """(7, 7) the numbers of a `Spread` for each of `COMBINATIONS`, by pairs in `_FOLDS` parts, see there."""
+    rng, every = np.random.default_rng(seed), np.arange(len(pairs.queries))
+    folds = []
+    for held in np.array_split(every, _FOLDS):
+        queries, same = (np.delete(rows, held, axis=0) for rows in pairs[:2])
+        learned_from = SeenStatistics.without_spreads(Pairs(queries, same, pairs.other))
+        folds.append((Pairs(pairs.queries[held], pairs.same[held], pairs.other), learned_from))
+
+    def spread(names: Sequence[str]) -> Spread:
+        found = [squared_distances(held, SeenWeights.of(by, names), rng) for held, by in folds]
+        return Spread.of(*(np.concatenate(each) for each in zip(*found, strict=True)))
+
+    return np.array([spread(names).numbers() for names in COMBINATIONS])
+
+
+def squared_distances(
+    pairs: Pairs, weights: SeenWeights, rng: np.random.Generator
+) -> tuple[F64, F64, F64, F64]:
+    """The arguments of `Spread.of`: of pairs at one place, and of as many at two, with a place of another
+    building, and of another pair.
+
+    Pairs of which one side has seen less than `_TOO_LITTLE` are left out.
+    """
+    kept = (pairs.queries[:, -1] > _TOO_LITTLE) & (pairs.same[:, -1] > _TOO_LITTLE)
+    queries, same = pairs.queries[kept], pairs.same[kept]
+    other = pairs.other[rng.integers(0, len(pairs.other), len(queries))]
+    shuffled = same[rng.permutation(len(same))]
+    at = weights.of_queries(queries)
+    squared, hidden = zip(
+        *(
+            (((at - weights.of_places(rows)) ** 2).sum(axis=1), 2.0 - queries[:, -1] - rows[:, -1])
+            for rows in (same, other, shuffled)
+        ),
+        strict=True,
+    )
+    return squared[0], hidden[0], np.concatenate(squared[1:]), np.concatenate(hidden[1:])
 
 
 @functools.cache
 def seen_spread(*names: str) -> Spread:
     """How much the distance by the signatures of `seen_weights` says."""
-    return learned("viewpoints").spread(names)
+    return learned().spread(names)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -235,26 +257,6 @@ class Spread:
             one_shape=float(1.0 / rest[0].var() + 0.5),
             two_shape=float(1.0 / rest[1].var() + 0.5),
         )
-
-    @staticmethod
-    def of_pairs(pairs: Pairs, weights: SeenWeights, rng: np.random.Generator) -> Spread:
-        """From pairs at one place, and as many at two: with a place of another building, and of another pair.
-
-        Pairs of which one side has seen less than `_TOO_LITTLE` are left out.
-        """
-        kept = (pairs.queries[:, -1] > _TOO_LITTLE) & (pairs.same[:, -1] > _TOO_LITTLE)
-        queries, same = pairs.queries[kept], pairs.same[kept]
-        other = pairs.other[rng.integers(0, len(pairs.other), len(queries))]
-        shuffled = same[rng.permutation(len(same))]
-        at = weights.of_queries(queries)
-        squared, hidden = zip(
-            *(
-                (((at - weights.of_places(rows)) ** 2).sum(axis=1), 2.0 - queries[:, -1] - rows[:, -1])
-                for rows in (same, other, shuffled)
-            ),
-            strict=True,
-        )
-        return Spread.of(squared[0], hidden[0], np.concatenate(squared[1:]), np.concatenate(hidden[1:]))
 
     def numbers(self) -> tuple[float, ...]:
         """All seven, in the order of the fields."""

@@ -122,7 +122,7 @@ def check_seen(seen: SeenPlaces, info: SessionInfo, _: object = None) -> None:
     viewpoint, and they are in order."""
     columns = seen.signatures.shape[1]
     if columns != SIGNATURE_COLUMNS:
-        raise ValueError(f"signatures of {columns} columns")
+        raise ValueError(f"signatures of {columns} columns; this version compares {SIGNATURE_COLUMNS}")
     _near(seen.at_m, "viewpoint")
     if not np.array_equal(np.unique(seen.place), np.arange(info.submaps)) or (np.diff(seen.place) < 0).any():
         raise ValueError(f"viewpoints that do not belong to {info.submaps} places, in their order")

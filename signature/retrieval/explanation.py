@@ -16,7 +16,7 @@ from pc2grid.arrays import F32, F64, BoolGrid
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.isovist import look_around
-from signature.boundary import RANGE_BINS, boundary_seen
+from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_seen
 from signature.freespace import PATH_BINS, freespace_seen
 from signature.retrieval.place_index import POSES
 from signature.seen import seen_signatures
@@ -101,7 +101,7 @@ def _described(
     """What is seen from points (N, 2), and the signatures (N, K); the axes of symmetry are counted on by
     `turned`."""
     ranges_m, ends = look_around(grid, points_m, sight_m, bearings=PROFILE_BEARINGS)
-    boundary = boundary_seen(ranges_m, ends, sight_m)[:, RANGE_BINS + 1 :] ** 2
+    boundary = boundary_seen(ranges_m, ends, sight_m)[:, RANGE_BINS + 1 :][:, : PAIR_BINS + 2] ** 2
     freespace = freespace_seen(ranges_m, ends, sight_m)[:, :PATH_BINS] ** 2
     symmetry = np.roll(mirror_agreement(ranges_m, ends), turned, axis=1)
     drawn = [

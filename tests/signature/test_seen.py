@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pc2grid.arrays import F32
 from pc2grid.submaps.isovist import HIDDEN, OPEN, WALL
-from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_seen
+from signature.boundary import PAIR_BINS, RANGE_BINS, RIMS, boundary_seen, rim_columns, within
 from signature.freespace import DETOUR_BINS, PATH_BINS, path_lengths, seen_graph
 from signature.seen import parts, seen_signatures
 
@@ -47,7 +47,8 @@ def test_each_histogram_is_a_share_of_what_was_seen() -> None:
     squares = found.astype(np.float64) ** 2
     ranges = RANGE_BINS + 1
     paths = columns["freespace"].start + PATH_BINS
-    edges = [0, ranges, columns["boundary"].stop, paths, paths + DETOUR_BINS, columns["freespace"].stop]
+    rims = np.cumsum([ranges, *(len(rim_columns(rim)) for rim in RIMS)]).tolist()
+    edges = [0, *rims, paths, paths + DETOUR_BINS, columns["freespace"].stop]
     for start, stop in itertools.pairwise(edges):
         np.testing.assert_allclose(squares[:, start:stop].sum(axis=1), 1.0, atol=1e-5)
     assert (found[:, columns["symmetry"]] >= 0).all() and (found[:, columns["symmetry"]] <= 1).all()
@@ -71,6 +72,19 @@ def test_pair_distances_are_those_of_all_pairs_of_wall_points() -> None:
             counts[PAIR_BINS + pair.count(OPEN) - 1 if OPEN in pair else at] += 1
     found = boundary_seen(ranges_m, ends, SIGHT_M)[0, RANGE_BINS + 1 :][: PAIR_BINS + 2]
     np.testing.assert_allclose(found**2, counts / counts.sum(), atol=0.01)
+
+
+def test_what_is_hidden_beyond_a_rim_does_not_change_the_pairs_within_it() -> None:
+    ranges_m, ends = random_views()
+    ends = np.where(ends == HIDDEN, WALL, ends).astype(np.int8)
+    hidden = np.where(ranges_m >= RIMS[-1][1] * SIGHT_M, HIDDEN, ends).astype(np.int8)
+    whole, part = (boundary_seen(ranges_m, e, SIGHT_M) for e in (ends, hidden))
+    near = len(rim_columns(RIMS[-1]))
+    np.testing.assert_allclose(whole[:, -near:], part[:, -near:], atol=1e-6)
+    assert not np.allclose(whole, part, atol=0.1)
+    # Pairs of walls that are nearer than the rim's beginning count in full, those beyond its end not at all.
+    assert within(np.array([0.0, RIMS[-1][0], RIMS[-1][1], 1.0]), *RIMS[-1]).tolist() == [1.0, 1.0, 0.0, 0.0]
+    assert within(np.array([0.5, 1.0]), *RIMS[0]).tolist() == [1.0, 1.0]
 
 
 def test_path_lengths_are_those_of_the_free_space_graph() -> None:

@@ -17,6 +17,7 @@ from signature.seen_likelihood import (
     SeenWeights,
     Spread,
     seen_weights,
+    squared_distances,
 )
 
 SPREAD = SeenStatistics.load().spread()
@@ -44,7 +45,8 @@ def test_bins_that_tell_places_apart_weigh_more_than_those_that_differ_by_the_se
     first = weights.matrix[:, :10]
     assert np.abs(first[:10]).max() > 10 * np.abs(first[10:]).max()
     queries, same = weights.of_queries(pairs.queries), weights.of_places(pairs.same)
-    # The difference at one place and the ridge together have unit variance along each direction.
+    # The difference at one place and the ridge together have unit variance along each direction; the columns
+    # of the pairs do not depend on each other, so that to shrink their covariance does nothing.
     within, others = 2.0 * 0.1**2, 2.0
     ridge = seen_likelihood._RIDGE * (10 * within + (COLUMNS - 10) * others) / COLUMNS
     expected = np.full(10, within / (within + ridge))
@@ -56,7 +58,7 @@ def test_bins_that_tell_places_apart_weigh_more_than_those_that_differ_by_the_se
 
 def test_statistics_come_back_from_their_file(tmp_path: Path) -> None:
     statistics = SeenStatistics.of(made_up_pairs(200))
-    SeenStatistics.save(tmp_path / "statistics.npz", viewpoints=statistics)
+    statistics.save(tmp_path / "statistics.npz")
     again = SeenStatistics.load(path=tmp_path / "statistics.npz")
     np.testing.assert_allclose(again.within, statistics.within, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(again.spreads, statistics.spreads, rtol=1e-5)
@@ -70,15 +72,28 @@ def test_each_signature_has_weights_of_its_own() -> None:
 
 
 def test_the_less_was_seen_the_less_a_distance_says() -> None:
-    near, far = np.full(5, 8.0), np.full(5, 150.0)
+    near, far = np.full(5, 20.0), np.full(5, 400.0)
     hidden = np.array([0.0, 0.4, 0.8, 1.2, 1.6])
     for_one, against = SPREAD.log_ratio(near, hidden), SPREAD.log_ratio(far, hidden)
     assert (for_one[:3] > 0.5).all() and (against[:3] < -0.5).all()
     assert (np.diff(for_one[:4]) < 0).all() and (np.diff(against[:4]) > 0).all()
-    # Of two views that hide more than half of each other, a distance says nothing.
-    assert np.abs(for_one[3:]).max() < 0.3 and np.abs(against[3:]).max() < 0.3
+    # Of two views that hide more than half of each other, a distance says little.
+    assert for_one[3:].max() < 0.3 * for_one[0] and np.abs(against[3:]).max() < 0.3
     distances = SPREAD.log_ratio(np.linspace(15, 400, 50), np.zeros(50))
     assert (np.diff(distances) < 0).all()
+
+
+def test_how_much_a_distance_says_is_learned_from_pairs_that_the_weights_were_not() -> None:
+    """Of few pairs for many bins: these lie nearer by weights of their own than new ones do."""
+    pairs, new = made_up_pairs(400), made_up_pairs(4000)
+    statistics = SeenStatistics.of(pairs)
+    weights, rng = SeenWeights.of(statistics), np.random.default_rng(0)
+    own, fresh = (
+        float(np.log(squared_distances(each, weights, rng)[0]).mean())
+        for each in (pairs, Pairs(*(rows[1000:] for rows in new)))
+    )
+    told = statistics.spread().one_place[0]
+    assert own < fresh and abs(told - fresh) < 0.5 * (fresh - own)
 
 
 def test_the_spread_is_found_again() -> None:

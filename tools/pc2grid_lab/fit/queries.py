@@ -85,15 +85,18 @@ def read(data: Path, name: str, queries: int, kept: Path, config: Config) -> Dra
     return load_map(site.map_stem.with_suffix(".yaml")), sessions
 
 
+Asked = tuple[QueryMap, SE2, Sequence[PlanMap]]
+"""A query, its true frame in the plan, and the maps of that plan."""
+
+
 def pairs_of(
-    queries: Iterable[tuple[QueryMap, SE2, Sequence[PlanMap]]],
+    queries: Iterable[Asked],
     floors: Sequence[OccupancyGrid],
     config: Config,
 ) -> Pairs:
     """Views of queries, and what the maps show at the same points.
 
-    queries : each with its true frame in the plan, and the maps of that plan. floors : maps of other
-    buildings, taken at their viewpoints.
+    floors : maps of other buildings, taken at their viewpoints.
     """
     rng = np.random.default_rng(0)
     sight_m = config.partition.radius_m

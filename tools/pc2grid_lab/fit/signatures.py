@@ -1,113 +1,78 @@
-"""Learn the weights of the signatures from real logs besides simulated sessions.
+"""Learn the weights of the signatures from real recordings.
 
-Walls that are drawn from real scans vary more than simulated ones, and real buildings are less alike than
-simulated floors. Of the statistics that `simulated` has learned, by all three sensors, a fifth of the
-variation within one place is kept; the rest, the variation between places and the means are those of real
-logs. Pairs are views of later parts of a log, and the same points of a map of its first part; other
-places are those of the other logs' maps, of drawn maps, and of office floors.
+    python -m pc2grid_lab.fit.signatures DATA WORK OUT.npz [--without BUILDING]
 
-    python -m pc2grid_lab.fit.signatures DATA SIMULATED.npz OUT.npz [--logs csail,...] [--maps aces,...]
+Pairs of views and of the same points of a map are of two kinds: later parts of a log in the map of its
+first part, drawn at true poses (`queries`), and the windows of `compare recordings` in the map of another
+day, whose places WORK knows. Other places are those of these maps, of drawn maps, and of office floors.
+DATA is as of `queries`; with `maps/NAME.yaml`, maps of buildings without queries. WORK is as of
+`recorded_queries`.
 
-The weights of the signatures of places, by which the first look is taken, are learned from the same logs, and
-from the place of the map that is nearest to each view.
-
-DATA is as of `queries`; with `maps/NAME.yaml`, maps of buildings without queries.
+--without leaves a building out, so that what has been learned can be judged there.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
+from typing import Annotated
 
-import numpy as np
 import typer
-from scipy.spatial import cKDTree
-from signature.retrieval.place_signatures import table_rows, view_rows
 
 from pc2grid.geometry import SE2
 from pc2grid.io.nav2_map import load_map
-from pc2grid.model import OccupancyGrid
-from pc2grid_lab.experiments.answers import index_of
-from pc2grid_lab.experiments.trial import JUDGEMENT
-from pc2grid_lab.fit.queries import MAPPED_S, Drawn, office_floor, pairs_of, queries_of, read
-from signature.boundary import boundary_bins
+from pc2grid_lab.experiments.recordings.catalogue import Catalogue
+from pc2grid_lab.experiments.recordings.run import Folder
+from pc2grid_lab.fit.queries import MAPPED_S, Asked, Drawn, office_floor, pairs_of, queries_of, read
+from pc2grid_lab.fit.recorded_queries import Window, index_of, windows
 from signature.config import Config
-from signature.freespace import freespace_bins
-from signature.seen_likelihood import Pairs, SeenStatistics, fitted_spreads
+from signature.seen_likelihood import SeenStatistics
 
-_SIMULATED = 0.2
-"""With half, a twentieth fewer queries of real lasers found their place; without any, as many as with this,
-but only lasers would be known."""
 _FIRST_FLOOR, _FLOORS = 30_010, 10
 """Office floors that are other places, besides the maps of other buildings."""
 
 
-def pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], config: Config) -> Pairs:
-    """Pairs of the logs; `floors` and the maps of the logs are the other places."""
-
-    asked = (
-        (query, T_map_query, [(grid, SE2())])
-        for grid, driven in logs.values()
-        for session in driven
-        for query, T_map_query in queries_of(session, config)
-    )
-    return pairs_of(asked, [*floors, *(grid for grid, _ in logs.values())], config)
-
-
-def place_pairs_of_logs(logs: dict[str, Drawn], floors: Sequence[OccupancyGrid], config: Config) -> Pairs:
-    """Views of the logs, and the places of their maps that are nearest to each, if within
-    `JudgementParameters.retrieved_m`."""
-    queries, same = [], []
-    maps = {name: index_of(name, grid, config).places.table for name, (grid, _) in logs.items()}
-    for name, (_, driven) in logs.items():
-        tree, rows = cKDTree(maps[name].center_m), table_rows(maps[name])
+def in_logs(logs: Mapping[str, Drawn], config: Config) -> Iterator[Asked]:
+    """The later parts of logs in the maps of their first parts."""
+    for grid, driven in logs.values():
         for session in driven:
             for query, T_map_query in queries_of(session, config):
-                if query.views:
-                    views_m = T_map_query.apply(np.array([view.center_m for view in query.views]))
-                    distance_m, nearest = tree.query(views_m)
-                    near = distance_m <= JUDGEMENT.retrieved_m
-                    queries.append(view_rows(query.views)[near])
-                    same.append(rows[nearest[near]])
-    tables = [*maps.values(), *(index_of("", grid, config).places.table for grid in floors)]
-    other = np.concatenate([table_rows(table) for table in tables])
-    return Pairs(np.concatenate(queries), np.concatenate(same), other)
+                yield query, T_map_query, [(grid, SE2())]
 
 
-def place_statistics_of(pairs: Pairs, config: Config) -> SeenStatistics:
-    """The statistics of `place_pairs_of_logs`."""
-    radius_m, signature = config.partition.radius_m, config.signature
-    return SeenStatistics.of(
-        pairs, (boundary_bins(radius_m, signature), freespace_bins(radius_m, signature), 2)
-    )
-
-
-def statistics_of(pairs: Pairs, simulated: SeenStatistics) -> SeenStatistics:
-    """The statistics of real pairs, with a share of the variation within one place from simulated ones."""
-    real = SeenStatistics.of(pairs)
-    mixed = replace(real, within=(1.0 - _SIMULATED) * real.within + _SIMULATED * simulated.within)
-    return replace(mixed, spreads=fitted_spreads(mixed, pairs))
+def in_maps(known: Sequence[Window], folder: Folder) -> Iterator[Asked]:
+    """Windows of recordings, each in the session of its map that shows its place."""
+    for window in known:
+        index = index_of(folder.map(window.pair.map_name))
+        session, T_map_base = next(iter(window.truth.items()))
+        grid = index.grids[index.sessions.index(session)]
+        yield window.whole, T_map_base @ window.whole.T_odom_base.inverse(), [(grid, SE2())]
 
 
 def main(
     data: Path,
-    simulated: Path,
+    work: Path,
     out: Path,
+    without: Annotated[str, typer.Option(help="building that is left out")] = "",
     logs: str = ",".join(MAPPED_S),
     maps: str = "aces,workshop_1",
     queries: int = 24,
 ) -> None:
-    """Learn and store the statistics of viewpoints and of places, in one file."""
+    """Learn and store the statistics."""
     config, kept = Config(), out.parent / "drives"
     kept.mkdir(parents=True, exist_ok=True)
-    drawn = {name: read(data, name, queries, kept, config) for name in logs.split(",")}
-    floors = [load_map(data / "maps" / f"{name}.yaml") for name in maps.split(",")]
+    catalogue, folder = Catalogue.of(), Folder(data.resolve(), work.resolve())
+    building = {name: recording.building for name, recording in catalogue.recordings.items()}
+    drawn = {name: read(data, name, queries, kept, config) for name in logs.split(",") if name != without}
+    known = [w for w in windows(catalogue, folder) if w.covered and building[w.pair.map] != without]
+    names = [name for name in maps.split(",") if building[f"{name}.yaml"] != without]
+    floors = [load_map(data / "maps" / f"{name}.yaml") for name in names]
     floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
-    pairs = pairs_of_logs(drawn, floors, config)
-    of_viewpoints = statistics_of(pairs, SeenStatistics.load(path=simulated))
-    of_places = place_statistics_of(place_pairs_of_logs(drawn, floors, config), config)
-    SeenStatistics.save(out, viewpoints=of_viewpoints, places=of_places)
+    floors += [grid for grid, _ in drawn.values()]
+    floors += [index_of(folder.map(name)).grids[0] for name in sorted({w.pair.map_name for w in known})]
+    pairs = pairs_of(chain(in_logs(drawn, config), in_maps(known, folder)), floors, config)
+    SeenStatistics.of(pairs).save(out)
     print(f"{out}: learned from {len(pairs.queries):,} pairs and {len(pairs.other):,} other places")
 
 
