@@ -110,7 +110,7 @@ def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
     _kernels.weighed_pairs(points, inside * (ends == WALL)[:, None], 1.0 - inside, pairs)
     pairs = pairs / np.maximum(pairs.sum(axis=2, keepdims=True), 1e-9)
     filled = [pairs[:, number, rim_columns(rim)] for number, rim in enumerate(RIMS)]
-    return np.sqrt(np.concatenate((ranges, *filled), axis=1))
+    return np.asarray(np.sqrt(np.concatenate((ranges, *filled), axis=1)), np.float64)
 
 
 def within(share: NDArray[np.floating], full: float, none: float) -> F64:
@@ -124,7 +124,7 @@ def within(share: NDArray[np.floating], full: float, none: float) -> F64:
 def rim_columns(rim: tuple[float, float]) -> I64:
     """The bins of pairs that a rim can fill: of two wall points within it, and of what is open."""
     bins = min(math.ceil(rim[1] * PAIR_BINS), PAIR_BINS)
-    return np.r_[np.arange(bins), PAIR_BINS, PAIR_BINS + 1]
+    return np.array([*range(bins), PAIR_BINS, PAIR_BINS + 1])
 
 
 def shares(at: NDArray[np.int64], valid: NDArray[np.bool_], bins: int) -> F64:
