@@ -20,6 +20,7 @@ from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.query import Query, QueryMap
+from signature.retrieval import viewpoints
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 OFFICE = building({"office": office()})
@@ -57,13 +58,13 @@ def test_certainty_grows_with_travel_and_history_tells_it() -> None:
 
 def test_an_answer_is_one_search_and_asking_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """An estimate is the answer at its scan; at others the database is searched when it is asked."""
-    searched, look_up = [], MapIndex.look_up
+    searched, search = [], MapIndex.search
 
     def counted(index: MapIndex, query: QueryMap, *arguments: Any) -> Any:
         searched.append(query.path_m)
-        return look_up(index, query, *arguments)
+        return search(index, query, *arguments)
 
-    monkeypatch.setattr(MapIndex, "look_up", counted)
+    monkeypatch.setattr(MapIndex, "search", counted)
     quiet, asked = Localizer(OFFICE), Localizer(OFFICE)
     for number, (registered, planar_scan, _) in enumerate(drive(office(), ROUTE)):
         told = quiet.add(registered, planar_scan)
@@ -194,9 +195,9 @@ def test_a_query_is_drawn_from_the_newest_scans_alone() -> None:
     assert 0 < last.walls.weight < 0.7 * whole.walls.weight
 
 
-@pytest.mark.parametrize(("shortlist", "uses_them"), [(40, True), (1000, False)])
+@pytest.mark.parametrize(("first_places", "uses_them"), [(40, True), (1000, False)])
 def test_views_are_described_by_the_papers_signatures_only_where_these_leave_places_out(
-    shortlist: int, uses_them: bool, monkeypatch: pytest.MonkeyPatch
+    first_places: int, uses_them: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a map with fewer places than are looked for, none can be left out at a first look."""
     described = []
@@ -207,9 +208,8 @@ def test_views_are_described_by_the_papers_signatures_only_where_these_leave_pla
 
     monkeypatch.setattr(query_module, "describe", counted)
     config = Config()
-    few = {"shortlist": shortlist, "shortlist_share": 0.0}
-    settings = config.model_copy(update={"relocalize": config.relocalize.model_copy(update=few)})
-    index = MapIndex({"office": office()}, OFFICE.places.table, config, settings)
+    monkeypatch.setattr(viewpoints, "FIRST_PLACES", first_places)
+    index = MapIndex({"office": office()}, OFFICE.places.table, config, config)
     answer, _ = ask(index, office(), ROUTE)
     assert answer.status == "located"
     assert bool(described) == uses_them
