@@ -167,20 +167,10 @@ class RelocalizeConfig(Section):
     step_m: float = Field(1.0, gt=0, description="metres of travel between two searches of the database")
     views: int = Field(8, gt=0, description="number of views that describe a query, along its path")
     view_spacing_m: float = Field(1.2, gt=0, description="least distance of two views")
-    shortlist: int = Field(
-        100,
-        gt=0,
-        description="at least so many places where the robot may stand are selected for a query, by their"
-        " signatures",
-    )
-    shortlist_share: float = Field(
-        0.05, ge=0, le=1, description="of many places, this share is selected; only these are verified"
-    )
-    shortlist_most: int = Field(3200, gt=0, description="but no more than so many")
     shortlist_by: ShortlistBy = Field(
         "signatures",
-        description="what selects them; the others are controls, which show what the signatures are worth:"
-        " some of the three; shuffled, by those of another viewpoint; random",
+        description="what orders the places where a query is looked for; the others are controls, which show"
+        " what the signatures are worth: some of the three; shuffled, by those of another viewpoint; random",
     )
     coarse_floor: float = Field(
         0.4, ge=0, le=1, description="placements with a lower coarse score are dropped"
@@ -189,11 +179,6 @@ class RelocalizeConfig(Section):
         0.9, gt=0, le=1, description="and so are those below this share of the best one; 0.8 takes longer"
     )
     hypotheses: int = Field(20, gt=0, description="largest number of hypotheses that are kept")
-    exhaustive_m2: float = Field(
-        20_000.0,
-        ge=0,
-        description="maps up to this free area are searched as a whole, for a drawn map or with a prior",
-    )
     accept: float = Field(0.75, gt=0, lt=1, description="least confidence to answer located")
 
 

@@ -181,11 +181,14 @@ class Tiles:
         np.minimum.at(first, group, low)
         squares, group = squares[box, step], group[box]
         beyond = squares - first[group]
-        keys, tile = np.unique(np.column_stack((group, beyond // TILE)), axis=0, return_inverse=True)
+        of = np.column_stack((group, beyond // TILE)).T
+        shape = tuple((of.max(axis=1) + 1).tolist())
+        keys, tile = np.unique(np.ravel_multi_index(tuple(of), shape), return_inverse=True)
+        group, *step = np.unravel_index(keys, shape)
         row, column = (beyond % TILE).T
         inside = np.zeros((len(keys), *TILE), np.uint16)
-        inside[tile.ravel(), row, column] = np.iinfo(np.uint16).max
-        return Tiles(first[keys[:, 0]] + keys[:, 1:] * TILE, yaws[keys[:, 0]], inside)
+        inside[tile, row, column] = np.iinfo(np.uint16).max
+        return Tiles(first[group] + np.column_stack(step) * TILE, yaws[group], inside)
 
 
 def _best(

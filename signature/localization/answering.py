@@ -41,7 +41,7 @@ def answer_query(
     index: MapIndex,
     query: Query,
     seen: QueryMap,
-    found: tuple[Hypothesis, ...],
+    known: tuple[Hypothesis, ...],
     *,
     prior_of: PriorOf,
     session_index: int | None,
@@ -50,12 +50,12 @@ def answer_query(
 ) -> Answer:
     """Where a query is.
 
-    seen : `query` drawn. found : hypotheses for it. prior_of : what was known before it, of each place.
-    session_index : of the map that is preferred among several that show the place.
+    seen : `query` drawn. known : hypotheses that are compared, too. prior_of : what was known before it, of
+    each place. session_index : of the map that is preferred among several that show the place.
     """
-    verdict = decide(index, seen, found, prior_of)
-    clock.lap("decide")
-    verdict, prior, excluded = _with_prior(index, seen, verdict, prior_of)
+    verdict, found = decide(index, seen, known, prior_of)
+    clock.lap("search")
+    prior, excluded = _with_prior(index, seen, verdict, found)
     verdict = _in_map(_with_slip(index, query, verdict), session_index)
     clock.lap("decide")
     in_space = None
@@ -68,24 +68,19 @@ def answer_query(
 
 
 def _with_prior(
-    index: MapIndex, query: QueryMap, verdict: Verdict, prior_of: PriorOf
-) -> tuple[Verdict, Literal["used", "lapsed", "ahead"] | None, Moment | None]:
-    """The verdict, what became of the prior, and the best place that it excludes.
-
-    Where nothing that the prior allows is certain, all places are asked: those that fit better outside tell
-    what wrong places score.
-    """
+    index: MapIndex, query: QueryMap, verdict: Verdict, found: tuple[Hypothesis, ...]
+) -> tuple[Literal["used", "lapsed", "ahead"] | None, Moment | None]:
+    """What became of the prior, and the best place of those found that it excludes, where nothing is certain
+    that it allows."""
     if index.whole is None or index.region is None:
-        return verdict, None, None
+        return None, None
     if not index.prior_applies(query):
-        return verdict, "ahead" if index.region.is_ahead(query) else "lapsed", None
+        return "ahead" if index.region.is_ahead(query) else "lapsed", None
     if verdict.status == "located":
-        return verdict, "used", None
-    everywhere = index.whole.look_up(query, verdict.hypotheses)
-    best = judge(index.whole, query, everywhere)
+        return "used", None
+    best = judge(index.whole, query, found)
     excluded = best.hypotheses and not index.allows(query, best.hypotheses[0])
-    verdict = judge(index, query, everywhere, prior_of)
-    return verdict, "used", moment_of(index.whole, query, best) if excluded else None
+    return "used", moment_of(index.whole, query, best) if excluded else None
 
 
 def _with_slip(index: MapIndex, query: Query, verdict: Verdict) -> Verdict:
@@ -94,7 +89,7 @@ def _with_slip(index: MapIndex, query: Query, verdict: Verdict) -> Verdict:
     if not evidence.tail or min(evidence.tail) >= 0.0:
         return verdict
     since = query.since(evidence.scans_since).map()
-    alone = decide(index, since, index.look_up(since))
+    alone, _ = decide(index, since)
     here = Masses.of(since, alone).mass([verdict.hypotheses[0]])
     found = alone.confidence and math.exp(alone.evidence.log_odds()) / alone.confidence
     elsewhere = 1.0 + found * (sum(alone.masses) - here)
@@ -128,10 +123,8 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     clock = Clock()
     query = map_as_query(grid, index.made_with, index.config, drawn=True)
     clock.lap("describe")
-    found = index.look_up(query)
-    clock.lap("look_up")
-    verdict = judge(index, query, index.search_whole_maps(query, found))
-    clock.lap("decide")
+    verdict, _ = decide(index, query)
+    clock.lap("search")
     at_origin = tuple(_at_origin(h, query.T_odom_base) for h in verdict.hypotheses)
     verdict = replace(verdict, hypotheses=at_origin)
     answer = _answer(index, replace(query, T_odom_base=SE2()), verdict, ())

@@ -25,6 +25,8 @@ from signature.localization.posterior import (
 from signature.localization.query import QueryMap
 
 Place = tuple[Hypothesis, ...]
+LEFT = 0.05
+"""A search ends when what was not searched has less than this share of the mass."""
 PriorOf = Callable[[Place], float]
 """Prior of a place, relative to that of "not in this map"."""
 
@@ -40,13 +42,21 @@ def anywhere(place: Place) -> float:
 
 
 def decide(
-    index: MapIndex, query: QueryMap, hypotheses: tuple[Hypothesis, ...], prior_of: PriorOf = anywhere
-) -> Verdict:
-    """The verdict on what the signatures propose; where there is nothing to describe, or a prior names a
-    small region, on whatever fits there."""
-    if not query.views or index.prior_applies(query):
-        hypotheses = index.search_whole_maps(query, hypotheses)
-    return judge(index, query, hypotheses, prior_of)
+    index: MapIndex,
+    query: QueryMap,
+    known: tuple[Hypothesis, ...] = (),
+    prior_of: PriorOf = anywhere,
+) -> tuple[Verdict, tuple[Hypothesis, ...]]:
+    """The verdict on what is known and what is found where the signatures say, until one place is certain and
+    the right one is likely searched, or the rest of the map does not matter; and all hypotheses that it is
+    about."""
+    verdict, found = NOTHING, known
+    for found, left in index.search(query, known):
+        verdict = judge(index, query, found, prior_of)
+        # What was not searched may fit as well as what was.
+        if left < LEFT or (verdict.status == "located" and left < 1.0 - index.config.accept):
+            break
+    return verdict, found
 
 
 def judge(

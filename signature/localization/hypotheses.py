@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,7 +14,6 @@ from pc2grid.matching.refinement import refine
 from pc2grid.matching.two_way_score import Fit, score_fit
 from pc2grid.matching.walls import thin_evenly
 from pc2grid.matching.window_search import (
-    SEARCH,
     SearchMap,
     SearchParameters,
     search_windows,
@@ -35,6 +34,10 @@ class HypothesisParameters:
     far_m : walls beyond are left out. What is near may be people and carts only: of a real hall, 4 s of a
         lidar were found with the walls between 8 and 20 m and not without them.
     refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
+    around_m, around_rad : each place that may be the answer is searched so far around itself: by a square of
+        the coarse search, which may have found the shoulder of a peak, to each side.
+    sigmas : two hypotheses nearer than this Mahalanobis distance are one peak (99 % of chi-square with three
+        degrees of freedom).
     same_m, same_rad : two hypotheses nearer than this are one.
     map_m, map_rad : standard deviations of where a map shows what is around a place: half a cell, and over
         the range of a laser as an angle. They are added to those of the alignment, in the plane and in space,
@@ -48,6 +51,9 @@ class HypothesisParameters:
     near_m: float = 8.0
     far_m: float = 20.0
     refined: int = 2
+    around_m: float = 0.8
+    around_rad: float = math.radians(5.0)
+    sigmas: float = 3.37
     same_m: float = 0.5
     same_rad: float = math.radians(10.0)
     map_m: float = 0.025
@@ -72,43 +78,63 @@ class Hypothesis:
 
 def align(
     query: QueryMap,
-    areas: Iterable[Area],
+    batches: Iterable[Iterable[Area]],
     places: Places,
     maps: Sequence[SearchMap],
     config: RelocalizeConfig,
-) -> tuple[Hypothesis, ...]:
-    """Align the query with any heading wherever the robot may stand; returns what fits, best first, no two
-    alike.
+) -> Iterator[tuple[Hypothesis, ...]]:
+    """Align the query with any heading wherever the robot may stand; yields what fits in each batch of areas.
 
-    areas : likeliest first; what is clearly less than the best so far is not looked for in the next.
+    batches : likeliest first; what is clearly less than the best so far is not looked for in the next.
     maps : prepared map of each session, by session_index.
     """
-    coarse: list[tuple[float, int, int, SE2]] = []
-    best = 0.0
-    for session, squares_m in areas:
-        target = maps[session]
-        poses = search_windows(
-            target,
-            coarse_points(query.walls.facing(target.walls).points_m, query.center_m),
-            np.insert(squares_m, 2, 0.0, axis=1),
-            half_t_m=0.5 * SQUARE_M,
-            half_a_rad=math.pi,
-            parameters=SearchParameters(
-                floor=max(config.coarse_floor, config.coarse_keep * best),
-                keep=config.coarse_keep,
-                most=config.hypotheses,
-            ),
+    most = HYPOTHESES.refined * config.hypotheses
+    scores = [0.0]  # the best so far
+    for areas in batches:
+        coarse: list[tuple[float, int, int, SE2]] = []
+        for session, squares_m in areas:
+            target = maps[session]
+            poses = search_windows(
+                target,
+                coarse_points(query.walls.facing(target.walls).points_m, query.center_m),
+                np.insert(squares_m, 2, 0.0, axis=1),
+                half_t_m=0.5 * SQUARE_M,
+                half_a_rad=math.pi,
+                parameters=SearchParameters(
+                    floor=max(config.coarse_floor, config.coarse_keep * scores[0]),
+                    keep=config.coarse_keep,
+                    most=config.hypotheses,
+                ),
+            )
+            _, rows = places.nearest(session, poses[:, :2])
+            for (x, y, yaw, score), row in zip(poses.tolist(), rows.tolist(), strict=True):
+                coarse.append((score, session, row, _about(query.center_m, SE2(x, y, yaw))))
+            scores = sorted((*scores, *poses[:, 3].tolist()), reverse=True)[:most]
+        enough = max(config.coarse_keep * scores[0], scores[-1])
+        yield tuple(
+            fitted(query, session, row, maps[session], T_map_query)
+            for score, session, row, T_map_query in coarse
+            if score >= enough
         )
-        _, rows = places.nearest(session, poses[:, :2])
-        for (x, y, yaw, score), row in zip(poses.tolist(), rows.tolist(), strict=True):
-            best = max(best, score)
-            coarse.append((score, session, row, _about(query.center_m, SE2(x, y, yaw))))
-    coarse.sort(key=lambda c: -c[0])
-    found = [
-        fitted(query, session, row, maps[session], T_map_query)
-        for _, session, row, T_map_query in coarse[: HYPOTHESES.refined * config.hypotheses]
-    ]
-    return distinct(found, query.T_odom_base)
+
+
+def best_around(query: QueryMap, h: Hypothesis, target: SearchMap) -> Hypothesis:
+    """The best hypothesis as near to one as `HypothesisParameters.around_m` and `around_rad` say."""
+    p, center_m = HYPOTHESES, query.center_m
+    at = _at(query, h)
+    poses = search_windows(
+        target,
+        coarse_points(query.walls.facing(target.walls).points_m, center_m),
+        np.array([[at.x, at.y, at.yaw]]),
+        half_t_m=p.around_m,
+        half_a_rad=p.around_rad,
+        parameters=SearchParameters(floor=0.0, most=1),
+    )
+    found = (
+        fitted(query, h.session_index, h.row, target, _about(center_m, SE2(x, y, yaw)))
+        for x, y, yaw, _ in poses.tolist()
+    )
+    return max((h, *found), key=lambda one: one.fit.score)
 
 
 def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Hypothesis:
@@ -138,29 +164,34 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
     return pose, turn @ covariance @ turn.T
 
 
-def distinct(hypotheses: Sequence[Hypothesis], at: SE2) -> tuple[Hypothesis, ...]:
-    """Best first, without those that put the pose `at` (query's frame) on the shoulder of a better one in the
-    same session: nearer than the poses of a coarse search are to each other.
+def distinct(query: QueryMap, hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
+    """Best first, without those that are one peak with a better one.
 
     The best one takes over the `row` of the others if it has none.
     """
     kept: list[Hypothesis] = []
-    bases: list[SE2] = []
     for candidate in sorted(hypotheses, key=lambda h: -h.fit.score):
-        base = candidate.fit.T_map_query @ at
-        near = (
-            i
-            for i, other in enumerate(bases)
-            if candidate.session_index == kept[i].session_index
-            and _nearer(base, other, SEARCH.apart_m, SEARCH.apart_rad)
-        )
-        better = next(near, None)
+        better = next((i for i, other in enumerate(kept) if _one_peak(query, candidate, other)), None)
         if better is None:
             kept.append(candidate)
-            bases.append(base)
         elif kept[better].row < 0:
             kept[better] = replace(kept[better], row=candidate.row)
     return tuple(kept)
+
+
+def _one_peak(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
+    """Whether two hypotheses do not differ by their covariances, and a search around one finds the other."""
+    here, there = _at(query, a), _at(query, b)
+    off = np.array([here.x - there.x, here.y - there.y, wrap_angle(here.yaw - there.yaw)])
+    if a.session_index != b.session_index or np.abs(off[:2]).max() > HYPOTHESES.around_m:
+        return False
+    squared = off @ np.linalg.solve(a.fit.covariance + b.fit.covariance, off)
+    return bool(squared <= HYPOTHESES.sigmas**2)
+
+
+def _at(query: QueryMap, h: Hypothesis) -> SE2:
+    """Where a hypothesis puts `QueryMap.center_m`, which its covariance is about."""
+    return h.fit.T_map_query @ SE2(*query.center_m, 0.0)
 
 
 def same_pose(a: SE2, b: SE2) -> bool:

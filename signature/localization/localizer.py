@@ -197,13 +197,11 @@ class Localizer:
         seen, index = query.map(), index or self.index
         self._clock.lap("describe")
         part, _, carried = self._last
-        found = index.look_up(seen, (*(carried if part == seen.part else ()), *known))
-        self._clock.lap("look_up")
         return answer_query(
             index,
             query,
             seen,
-            found,
+            (*(carried if part == seen.part else ()), *known),
             prior_of=prior_of or partial(self._belief.prior, seen),
             session_index=self._belief.session_index,
             history=tuple(self._history),

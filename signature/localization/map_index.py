@@ -7,6 +7,7 @@ import copy
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain, islice, pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,13 +20,13 @@ from pc2grid.observer import Observer
 from pc2grid.threads import one_blas_thread
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.hypotheses import Hypothesis, align, distinct, fitted
+from signature.localization.hypotheses import Hypothesis, align, best_around, distinct, fitted
 from signature.localization.in_space import SurfaceOf, surface_reader
 from signature.localization.posterior import POSTERIOR
 from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
 from signature.retrieval.lazy_maps import DatabaseGrids, LazySequence
-from signature.retrieval.viewpoints import AT_ONCE_M2, SQUARE_M, Area, Places
+from signature.retrieval.viewpoints import AT_ONCE_M2, FIRST_PLACES, SQUARE_M, Area, Places
 from signature.seen_places import SeenPlaces
 from signature.similarity import SignatureTable
 
@@ -83,7 +84,7 @@ class MapIndex:
         most = most_prepared = None
         if area_m2 > AT_ONCE_M2:
             most = math.ceil(count * AT_ONCE_M2 / area_m2)
-            most_prepared = self.config.shortlist + self.config.hypotheses
+            most_prepared = FIRST_PLACES + self.config.hypotheses
         self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count, most)
         self.maps: LazySequence[SearchMap] = LazySequence(
             lambda i: SearchMap.of(self.grids[i], drawn=self.sessions[i] in drawn), count, most_prepared
@@ -186,26 +187,47 @@ class MapIndex:
             h.session_index == region.session_index and region.allows(query, h.fit.T_map_query)
         )
 
-    def look_up(self, query: QueryMap, carried: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
-        """Hypotheses for the query, best first: those carried, refined, and what the signatures propose."""
-        maps = self.maps_for(query)
-        old = [
-            fitted(query, h.session_index, h.row, maps[h.session_index], h.fit.T_map_query) for h in carried
-        ]
-        rows = self.places.select(query.views, query.center_m, self.config)
-        return self._worth_keeping(query, (*old, *self._aligned(query, self.places.areas(rows))))
-
-    def search_whole_maps(self, query: QueryMap, known: tuple[Hypothesis, ...]) -> tuple[Hypothesis, ...]:
-        """`known` and whatever fits anywhere on the maps that are small enough to be searched as a whole,
-        those first that look most like the query; in a large database, on these alone. With a prior: anywhere
-        in its region.
+    def search(
+        self, query: QueryMap, known: tuple[Hypothesis, ...] = ()
+    ) -> Iterator[tuple[tuple[Hypothesis, ...], float]]:
+        """Hypotheses for the query, best first, again and again: those that are known, refined, and what is
+        found next to more and more places, the likeliest first; with a prior, anywhere in its region at
+        once. Beside them the share 0..1 of the mass, by the signatures, that is not searched yet.
 
         What has less than the share `RelocalizeConfig.coarse_keep` of the best coarse score is left out.
         """
-        return self._worth_keeping(query, (*known, *self._aligned(query, self._whole_maps(query))))
+        maps = self.maps_for(query)
+        found = self._worth_keeping(query, self._fitted(query, known))
+        rows, after = self.places.order(query.views, query.center_m, self.config)
+        ends = [FIRST_PLACES]
+        while ends[-1] < len(rows):
+            ends.append(10 * ends[-1])
+        ends[-1] = len(rows)
+        parts = [rows[begin:end] for begin, end in pairwise((0, *ends))]
+        batches = [self.places.areas(part) for part in parts]
+        batches[0] = chain(batches[0], self._allowed(query))
+        for end, fits in zip(ends, align(query, batches, self.places, maps, self.config), strict=True):
+            found = self._worth_keeping(query, fits, found)
+            yield found, float(after[end - 1]) if end else 0.0
 
-    def _aligned(self, query: QueryMap, areas: Iterable[Area]) -> tuple[Hypothesis, ...]:
-        return align(query, areas, self.places, self.maps_for(query), self.config)
+    def in_region(self, query: QueryMap, known: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
+        """`known` and what fits anywhere in the region of the prior."""
+        fits = next(align(query, [self._allowed(query)], self.places, self.maps_for(query), self.config))
+        return self._worth_keeping(query, (*self._fitted(query, known), *fits))
+
+    def _allowed(self, query: QueryMap) -> Iterator[Area]:
+        """The region of the prior, if there is one that applies."""
+        region = self._region_for(query)
+        if region is not None:
+            squares_m = region.squares(query, self.places.ground[region.session_index][0], SQUARE_M)
+            yield Area(region.session_index, squares_m)
+
+    def _fitted(self, query: QueryMap, known: Iterable[Hypothesis]) -> list[Hypothesis]:
+        """What is known, refined."""
+        maps = self.maps_for(query)
+        return [
+            fitted(query, h.session_index, h.row, maps[h.session_index], h.fit.T_map_query) for h in known
+        ]
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
         """The maps as they are searched for a query: to one in a lower plane, their free space is unknown."""
@@ -216,29 +238,24 @@ class MapIndex:
 
         return LazySequence(facing, len(self.maps), 0)
 
-    def _whole_maps(self, query: QueryMap) -> Iterator[Area]:
-        """The maps that are searched as a whole."""
-        region = self._region_for(query)
-        if region is not None:
-            index = region.session_index
-            squares_m = region.squares(query, self.places.ground[index][0], SQUARE_M)
-            if len(squares_m) * SQUARE_M**2 <= self.config.exhaustive_m2:
-                yield Area(index, squares_m)
-            return
-        for index in self.places.sessions(query.views, query.center_m, self.config):
-            if self._areas_m2[index] <= self.config.exhaustive_m2:
-                yield Area(index, self.places.ground[index][0])
-
-    def _worth_keeping(self, query: QueryMap, found: Sequence[Hypothesis]) -> tuple[Hypothesis, ...]:
-        """Best first, what scores enough beside the best one to tell of it
-        (`PosteriorParameters.longest_lead`); what a prior excludes is kept beside it."""
-        ordered = distinct(found, query.T_odom_base)
-        kept: list[Hypothesis] = []
+    def _worth_keeping(
+        self, query: QueryMap, new: Sequence[Hypothesis], kept: Sequence[Hypothesis] = ()
+    ) -> tuple[Hypothesis, ...]:
+        """Best first, of what is new and what was kept before, what scores enough beside the best one to tell
+        of it (`PosteriorParameters.longest_lead`), each the best around itself; what a prior excludes is
+        kept beside it."""
+        maps, share = self.maps_for(query), 1.0 - POSTERIOR.longest_lead
+        worth: list[Hypothesis] = []
         for inside in (True, False):
-            group = [h for h in ordered if self.allows(query, h) is inside]
-            enough = [h for h in group if h.fit.score >= (1.0 - POSTERIOR.longest_lead) * group[0].fit.score]
-            kept += enough[: self.config.hypotheses]
-        return tuple(sorted(kept, key=lambda h: -h.fit.score))
+            found = [h for h in kept if self.allows(query, h) is inside]
+            best = max((h.fit.score for h in found), default=0.0)
+            for h in sorted((h for h in new if self.allows(query, h) is inside), key=lambda h: -h.fit.score):
+                if h.fit.score >= share * best:
+                    found.append(best_around(query, h, maps[h.session_index]))
+                    best = max(best, found[-1].fit.score)
+            enough = (h for h in distinct(query, found) if h.fit.score >= share * best)
+            worth += islice(enough, self.config.hypotheses)
+        return tuple(sorted(worth, key=lambda h: -h.fit.score))
 
     def joined(self, a: int, b: int) -> tuple[BuildingFrame, BuildingFrame] | None:
         """Where two sessions lie in the building in which they are joined; None if they are not."""

@@ -22,7 +22,7 @@ from pc2grid.matching.two_way_score import Fit
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
-from signature.localization.hypotheses import align
+from signature.localization.hypotheses import align, best_around, distinct
 from signature.localization.posterior import log_likelihood_ratio
 from signature.localization.query import QueryMap, query_of
 from signature.retrieval.lazy_maps import LazySequence
@@ -80,8 +80,6 @@ class SessionRecognizer:
         self._config = config.relocalize.model_copy(
             update={
                 "views": parameters.views,
-                "shortlist": parameters.shortlist,
-                "shortlist_share": 0.0,
             }
         )
         self._parameters = parameters
@@ -98,8 +96,13 @@ class SessionRecognizer:
         return found
 
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
-        areas = places.areas(places.select(query.views, query.center_m, self._config))
+        rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
         maps = LazySequence(self._map, len(self._stored), most=0)
+        likely = [
+            best_around(query, found, maps[found.session_index])
+            for found in next(align(query, [places.areas(rows)], places, maps, self._config))
+            if self._parameters.probability(found.fit) >= self._parameters.least
+        ]
         return [
             Recognition(
                 older=found.session_index,
@@ -107,8 +110,8 @@ class SessionRecognizer:
                 T_older_newer=found.fit.T_map_query,
                 probability=probability,
             )
-            for found in align(query, areas, places, maps, self._config)
-            if (probability := self._parameters.probability(found.fit)) >= self._parameters.least
+            for found in distinct(query, likely)
+            for probability in [self._parameters.probability(found.fit)]
         ]
 
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:

@@ -146,7 +146,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     # All mass was near the pose before what was seen lately. So of two equal rooms it is in the nearer one.
     answer = localizer.search(
         localizer.query,
-        near.search_whole_maps(seen, (believed,)),
+        near.in_region(seen, (believed,)),
         lambda place: 1.0 / (1.0 - kept(seen)) if any(near.allows(seen, h) for h in place) else 1.0,
     )
     apart = [

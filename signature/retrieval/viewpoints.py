@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple, TypeVar
 
@@ -29,6 +30,9 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+FIRST_PLACES = 100
+"""So many places are searched before it is asked whether one is certain, then ten times as many, and so on.
+By hand, by the time: places that are searched later share tiles of the search with those before."""
 AT_ONCE_M2 = 200_000.0
 """So much free floor is searched at once; of a larger database, the sessions that look likeliest. Chosen by
 the time of a look-up."""
@@ -40,11 +44,35 @@ _APART_M = 1e6
 """Puts the places of different sessions far apart in one KD-tree."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderParameters:
+    """How much the signatures say: the mass of a place is (1 - astray) exp(L / dependent) / sum + astray / N.
+
+    dependent : of the views of a query, so many repeat what one says. astray : share of the queries of which
+        the signatures say nothing. With these 0.14 of 54 real windows are said to have their place behind the
+        first 100, and 0.15 have; chosen by their likelihood, which leaves out a building at a time.
+    """
+
+    dependent: float = 1.5
+    astray: float = 0.05
+
+
+ORDER = OrderParameters()
+
+
 class Area(NamedTuple):
     """Where the robot may stand in one session: squares of `SQUARE_M` with the centres (K, 2), map frame."""
 
     session: int
     squares_m: F64
+
+
+class Order(NamedTuple):
+    """Places (R,), likeliest first, and of each the share (R,) of the mass that those after it have, by the
+    signatures."""
+
+    rows: I64
+    after: F64
 
 
 class Places:
@@ -78,30 +106,31 @@ class Places:
         self.ground: LazySequence[tuple[F64, I64]] = LazySequence(self._ground, len(grids), _KEPT_SESSIONS)
         """By session, the squares (K, 2) that hold free ground, and the places next to them (K,)."""
         self._controls: dict[ShortlistBy, PlaceIndex] = {}
-        self._selected: tuple[Sequence[View], RelocalizeConfig, I64] | None = None
+        self._ordered: tuple[Sequence[View], RelocalizeConfig, Order] | None = None
 
     @property
     def is_large(self) -> bool:
         """Whether there is more free floor than is searched at once."""
         return bool(self._areas_m2.sum() > AT_ONCE_M2)
 
-    def select(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> I64:
-        """The places (R,) that the robot at `base_m` most likely stands next to, likeliest first,
-        `shortlist_size` of them: by `PlaceIndex.poses`, or by a control (`RelocalizeConfig.shortlist_by`). In
-        a large database those in the likeliest maps, up to `AT_ONCE_M2`.
+    def order(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> Order:
+        """Return the places by how likely the robot at `base_m` stands next to them: by `PlaceIndex.poses`, or
+        by a control (`RelocalizeConfig.shortlist_by`). Of a large database those in the likeliest maps, up to
+        `AT_ONCE_M2`.
         """
-        if self._selected is None or self._selected[0] is not views or self._selected[1] is not config:
-            self._selected = views, config, self._select(views, base_m, config)
-        return self._selected[2]
+        if self._ordered is None or self._ordered[0] is not views or self._ordered[1] is not config:
+            self._ordered = views, config, self._order(views, base_m, config)
+        return self._ordered[2]
 
-    def _select(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> I64:
-        most = shortlist_size(len(self.table), config)
+    def _order(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> Order:
         every = np.arange(len(self.table))
         if not views or not len(every):
-            return every[:0]
+            return self._at_once(every, np.zeros(len(every)))
         if config.shortlist_by == "random":
-            return self._at_once(self._chance.permutation(every)[:most])
-        return self._at_once(self.next_to(self._searched(config.shortlist_by).poses(views, base_m), most))
+            return self._at_once(self._chance.permutation(every), np.zeros(len(every)))
+        likelihood = self.next_to(self._searched(config.shortlist_by).poses(views, base_m))
+        rows = np.argsort(-likelihood, kind="stable")
+        return self._at_once(rows, likelihood[rows])
 
     def _searched(self, by: ShortlistBy) -> PlaceIndex:
         """The viewpoints, by all signatures or as a control wants them."""
@@ -118,24 +147,27 @@ class Places:
         names = by.split("+")
         return PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names))
 
-    def next_to(self, poses: Poses, most: int) -> I64:
-        """The `most` places (R,) that the robot stands next to in the likeliest poses, likeliest first; if
-        these are too few, others, too."""
+    def next_to(self, poses: Poses) -> F64:
+        """(N,) the log-likelihood of the likeliest pose next to each place. Where none is, it is that of the
+        least likely one: no more are proposed."""
         away_m, row = self.nearest(self._session_of_block[poses.block], poses.base_m)
-        order = np.argsort(-poses.likelihood, kind="stable")
-        near = row[order[away_m[order] <= self.sight_m]]
-        ordered = np.concatenate((near, np.arange(len(self.table))))
-        return ordered[np.sort(np.unique(ordered, return_index=True)[1])[:most]]
+        likelihood = np.full(len(self.table), poses.likelihood.min(initial=0.0), np.float64)
+        near = away_m <= self.sight_m
+        np.maximum.at(likelihood, row[near], poses.likelihood[near])
+        return likelihood
 
-    def _at_once(self, rows: I64) -> I64:
-        """Those of the places that are in the maps that are searched at once."""
-        if not self.is_large:
-            return rows
-        of = self.table.session_index[rows]
-        sessions = np.array(list(dict.fromkeys(of.tolist())))
-        areas_m2 = self._areas_m2[sessions]
-        kept: I64 = rows[np.isin(of, sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])])]
-        return kept
+    def _at_once(self, rows: I64, likelihood: F64) -> Order:
+        """The order of the places (R,) of such log-likelihoods that are in the maps that are searched at
+        once."""
+        if self.is_large:
+            of = self.table.session_index[rows]
+            sessions = np.array(list(dict.fromkeys(of.tolist())))
+            areas_m2 = self._areas_m2[sessions]
+            kept = np.isin(of, sessions[np.cumsum(areas_m2) <= max(AT_ONCE_M2, areas_m2[0])])
+            rows, likelihood = rows[kept], likelihood[kept]
+        mass = np.exp((likelihood - likelihood.max(initial=-math.inf)) / ORDER.dependent)
+        mass = (1.0 - ORDER.astray) * mass / mass.sum() + ORDER.astray / max(len(mass), 1)
+        return Order(rows, np.cumsum(mass[::-1])[::-1] - mass)
 
     def index(self, on_progress: Callable[[float], None] = lambda share: None) -> PlaceIndex:
         """The viewpoints of all places with their signatures; made when first asked for.
@@ -170,16 +202,6 @@ class Places:
         """The places of a session in the table, which are side by side."""
         first, end = np.searchsorted(self.table.session_index, (session, session + 1))
         return slice(int(first), int(end))
-
-    def sessions(
-        self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig
-    ) -> list[int]:
-        """Indices of the sessions to be searched as a whole, likeliest first: all, or of a large database
-        those of the selected places."""
-        rows = self.select(views, base_m, config)
-        first: list[int] = self.table.session_index[rows].tolist()
-        every = () if self.is_large else range(len(self._areas_m2))
-        return list(dict.fromkeys((*first, *every)))
 
     def areas(self, rows: I64) -> Iterator[Area]:
         """The free ground next to the places `rows`, in the order of their sessions."""
@@ -217,11 +239,6 @@ def ground_squares(grid: OccupancyGrid) -> F64:
     ground = np.add.reduceat(np.add.reduceat(grid.ground.astype(np.int32), rows, axis=0), columns, axis=1)
     corners = np.argwhere(ground > 0)[:, ::-1] * (n * grid.resolution_m)
     return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
-
-
-def shortlist_size(places: int, config: RelocalizeConfig) -> int:
-    """How many places a query is aligned at."""
-    return max(config.shortlist, min(math.ceil(config.shortlist_share * places), config.shortlist_most))
 
 
 def _forget(kept: dict[int, T], most: int) -> None:

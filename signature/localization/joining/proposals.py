@@ -43,7 +43,8 @@ def proposals(target: MapIndex, pieces: Sequence[Piece]) -> list[Proposal]:
 
 def _places_of(target: MapIndex, piece: Piece) -> list[Proposal]:
     """Where a piece may lie in the target."""
-    fits = [hypothesis.fit for hypothesis in target.look_up(piece.query)]
+    found, _ = next(target.search(piece.query))
+    fits = [hypothesis.fit for hypothesis in found]
     return [
         Proposal(T_target_source=fit.T_map_query, at_m=piece.center_m, log_odds=evidence.log_odds())
         for fit, evidence in zip(fits, evidence_of(fits, piece.query), strict=True)

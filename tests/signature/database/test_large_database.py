@@ -12,7 +12,7 @@ from pc2grid.errors import DatabaseCorrupt
 from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
 from pc2grid.observer import Observer
 from pc2grid.submaps.partition import partition
-from signature.config import Config, RelocalizeConfig
+from signature.config import Config
 from signature.database import maintenance, open_database
 from signature.localization import map_index as building_file
 from signature.localization.answering import locate_map
@@ -58,15 +58,18 @@ class _Counted(Mapping[str, OccupancyGrid]):
         return len(MAPS)
 
 
-FEW = Config(relocalize=RelocalizeConfig(shortlist=8, shortlist_share=0.0))
-"""The best eight places are compared."""
+@pytest.fixture(autouse=True)
+def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The best eight places are compared at first."""
+    monkeypatch.setattr(viewpoints, "FIRST_PLACES", 8)
+    monkeypatch.setattr(building_file, "FIRST_PLACES", 8)
 
 
 def test_few_maps_are_read_and_the_answer_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
     monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 2 * max(areas_m2.values()))
     maps = _Counted()
-    large = MapIndex(maps, ALL.places.table, ALL.made_with, FEW, areas_m2=areas_m2, stored=SEEN.get)
+    large = MapIndex(maps, ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2, stored=SEEN.get)
     assert maps.read == []
     answer = locate_map(PART, large)
     assert 1 <= len(maps.read) <= 3 and len(set(maps.read)) == len(maps.read) and "office" in maps.read
@@ -87,7 +90,8 @@ def test_a_map_larger_than_what_is_searched_at_once_is_still_searched(
         _Counted(), ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2, stored=SEEN.get
     )
     assert locate_map(PART, index).session == "office"
-    assert index.places.sessions(query_views(), (0.0, 0.0), index.config) == [list(MAPS).index("office")]
+    rows = index.places.order(query_views(), (0.0, 0.0), index.config).rows
+    assert set(index.places.table.session_index[rows].tolist()) == {list(MAPS).index("office")}
 
 
 def test_the_maps_that_were_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,24 +149,21 @@ def test_a_stored_map_is_read_when_it_matters(tmp_path: Path, monkeypatch: pytes
         read: list[str] = []
         take = database.grid
         monkeypatch.setattr(database, "grid", lambda name: (read.append(name), take(name))[1])
-        answer = locate_map(PART, MapIndex.of(database, FEW))
+        answer = locate_map(PART, MapIndex.of(database, Config()))
     assert answer.session == "office" and read == ["office"]
 
 
 def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_path: Path) -> None:
-    """A database of more places than are all compared, of which only a share is selected."""
+    """A database of more places than are compared at first."""
     file, copied = tmp_path / "damaged.submaps", tmp_path / "copied.submaps"
     store_maps(file, MAPS)
-    settings = ALL.made_with.relocalize.model_copy(update={"shortlist": 16, "shortlist_share": 0.0})
-    config = ALL.made_with.model_copy(update={"relocalize": settings})
     sql(file, "DELETE FROM part WHERE name = 'seen'")
     maintenance.copy(file, copied, recover=True)
     answers, news = {}, {}
     for path in (file, copied):
         news[path] = News()
         with open_database(path) as database:
-            index = MapIndex.of(database, config, news[path])
-            assert len(index.places.select(query_views(), (0.0, 0.0), index.config)) < 20
+            index = MapIndex.of(database, ALL.made_with, news[path])
             answers[path] = locate_map(PART, index)
     assert answers[file].session == answers[copied].session == "office"
     assert answers[file].T_map_base == answers[copied].T_map_base

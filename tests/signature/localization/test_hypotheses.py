@@ -5,15 +5,26 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from pc2grid.arrays import F32
 from pc2grid.geometry import SE2
+from pc2grid.matching.two_way_score import score_fit
 from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
-from signature.config import Config
-from signature.localization.hypotheses import HYPOTHESES, coarse_points, fitted
+from signature.config import Config, RelocalizeConfig, ShortlistBy
+from signature.localization import map_index
+from signature.localization.decision import decide
+from signature.localization.hypotheses import (
+    HYPOTHESES,
+    Hypothesis,
+    best_around,
+    coarse_points,
+    distinct,
+    fitted,
+)
 from signature.localization.query import query_of
-from tests.helpers.simulated_drives import building, office, with_tables
+from tests.helpers.simulated_drives import building, office, office_part, with_tables
 
 CENTER_M = (3.0, -2.0)
 
@@ -62,3 +73,36 @@ def test_tables_that_a_lidar_has_seen_over_and_under_hide_no_place_from_a_laser(
     plain = replace(of_lidar, heights=None)
     assert agreement(of_laser, of_lidar) > 0.9 > agreement(of_laser, plain)
     assert agreement(of_lidar, of_laser) > 0.9 > agreement(plain, of_laser)
+
+
+def test_a_shoulder_is_led_to_its_peak_and_is_no_place_of_its_own() -> None:
+    query = query_of(office(), np.empty((0, 2)), Config(), Config().relocalize)
+    target = SearchMap.of(office())
+    peak = fitted(query, 0, -1, target, SE2())
+    aside = SE2(0.6, -0.5, 0.06)
+    shoulder = Hypothesis(
+        session_index=0, row=3, fit=score_fit(target.walls, query.walls, aside, peak.fit.covariance)
+    )
+    assert distinct(query, (shoulder, peak)) == (peak, shoulder)
+    led = best_around(query, shoulder, target)
+    pose = led.fit.T_map_query
+    assert abs(pose.x) + abs(pose.y) < 0.05 and led.fit.score > shoulder.fit.score
+    (one,) = distinct(query, (led, peak))
+    assert one.row == 3  # of the place that proposed it
+    elsewhere = replace(led, session_index=1)
+    assert len(distinct(query, (elsewhere, peak))) == 2
+
+
+@pytest.mark.parametrize("by", ["signatures", "random"])
+def test_a_search_goes_on_until_it_is_sure(by: ShortlistBy, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the order is, no length of a list decides what is found."""
+    monkeypatch.setattr(map_index, "FIRST_PLACES", 2)
+    config = Config(relocalize=RelocalizeConfig(shortlist_by=by))
+    index = building({"office": office()}, config)
+    query = query_of(office_part((15.0, 5.0), 4.5), np.empty((0, 2)), config, config.relocalize)
+    steps = [left for _, left in index.search(query)]
+    assert len(steps) > 1 and steps == sorted(steps, reverse=True) and abs(steps[-1]) < 1e-9
+    verdict, _ = decide(index, query)
+    assert verdict.status == "located"
+    pose = verdict.hypotheses[0].fit.T_map_query
+    assert abs(pose.x - 15.0) + abs(pose.y - 5.0) < 0.1

@@ -55,13 +55,13 @@ def test_certainty_grows_with_travel_and_history_tells_it() -> None:
 
 def test_an_answer_is_one_search_and_asking_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """An estimate is the answer at its scan; at others the database is searched when it is asked."""
-    searched, look_up = [], MapIndex.look_up
+    searched, search = [], MapIndex.search
 
     def counted(index: MapIndex, query: QueryMap, *arguments: Any) -> Any:
         searched.append(query.path_m)
-        return look_up(index, query, *arguments)
+        return search(index, query, *arguments)
 
-    monkeypatch.setattr(MapIndex, "look_up", counted)
+    monkeypatch.setattr(MapIndex, "search", counted)
     quiet, asked = Localizer(OFFICE), Localizer(OFFICE)
     for number, (registered, planar_scan, _) in enumerate(drive(office(), ROUTE)):
         told = quiet.add(registered, planar_scan)

@@ -79,16 +79,6 @@ def test_a_prior_that_holds_changes_no_right_answer() -> None:
         assert answer.confidence >= free.confidence - 1e-9
 
 
-def test_a_region_that_is_too_large_to_be_searched_as_a_whole_is_searched_through_proposals() -> None:
-    small = RelocalizeConfig(step_m=100.0, exhaustive_m2=1.0)
-    index = building({"office": office()}, Config(relocalize=small))
-    answer, truth = ask(index.within(Prior.around(9.0, 5.0, radius_m=4.0)))
-    assert answer.status == "located" and distance(answer.T_map_base, truth) < 0.1
-    # Proposals outside are dropped all the same.
-    answer, _ = ask(index.within(Prior.around(17.0, 2.0, radius_m=2.0)))
-    assert answer.status == "not_found"
-
-
 def test_a_pose_of_the_first_scan_is_carried_along_by_the_travel() -> None:
     """1 m and 20 degrees off at the start, 11 m before the answer."""
     covariance = np.diag([0.5, 0.5, 0.1])

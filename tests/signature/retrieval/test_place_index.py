@@ -16,7 +16,7 @@ from signature.config import RelocalizeConfig, ShortlistBy
 from signature.localization.query import Query, QueryMap
 from signature.retrieval._kernels import best_headings
 from signature.retrieval.place_index import POSES, PlaceBlock, PlaceIndex
-from signature.retrieval.viewpoints import SQUARE_M, Places, shortlist_size
+from signature.retrieval.viewpoints import FIRST_PLACES, ORDER, SQUARE_M, Places
 from tests.helpers.simulated_drives import building, drive, office
 
 
@@ -83,14 +83,19 @@ def right(query: QueryMap, T_map_query: SE2, reach_m: float = 1.5) -> np.ndarray
     return np.flatnonzero(np.hypot(*(OFFICE.places.table.center_m - base_m).T) <= reach_m)
 
 
-def test_a_random_shortlist_of_the_same_size_finds_fewer_places() -> None:
+def first(places: Places, query: QueryMap, index: PlaceIndex, most: int) -> np.ndarray:
+    """The places that are likeliest by an index."""
+    return np.argsort(-places.next_to(index.poses(query.views, query.center_m)), kind="stable")[:most]
+
+
+def test_a_random_order_has_the_place_later() -> None:
     places, rng = with_floors(6), np.random.default_rng(0)
     count = len(places.table)
-    most, asked = shortlist_size(count, RelocalizeConfig()), queries(90.0)
+    most, asked = FIRST_PLACES, queries(90.0)
     assert most <= 0.06 * count and len(asked) > 10
 
     def share(index: PlaceIndex) -> float:
-        chosen = [places.next_to(index.poses(q.views, q.center_m), most) for q, _ in asked]
+        chosen = [first(places, q, index, most) for q, _ in asked]
         return float(np.mean([np.isin(c, right(*each)).any() for c, each in zip(chosen, asked, strict=True)]))
 
     drawn = [np.isin(rng.permutation(count)[:most], right(q, T)).any() for q, T in asked]
@@ -101,31 +106,26 @@ def test_a_random_shortlist_of_the_same_size_finds_fewer_places() -> None:
     assert found >= share(places.index().shuffled(rng)) + 0.2
 
 
-def test_the_selected_places_are_as_many_as_asked_for_and_different() -> None:
+def test_the_order_holds_every_place_once_and_what_is_left_of_the_mass() -> None:
     (query, _), *_ = queries()
-    places = OFFICE.places
-    poses = places.index().poses(query.views, query.center_m)
-    for most in (1, 10, PLACES - 1, PLACES, 10 * PLACES):
-        rows = places.next_to(poses, most)
-        assert len(rows) == len(np.unique(rows)) == min(most, PLACES)
-    assert len(places.select((), query.center_m, RelocalizeConfig())) == 0
+    for views in (query.views, ()):
+        rows, after = OFFICE.places.order(views, query.center_m, RelocalizeConfig())
+        assert sorted(rows.tolist()) == list(range(PLACES))
+        assert (np.diff(after) < 0.0).all() and after[0] < 1.0 and abs(after[-1]) < 1e-9
+        # Of some queries the signatures say nothing, so every place has a share.
+        share = ORDER.astray if views else 1.0
+        assert -np.diff(after).min() >= 0.999 * share / PLACES
 
 
-def test_a_share_of_the_places_is_selected_and_at_least_a_hundred() -> None:
-    config = RelocalizeConfig()
-    sizes = {count: shortlist_size(count, config) for count in (100, 1000, 10_000, 500_000)}
-    assert sizes == {100: 100, 1000: 100, 10_000: 500, 500_000: config.shortlist_most}
-
-
-def test_the_controls_select_as_many_places_and_find_fewer() -> None:
+def test_the_controls_have_the_place_later() -> None:
     """As by `relocalize --set relocalize.shortlist_by=shuffled`."""
     asked, found = queries(), {}
     for by in get_args(ShortlistBy):
-        config = RelocalizeConfig.model_validate({"shortlist": 5, "shortlist_share": 0.0, "shortlist_by": by})
+        config = RelocalizeConfig.model_validate({"shortlist_by": by})
         places = building({"office": office()}).places
-        rows = [places.select(query.views, query.center_m, config) for query, _ in asked]
-        assert {len(chosen) for chosen in rows} == {5}
-        found[by] = np.mean([np.isin(r, right(*each)).any() for r, each in zip(rows, asked, strict=True)])
+        rows = [places.order(query.views, query.center_m, config).rows for query, _ in asked]
+        assert {len(chosen) for chosen in rows} == {PLACES}
+        found[by] = np.mean([np.isin(r[:5], right(*each)).any() for r, each in zip(rows, asked, strict=True)])
     assert min(found["signatures"], found["boundary"]) >= max(found["shuffled"], found["random"]) + 0.2
     assert found["symmetry"] < found["boundary"]
 

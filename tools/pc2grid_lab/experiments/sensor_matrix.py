@@ -191,7 +191,7 @@ def _judged(
 
 def _retrieved_rank(index: MapIndex, query: QueryMap, T_map_query: SE2) -> int:
     """Rank of the first place, selected by the signatures, that the robot truly stood next to."""
-    rows = index.places.select(query.views, query.center_m, index.config)
+    rows = index.places.order(query.views, query.center_m, index.config).rows
     off_m = index.places.table.center_m[rows] - T_map_query.apply(np.array([query.center_m]))
     right = np.flatnonzero(np.hypot(*off_m.T) <= JUDGEMENT.retrieved_m)
     return int(right[0]) if len(right) else -1

@@ -109,7 +109,7 @@ def _asked(
 ) -> dict[str, Any]:
     """What tells for each place that is found, for the best one with what its last scans tell, and how far it
     is from the truth."""
-    found = index.search_whole_maps(query, index.look_up(query))
+    *_, (found, _) = index.search(query)
     evidence = list(evidence_of([h.fit for h in found], query))
     if found:
         walls = index.maps[found[0].session_index].walls

@@ -1,4 +1,4 @@
-"""What the signatures decide: real windows, located with their shortlist, with parts of it, and without.
+"""What the signatures decide: real windows, located in their order, in that of some of them, and in any.
 
     python -m pc2grid_lab.fit.shortlists DATA WORK [--only PATTERN] [--places 13000,100000]
 
@@ -35,7 +35,7 @@ from signature.localization.query import QueryMap
 from signature.similarity import SignatureTable
 
 _FEW = 200
-"""Of fewer places, half or more are aligned at in any case."""
+"""Of fewer places, half or more are searched at once."""
 _FIRST_FLOOR = 40_000
 """Seed of the first office floor: others than those that the weights were learned from."""
 
@@ -62,10 +62,10 @@ class Database:
 
 
 def asked(index: MapIndex, query: QueryMap, by: ShortlistBy, truth: Mapping[str, SE2]) -> Asked:
-    """The answer by a shortlist. truth : where the base is, by session of the index."""
+    """The answer in an order. truth : where the base is, by session of the index."""
     index.config = index.config.model_copy(update={"shortlist_by": by})
     begin = time.process_time()
-    verdict = decide(index, query, index.look_up(query))
+    verdict, _ = decide(index, query)
     cpu_s = time.process_time() - begin
     errors = (error_of(index, query, place, truth) for place in verdict.hypotheses[:1])
     right = any(error_m <= RIGHT_M and error_rad <= RIGHT_RAD for error_m, error_rad in errors)
@@ -125,7 +125,7 @@ def one_each(folder: Folder) -> list[str]:
 
 
 def row(database: Database, by: ShortlistBy, known: Sequence[Window]) -> str:
-    """A row of the table: the windows asked in a database by a shortlist."""
+    """A row of the table: the windows asked in a database in an order."""
     found = [
         asked(index, window.whole, by, database.truth(window))
         for window in known
@@ -139,7 +139,7 @@ def row(database: Database, by: ShortlistBy, known: Sequence[Window]) -> str:
 
 
 def main(data: Path, work: Path, only: Only = None, places: str = "13000,100000") -> None:
-    """Print the table: windows located by each shortlist. DATA and WORK are those of `compare recordings`."""
+    """Print the table: windows located in each order. DATA and WORK are those of `compare recordings`."""
     folder = Folder(data.resolve(), work.resolve())
     known = [window for window in windows(Catalogue.of(only=only), folder) if window.truth]
     for database in databases(folder, [int(size) for size in places.split(",")]):

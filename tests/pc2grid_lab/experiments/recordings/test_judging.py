@@ -60,6 +60,9 @@ class Known(Judge):
     def _problem(self, pair: Pair) -> str:
         return ""
 
+    def _fine(self, pair: Pair, query: Recording, one: LocatedWindow, expected: Any) -> float:
+        return 0.95 if one.window % 2 else 0.6
+
 
 @pytest.fixture(autouse=True)
 def all_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -153,6 +156,15 @@ def test_later_parts_are_judged_by_the_trajectory_of_the_whole(
     answers = [located("a", 3, T_A_B @ pose(3)), located("a", 4, T_A_B @ pose(4) @ SE2(2.0, 0.0, 0.0))]
     row = Known({pair: answers}).row(pair)
     assert row.truth == "trajectory" and [query.right for query in row.queries] == [True, False]
+
+
+def test_what_a_check_of_the_true_pose_finds_and_the_search_does_not_is_counted() -> None:
+    found = answers(a=(T_PLAN_A, T_PLAN_A), b=(T_PLAN_A, T_PLAN_A))
+    found[A_IN_PLAN] = [located("a", k, T_PLAN_A @ pose(k), status="not_found") for k in range(2)]
+    judge = Known(found)
+    missed, right = judge.row(A_IN_PLAN), judge.row(B_IN_PLAN)
+    assert [query.fine for query in missed.queries] == [0.6, 0.95] and missed.counts.overlooked == 1
+    assert [query.fine for query in right.queries] == [None, None] and right.counts.overlooked == 0
 
 
 def test_elsewhere_nothing_is_right() -> None:

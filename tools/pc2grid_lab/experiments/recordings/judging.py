@@ -13,6 +13,7 @@ from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid, Trajectory
+from pc2grid.pipeline import follow
 from pc2grid.time_span import TimeSpan
 from pc2grid_lab.experiments.frames import nearest
 from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
@@ -32,6 +33,9 @@ from pc2grid_lab.experiments.recordings.mapped import MISSING, map_row, said
 from pc2grid_lab.experiments.recordings.rows import NOT_RUN, PairRow, QueryRow, Table, Truth
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.trial import JUDGEMENT
+from signature.database import open_database
+from signature.localization.map_index import MapIndex
+from signature.localization.pose_check import check_pose
 
 _SESSION = "map"
 """The first session of a map, see `run`."""
@@ -148,8 +152,33 @@ class Judge:
             **row,
             truth=truth,
             agreeing=sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None,
-            queries=tuple(_judged(one, frames, known) for one in windows),
+            queries=tuple(self._row_of(pair, one, frames, known) for one in windows),
         )
+
+    def _row_of(
+        self, pair: Pair, one: LocatedWindow, frames: Frames, known: Mapping[str, OccupancyGrid]
+    ) -> QueryRow:
+        """The row of a window; where it is missed, with what `--check` says of its true pose."""
+        row = _judged(one, frames, known)
+        if not row.missed:
+            return row
+        query = self._catalogue.recordings[pair.query]
+        return replace(row, fine=self._fine(pair, query, one, _expected(one, frames)))
+
+    def _fine(
+        self, pair: Pair, query: Recording, one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]]
+    ) -> float | None:
+        """Probability of the true pose of a window by `check_pose`; None if that does not call it fine."""
+        config, folder, found = config_of(query), self._folder, []
+        for session, (T_map_base, _) in expected.items():
+            with (
+                open_database(folder.map(pair.map_name)) as database,
+                open_log(folder.source(query), config.read) as log,
+            ):
+                scans = follow(log.scans(one.span.start_s, one.span.duration_s), config)
+                checked = check_pose(scans, MapIndex.of(database, config), T_map_base, session=session)
+            found += [checked.probability] if checked.status == "fine" else []
+        return max(found, default=None)
 
     def _problem(self, pair: Pair) -> str:
         if gaps := self._folder.gaps(self._catalogue, pair):

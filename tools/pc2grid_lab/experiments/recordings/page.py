@@ -9,7 +9,7 @@ from textwrap import wrap
 from pc2grid_lab.experiments.recordings.catalogue import KINDS
 from pc2grid_lab.experiments.recordings.chance import clopper_pearson
 from pc2grid_lab.experiments.recordings.changes import RowChange
-from pc2grid_lab.experiments.recordings.rows import NOT_RUN, Counts, FollowedRow, MapRow, PairRow, Table
+from pc2grid_lab.experiments.recordings.rows import FINE, NOT_RUN, Counts, FollowedRow, MapRow, PairRow, Table
 
 _MARKS = {"right": "", "false": " (false)", "unknown": " (?)"}
 _READING = ("no tf", "gaps", "empty scans")
@@ -133,6 +133,7 @@ _PLACES = (
         "not judged",
         "refused",
         "right of covered",
+        "overlooked",
         "rank",
         "error, m",
         "in space",
@@ -151,8 +152,10 @@ def _places(table: Table) -> list[str]:
     return [
         *lines,
         "covered: the map knows half of the ground that the last scan sees there. right: within 0.3 m and 3",
-        "degrees. rank: places before the right one, of covered queries that are not located (-: it is not",
-        "among the hypotheses). error: median of the right ones. in space: answers with which the points of",
+        "degrees. overlooked: covered and missed, though `--check` of the true pose calls it fine, at",
+        f"{FINE:.1f} and more: missed by the search, not by the walls. rank: places before the right one, of",
+        "covered queries that are not located (-: it is not among the hypotheses). error: median of the",
+        "right ones. in space: answers with which the points of",
         "the map agree / do not tell / disagree, if it has points. judged by: true poses of both; the",
         "trajectory of the whole recording, whose beginning is the map; a pose found by hand in a drawn",
         "map, within 1 m; the clouds of both, registered in space; or the answers themselves, which must",
@@ -164,7 +167,7 @@ def _places(table: Table) -> list[str]:
 
 def _pair_cells(row: PairRow) -> list[str]:
     if row.problem:
-        return [row.query, row.map, row.sensors, *[""] * 12, row.problem]
+        return [row.query, row.map, row.sensors, *[""] * 13, row.problem]
     counts = row.counts
     judged = {
         "poses": "poses",
@@ -190,6 +193,7 @@ def _pair_cells(row: PairRow) -> list[str]:
         str(counts.unjudged),
         str(counts.refused),
         _share(counts.covered_right, counts.covered),
+        _strong(counts.overlooked) if known else "",
         " ".join("-" if rank is None else str(rank) for rank in row.ranks),
         _number(row.median_error_m, 3),
         _in_space(row),
@@ -267,6 +271,7 @@ def _by_building(table: Table) -> list[str]:
             "queries",
             "covered",
             "right of covered",
+            "overlooked",
             "wrong of judged",
             "not judged",
             "elsewhere: wrong of asked",
@@ -301,6 +306,7 @@ def _building_cells(name: str, inside: Sequence[PairRow], outside: Sequence[Pair
         str(counts.queries),
         str(counts.covered),
         _share(counts.covered_right, counts.covered),
+        _strong(counts.overlooked),
         _share(counts.wrong, counts.right + counts.wrong),
         str(counts.unjudged),
         _share(other.wrong, other.queries),

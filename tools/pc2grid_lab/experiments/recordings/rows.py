@@ -12,6 +12,9 @@ from pydantic import TypeAdapter
 
 NOT_RUN = "was not run"
 """The problem of a row whose commands were not run, because the run ended early."""
+FINE = 0.9
+"""A missed window whose true pose is at least so probable by `--check` is missed by the search, not by the
+walls; by hand."""
 Verdict = Literal["right", "false", "unknown"]
 Truth = Literal["poses", "trajectory", "hand", "clouds", "agreement", "elsewhere"]
 """How answers are judged: by true poses of query and map, by the trajectory of the recording whose beginning
@@ -63,7 +66,8 @@ class QueryRow:
     window : its number among those of the pair. problem : why there is no answer. covered : whether the map
         knows the ground that the last scan saw; None if the true place is not known. right : whether the best
         hypothesis is right; None if that is not known. rank : how many other places come before the right
-        one; None if it is not among the hypotheses. error_m : of the best hypothesis.
+        one; None if it is not among the hypotheses. error_m : of the best hypothesis. fine : probability of
+        the true pose of a missed window, where `--check` calls it fine.
     """
 
     window: int
@@ -77,12 +81,18 @@ class QueryRow:
     rank: int | None = None
     error_m: float | None = None
     in_space: str | None = None
+    fine: float | None = None
     cpu_s: float | None = None
 
     @property
     def located(self) -> bool:
         """Whether one place was answered."""
         return self.status == "located"
+
+    @property
+    def missed(self) -> bool:
+        """Whether it is covered, and the answer is not its place."""
+        return self.covered is True and not (self.located and self.right)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,7 +101,7 @@ class Counts:
 
     right, wrong : located and right, located and wrong, of those whose answer can be judged; unjudged :
         located, of the others. refused : not located. covered : judged, and in the map; covered_right : of
-        those, located and right.
+        those, located and right. overlooked : missed by the search alone, see `FINE`.
     """
 
     queries: int
@@ -99,6 +109,7 @@ class Counts:
     located: int
     right: int
     covered_right: int
+    overlooked: int
     wrong: int
     unjudged: int
     failed: int
@@ -113,6 +124,7 @@ class Counts:
             located=len(located),
             right=sum(q.right is True for q in located),
             covered_right=sum(q.right is True and q.covered is True for q in located),
+            overlooked=sum(q.missed and (q.fine or 0.0) >= FINE for q in queries),
             wrong=sum(q.right is False for q in located),
             unjudged=sum(q.right is None for q in located),
             failed=sum(bool(q.problem) for q in queries),
