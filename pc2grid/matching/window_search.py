@@ -184,11 +184,11 @@ class Tiles:
         of = np.column_stack((group, beyond // TILE)).T
         shape = tuple((of.max(axis=1) + 1).tolist())
         keys, tile = np.unique(np.ravel_multi_index(tuple(of), shape), return_inverse=True)
-        group, *step = np.unravel_index(keys, shape)
+        group, down, across = np.unravel_index(keys, shape)
         row, column = (beyond % TILE).T
         inside = np.zeros((len(keys), *TILE), np.uint16)
         inside[tile, row, column] = np.iinfo(np.uint16).max
-        return Tiles(first[group] + np.column_stack(step) * TILE, yaws[group], inside)
+        return Tiles(first[group] + np.column_stack((down, across)) * TILE, yaws[group], inside)
 
 
 def _best(

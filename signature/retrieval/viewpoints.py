@@ -114,9 +114,9 @@ class Places:
         return bool(self._areas_m2.sum() > AT_ONCE_M2)
 
     def order(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> Order:
-        """Return the places by how likely the robot at `base_m` stands next to them: by `PlaceIndex.poses`, or
-        by a control (`RelocalizeConfig.shortlist_by`). Of a large database those in the likeliest maps, up to
-        `AT_ONCE_M2`.
+        """Return the places by how likely the robot at `base_m` stands next to them: by `PlaceIndex.poses`,
+        or by a control (`RelocalizeConfig.shortlist_by`). Of a large database those in the likeliest maps, up
+        to `AT_ONCE_M2`.
         """
         if self._ordered is None or self._ordered[0] is not views or self._ordered[1] is not config:
             self._ordered = views, config, self._order(views, base_m, config)
