@@ -36,10 +36,10 @@ demo: $(READY)
 	$(BIN)/pc2grid demo --out demo_out --force
 
 test: $(READY) browser
-	$(BYTE_CODE) $(BIN)/python -m pytest -q -n auto --dist loadfile $(PYTEST_ARGS)
+	$(BYTE_CODE) $(BIN)/python -m pytest -q -n auto --dist worksteal $(PYTEST_ARGS)
 
 nightly: $(READY) browser
-	$(BYTE_CODE) $(BIN)/python -m pytest -q -n auto --dist loadfile -m nightly $(PYTEST_ARGS)
+	$(BYTE_CODE) $(BIN)/python -m pytest -q -n auto --dist worksteal -m nightly $(PYTEST_ARGS)
 	PC2GRID_FUZZ=1000 $(BIN)/python -m pytest -q -n auto --dist worksteal $(FUZZED) $(PYTEST_ARGS)
 
 check: $(READY)

@@ -26,7 +26,7 @@ class Extra:
 
 
 EXTRAS = {
-    "paper": Extra(("mahotas",), ("mahotas",)),
+    "paper": Extra(("mahotas", "sklearn"), ("mahotas", "scikit-learn")),
     "cluster": Extra(("dask", "distributed"), ("dask", "distributed"), ClusterError),
     "live": Extra(("websockets",), ("websockets",), LiveError),
     "postgres": Extra(("psycopg",), ("'psycopg[binary]'",), DatabaseError),

@@ -25,10 +25,10 @@ def in_sight(
     """
     width = occupied.shape[1]
     flat = occupied.reshape(-1)
-    visible = np.ones(len(first), np.bool_)
+    visible = np.empty(len(first), np.bool_)
     for pair in range(len(first)):
-        r0, c0 = cells[first[pair]]
-        r1, c1 = cells[second[pair]]
+        a, b = first[pair], second[pair]
+        r0, c0, r1, c1 = cells[a, 0], cells[a, 1], cells[b, 0], cells[b, 1]
         rows, columns = abs(r1 - r0), abs(c1 - c0)
         down, across = (width if r1 > r0 else -width), (1 if c1 > c0 else -1)
         at, end = r0 * width + c0, r1 * width + c1
@@ -56,7 +56,9 @@ def pair_counts(cells: I64, bin_of: NDArray[np.int32], bins: int) -> I64:
     Measured: 1,200 points of a disc of 8 m in 1.1 ms, where their distances as floating point take 5.
     """
     counts = np.zeros(bins, np.int64)
-    rows, columns = cells[:, 0].astype(np.int32), cells[:, 1].astype(np.int32)
+    rows, columns = np.empty(len(cells), np.int32), np.empty(len(cells), np.int32)
+    for i in range(len(cells)):
+        rows[i], columns[i] = cells[i, 0], cells[i, 1]
     for i in range(len(cells)):
         row, column = rows[i], columns[i]
         for j in range(i + 1, len(cells)):

@@ -18,7 +18,7 @@ import networkx as nx
 
 ABOUT = {
     "pc2grid_lab": "the laboratory: experiments, peers",
-    "pc2grid_cli": "the program: one file for each command, and what they share",
+    "pc2grid_cli": "the program: what can be typed, a file for the work of each command, and what they share",
     "signature": "submaps to signatures, database, localization",
     "pc2grid": "recordings to clouds, trajectories, maps, submaps",
 }

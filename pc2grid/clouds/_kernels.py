@@ -33,7 +33,7 @@ def planar_normals(
     angles = np.empty(count, dtype=np.float32)
     for place in range(count):
         i = order[place]
-        x, y = away[i]
+        x, y = away[i, 0], away[i, 1]
         distance = math.hypot(x, y)
         towards = math.atan2(-y, -x)
         angles[i] = towards
@@ -93,11 +93,11 @@ def scan_bearings(
 
     Measured: 0.6 ms instead of 23 ms a scan of a lidar, 0.015 instead of 0.7 ms of a planar laser.
     """
-    nearest = np.full(bearings, np.inf)
-    reach = np.zeros(bearings)
+    nearest, reach = np.empty(bearings), np.empty(bearings)
+    for b in range(bearings):
+        nearest[b], reach[b] = math.inf, 0.0
     count = points.shape[0]
-    bearing_of = np.full(count, -1, dtype=np.int32)
-    ranges = np.empty(count)
+    bearing_of, ranges = np.empty(count, dtype=np.int32), np.empty(count)
     sensor_height = plane[0] * sensor[0] + plane[1] * sensor[1] + plane[2] * sensor[2] + plane[3]
     for k in range(count):
         px, py = float(points[k, 0]), float(points[k, 1])
@@ -105,6 +105,7 @@ def scan_bearings(
         ranges[k] = distance = math.hypot(x, y)
         bearing = round(math.atan2(y, x) * (bearings / (2.0 * math.pi))) % bearings
         height = plane[0] * px + plane[1] * py + plane[2] * points[k, 2] + plane[3]
+        bearing_of[k] = -1
         if height < band[0]:
             reach[bearing] = max(reach[bearing], distance)
         elif height > band[1]:
@@ -128,9 +129,12 @@ def _by_bearing(
     for bearing in bearing_of:
         if bearing >= 0:
             starts[bearing + 1] += 1
-    starts = np.cumsum(starts)
-    order = np.empty(starts[-1], dtype=np.int64)
-    filled = starts.copy()
+    filled = np.empty(bearings + 1, dtype=np.int64)
+    filled[0] = 0
+    for b in range(bearings):
+        starts[b + 1] += starts[b]
+        filled[b + 1] = starts[b + 1]
+    order = np.empty(starts[bearings], dtype=np.int64)
     for k in range(len(bearing_of)):
         bearing = bearing_of[k]
         if bearing >= 0:
@@ -160,7 +164,7 @@ def _surfaces(
             k = order[place]
             if place == starts[bearing] or ranges[k] - first > depths[0] + depths[1] * ranges[k] * ranges[k]:
                 first = ranges[k]
-                surfaces[found] = 0.0
+                surfaces[found, 0] = surfaces[found, 1] = surfaces[found, 2] = 0.0
                 found += 1
             surfaces[found - 1, 0] += points[k, 0]
             surfaces[found - 1, 1] += points[k, 1]
@@ -209,8 +213,11 @@ def _sorted(bearing_of: NDArray[np.int32], bearings: int) -> tuple[NDArray[np.in
     starts = np.zeros(bearings + 1, dtype=np.int64)
     for bearing in bearing_of:
         starts[bearing + 1] += 1
-    starts = np.cumsum(starts)
-    order, filled = np.empty(len(bearing_of), dtype=np.int64), starts.copy()
+    order, filled = np.empty(len(bearing_of), dtype=np.int64), np.empty(bearings + 1, dtype=np.int64)
+    filled[0] = 0
+    for b in range(bearings):
+        starts[b + 1] += starts[b]
+        filled[b + 1] = starts[b + 1]
     for n in range(len(bearing_of)):
         order[filled[bearing_of[n]]] = n
         filled[bearing_of[n]] += 1
@@ -244,6 +251,8 @@ def _heights_along(
         if behind:
             height = sensor_height + (height - sensor_height) * r / away
         if band[0] <= height <= band[1]:
-            bit = 1 << np.searchsorted(borders, height, side="right")
+            bit = 1
+            for border in borders:
+                bit <<= height >= border
             filled, empty = filled | bit * (not behind), empty | bit * behind
     return filled, empty

@@ -29,7 +29,9 @@ def corrected(reported: F64, errors: F64) -> tuple[F64, F64, F64]:
     """
     way, distance_m = 1.0 + errors[0], math.hypot(reported[0], reported[1])
     c, s = way * math.cos(errors[1]), way * math.sin(errors[1])
-    step, by_report, by_errors = reported.copy(), np.eye(6), np.zeros((6, ERRORS))
+    step, by_report, by_errors = np.empty(6), np.zeros((6, 6)), np.zeros((6, ERRORS))
+    for a in range(6):
+        step[a], by_report[a, a] = reported[a], 1.0
     x, y = c * reported[0] - s * reported[1], s * reported[0] + c * reported[1]
     step[0], step[1] = x, y
     step[5] = (1.0 + errors[3]) * reported[5] + errors[2] * distance_m
@@ -43,11 +45,9 @@ def corrected(reported: F64, errors: F64) -> tuple[F64, F64, F64]:
 @njit(cache=True)
 def drift_variance(reported: F64, drift: float, drift_turn_m: float) -> F64:
     """Variances (6,) of the drift over a step (6,)."""
-    x, y, z, roll, pitch, yaw = reported
-    distance_m, turn_rad = (
-        math.sqrt(x * x + y * y + z * z),
-        math.sqrt(roll * roll + pitch * pitch + yaw * yaw),
-    )
+    x, y, z, roll, pitch, yaw = reported[0], reported[1], reported[2], reported[3], reported[4], reported[5]
+    distance_m = math.sqrt(x * x + y * y + z * z)
+    turn_rad = math.sqrt(roll * roll + pitch * pitch + yaw * yaw)
     variance = np.empty(6)
     for a in range(6):
         of_turn = drift_turn_m**2 * turn_rad if a < 3 else drift**2 * turn_rad
@@ -157,7 +157,9 @@ def _add_prior(state: State, prior: Prior, free: NDArray[np.intp], H: F64, g: F6
     d, m = len(free), len(prior.about.poses)
     off_pose, _, _ = steps(prior.about.poses, state.poses[:m])
     off_reading, _, _ = steps(prior.about.readings, state.readings[:m])
-    off = prior.shift.copy()
+    off = np.empty(len(prior.shift))
+    for a in range(len(off)):
+        off[a] = prior.shift[a]
     for a in range(ERRORS):
         off[a] += state.errors[a] - prior.about.errors[a]
     for k in range(m):

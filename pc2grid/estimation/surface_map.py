@@ -174,7 +174,14 @@ class VoxelShapes:
         """What points (N, 3) say of a change of their pose (4, 4) in its own axes; see `normal_equations`."""
         rows = self._rows
         H, g, found, distance_m = kernels.normal_equations(
-            self._slots, rows.codes, rows.shapes, points_m, weights, pose, self.edge_m, scale_m
+            self._slots,
+            rows.codes,
+            rows.shapes,
+            points_m,
+            weights,
+            np.ascontiguousarray(pose),  # or the kernel is compiled twice
+            self.edge_m,
+            scale_m,
         )
         R = np.zeros((6, 6))
         R[:3, :3] = R[3:, 3:] = pose[:3, :3]

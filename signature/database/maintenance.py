@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
-from pc2grid.io.containers.detect import first_bytes, is_submap_database
+from pc2grid.io.containers.detect import is_submap_file
 from signature.database import SubmapDatabase, engine_of, open_database, refuse_existing
 from signature.database.arrays import DatabaseDamage, clean
 from signature.database.document import StoredSession, stored_session
@@ -68,12 +68,7 @@ def exists(target: Place) -> bool:
 
 def is_database(name: str) -> bool:
     """Whether this is the URL or the file of a submap database."""
-    if is_url(name):
-        return True
-    try:
-        return is_submap_database(first_bytes(Path(name)))
-    except OSError:
-        return False
+    return is_url(name) or is_submap_file(Path(name))
 
 
 def shown(place: Place) -> str:

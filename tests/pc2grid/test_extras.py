@@ -61,7 +61,7 @@ def test_a_package_that_is_broken_is_missing(tmp_path: Path, monkeypatch: pytest
 @pytest.mark.parametrize(
     ("command", "blocked", "error", "hint"),
     [
-        ("compare paper --maps {0} -o {0}/new", ("paper",), ConfigError, "pip install mahotas"),
+        ("compare paper --maps {0} -o {0}/new", ("paper",), ConfigError, "pip install mahotas scikit-learn"),
         (
             "convert a.mcap -o postgresql://u:secret@h/d --dask tcp://h:1",
             ("cluster", "postgres"),
@@ -99,14 +99,9 @@ def test_commands_say_all_that_is_missing_before_any_work(
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_methods_that_need_no_extra_run_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from pc2grid_lab.paper.methods import require_packages
-
+def test_what_needs_no_extra_runs_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     missing(monkeypatch, *EXTRAS)
-    require_packages(["proposed", "shape_context", "sift_bow", "sdf"])
     require(of_addresses(tmp_path / "b.submaps", "monday.mcap", "-", None))
-    with pytest.raises(ConfigError, match="for surf_bow, surf_tfidf, is"):
-        require_packages(["surf_bow", "proposed", "surf_tfidf"])
 
 
 def test_a_robot_is_not_waited_for_without_the_package(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,18 +8,21 @@ import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import jsonschema
 import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from pc2grid.model import MapOf, SensorKind
 from pc2grid.settings import dump_settings
+from pc2grid_cli.commands import export_command, simulate_command
 from pc2grid_cli.console import print_result
 from pc2grid_cli.json_schemas import DOCUMENTS, schema
 from pc2grid_cli.main import app
-from signature.config import Config
+from pc2grid_lab.commands import compare_recordings_command
+from signature.config import Config, ShortlistBy
 from tests.helpers.json_schema import closed, keys
 
 
@@ -129,6 +132,20 @@ def test_every_command_shows_an_example_that_parses(name: str, command: Any) -> 
     command.make_context(name, words)
     for option in command.params:
         assert option.help, f"{name}: {option.name} is not explained"
+
+
+@pytest.mark.parametrize(
+    ("command", "option", "values"),
+    [
+        (simulate_command, "sensor", SensorKind),
+        (export_command, "map_of_", MapOf),
+        (compare_recordings_command, "shortlist", ShortlistBy),
+    ],
+)
+def test_an_option_takes_all_values_of_its_type(command: Any, option: str, values: Any) -> None:
+    """Their types are in modules that help does not load: the declarations repeat the values."""
+    declared = get_type_hints(command)[option]
+    assert values in (declared, *get_args(declared))
 
 
 def test_json_is_offered_where_there_is_a_schema_and_only_there() -> None:

@@ -1,8 +1,7 @@
 """How the words of a command are read, in addition to what typer does.
 
-Global options are understood behind the command as well, where people put them. The module of a command is
-imported when it is used: here alone the program imports late, so that every other import stands at the top of
-its file.
+Global options are understood behind the command as well, where people put them. The declaration of a command
+is imported when it is used, and what does its work when it runs (`commands.py`).
 """
 
 from __future__ import annotations

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
 from pc2grid.display import counted
 from pc2grid.errors import DatabaseError, one_line
 from pc2grid_cli import console
-from pc2grid_cli.options import DATABASE, AsJson, Database, Force, WrittenDatabase
 from pc2grid_cli.session_documents import (
     JoinedSession,
     OfDatabase,
@@ -21,10 +19,8 @@ from pc2grid_cli.session_documents import (
     stored_document,
 )
 from signature.database import Problem, SessionInfo, open_database
-from signature.database.maintenance import check, copy, merge, remove, rename, shown, split
+from signature.database.maintenance import check, shown
 from signature.localization.answer_json import plain
-
-_Sessions = Annotated[list[str], typer.Argument(metavar="SESSION...", help="which of its sessions")]
 
 
 class DbInfo(OfDatabase):
@@ -48,11 +44,8 @@ class DbWrite(OfDatabase):
     left_out: list[Problem]
 
 
-def db_info_command(database: Database, json: AsJson = False) -> None:
-    """Show the sessions of a database.
-
-    Example: pc2grid db info building.submaps
-    """
+def tell_sessions(database: str, *, json: bool) -> None:
+    """Print the sessions of a database."""
     with open_database(database) as opened:
         sessions, frames, where = opened.sessions(), opened.frames(), opened.location
     about: DbInfo = {
@@ -81,11 +74,8 @@ def _line(s: SessionInfo) -> str:
     return line
 
 
-def db_check_command(database: Database, json: AsJson = False) -> None:
-    """Read everything in a database and list all damage; exit code 1 if there is any.
-
-    Example: pc2grid db check building.submaps
-    """
+def tell_damage(database: str, *, json: bool) -> None:
+    """Print all damage of a database. Raises typer.Exit if there is any."""
     problems = check(database)
     about: DbCheck = {"database": shown(database), "problems": list(problems)}
     damage = [one_line(f"{problem.where}: {problem.what}") for problem in problems]
@@ -95,96 +85,19 @@ def db_check_command(database: Database, json: AsJson = False) -> None:
         raise typer.Exit(console.FAILED)
 
 
-def db_merge_command(
-    databases: Annotated[list[str], typer.Argument(metavar=f"{DATABASE} ...", help="what to merge")],
-    output: WrittenDatabase,
-    force: Force = False,
-    json: AsJson = False,
-) -> None:
-    """Put the sessions of several databases into a new one.
-
-    Example: pc2grid db merge monday.submaps tuesday.submaps -o week.submaps
-    """
-    count = merge(databases, output, overwrite=force)
-    _tell(output, f"{shown(output)}: {counted(count, 'session')}", json)
-
-
-def db_copy_command(
-    database: Database,
-    output: WrittenDatabase,
-    recover: Annotated[bool, typer.Option("--recover", help="leave damaged parts out; exit code 3")] = False,
-    force: Force = False,
-    json: AsJson = False,
-) -> None:
-    """Write a compact copy of a database.
-
-    Example: pc2grid db copy --recover damaged.submaps -o good.submaps
-    """
-    problems = copy(database, output, recover=recover, overwrite=force)
-    for problem in problems:
-        console.warn(f"left out: {problem.where}: {problem.what}")
-    _tell(output, f"{shown(output)}: {_size(output)}", json, problems)
-    if problems:
-        raise typer.Exit(console.LOSSY)
-
-
-def _size(output: str) -> str:
+def size(output: str) -> str:
     """The size of a copy: of a file in bytes, of anything else in sessions."""
     path = Path(output)
-    return f"{path.stat().st_size / 1e6:.1f} MB" if path.is_file() else _sessions(output)
+    return f"{path.stat().st_size / 1e6:.1f} MB" if path.is_file() else sessions_in(output)
 
 
-def _sessions(database: str) -> str:
+def sessions_in(database: str) -> str:
+    """Return how many sessions are in a database, with the noun."""
     with open_database(database) as opened:
         return counted(len(opened.sessions()), "session")
 
 
-def db_split_command(
-    database: Database,
-    sessions: _Sessions,
-    output: WrittenDatabase,
-    force: Force = False,
-    json: AsJson = False,
-) -> None:
-    """Copy sessions of a database into a new one; the first stays as it is.
-
-    Example: pc2grid db split building.submaps monday -o monday.submaps
-    """
-    count = split(database, sessions, output, overwrite=force)
-    _tell(output, f"{shown(output)}: {counted(count, 'session')}", json)
-
-
-def db_rename_command(
-    database: Database,
-    old: Annotated[str, typer.Argument(metavar="OLD", help="the session")],
-    new: Annotated[str, typer.Argument(metavar="NEW", help="its new name")],
-    json: AsJson = False,
-) -> None:
-    """Give a session another name, for example before databases with equal names are merged.
-
-    Example: pc2grid db rename building.submaps monday first-floor
-    """
-    rename(database, old, new)
-    _tell(database, one_line(f"{shown(database)}: {old} is now {new}"), json)
-
-
-def db_remove_command(
-    database: Database,
-    sessions: _Sessions,
-    force: Annotated[bool, typer.Option("--force", help="also if no session is left")] = False,
-    json: AsJson = False,
-) -> None:
-    """Remove sessions from a database, all or none; they cannot be brought back.
-
-    Example: pc2grid db remove building.submaps monday
-    """
-    if not force:
-        _refuse_all(database, sessions)
-    remove(database, sessions)
-    _tell(database, f"{shown(database)}: {_sessions(database)} left", json)
-
-
-def _refuse_all(database: str, sessions: list[str]) -> None:
+def refuse_all(database: str, sessions: list[str]) -> None:
     """Raises DatabaseError if no session of the database would be left."""
     with open_database(database) as opened:
         known = {info.name for info in opened.sessions()}
@@ -195,7 +108,7 @@ def _refuse_all(database: str, sessions: list[str]) -> None:
             )
 
 
-def _tell(output: str, text: str, json: bool, left_out: Sequence[Problem] = ()) -> None:
+def tell(output: str, text: str, json: bool, left_out: Sequence[Problem] = ()) -> None:
     """Print a text or the document about a database that was written."""
     with open_database(output) as opened:
         number, where = len(opened.sessions()), opened.location

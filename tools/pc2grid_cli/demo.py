@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 import typer
@@ -18,7 +17,6 @@ from pc2grid.model import SensorKind
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.config import LidarConfig
 from pc2grid_cli import console
-from pc2grid_cli.options import OUTPUT_FOLDER, Force
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
@@ -34,18 +32,8 @@ QUERY_LENGTH_M = 15.0
 QUERY_START_M = (7.6, 8.0)
 
 
-def demo_command(
-    context: typer.Context,
-    out: Annotated[Path, typer.Option(*OUTPUT_FOLDER, metavar="DIR", help="where to leave the files")] = Path(
-        "demo_out"
-    ),
-    force: Force = False,
-) -> None:
-    """Map a simulated office with a lidar, then find a robot with a depth camera in it.
-
-    Example: pc2grid demo
-    """
-    terminal = console.of(context)
+def run(out: Path, terminal: console.Console, *, force: bool) -> None:
+    """Map the office, find the other robot, and leave all files in the folder `out`."""
     begin = time.monotonic()
     lidar, depth = out / "lidar.mcap", out / "depth.mcap"
     database, picture, page = out / "office.submaps", out / "answer.png", out / "report.html"

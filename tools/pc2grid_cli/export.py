@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-import typer
 
-from pc2grid import extras
 from pc2grid._version import __version__
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid.io.export.cloud import write_cloud
@@ -19,23 +17,10 @@ from pc2grid.io.export.graphml import write_graph
 from pc2grid.io.nav2_map import is_map_file, save_map
 from pc2grid.io.trajectory import write_trajectory
 from pc2grid.model import THING, MapOf, OccupancyGrid
-from pc2grid_cli import console
+from pc2grid_cli import console, options
 from pc2grid_cli.foxglove import write_session
-from pc2grid_cli.options import (
-    AsJson,
-    Building,
-    Database,
-    Floor,
-    Force,
-    Frame,
-    Plot,
-    Report,
-    TrajectoryFile,
-)
-from pc2grid_cli.output_files import check_file, files_of, map_stem, written_files
+from pc2grid_cli.output_files import check_file, written_files
 from pc2grid_cli.session_documents import OfDatabase
-from signature.database import open_database
-from signature.localization.answer_json import plain
 from signature.localization.joining.building_map import floors_of, map_of
 from signature.localization.shown.picture import draw_building, draw_session
 from signature.localization.shown.report import write_report
@@ -53,110 +38,15 @@ class Export(OfDatabase):
     written: list[str]
 
 
-_SHOWN: dict[MapOf, str] = {
+SHOWN: dict[MapOf, str] = {
     "everything": "what stands there is an obstacle, walls and things such as tables alike",
     "walls": "things such as tables are unknown, and no obstacles",
     "raw": f"in percent, {THING} is a thing such as a table; nav2 takes what is below 100 for free",
 }
 
 
-TrajectoryFormat = Literal["tum", "kitti"]
-_Map = Annotated[Path | None, typer.Option("--map", metavar="STEM", help="STEM.yaml and STEM.pgm for nav2")]
-_MapOf = Annotated[
-    MapOf | None,
-    typer.Option(
-        "--map-of",
-        help="of --map and --mcap; default: everything that stands there is an obstacle; walls: furniture"
-        " is unknown; raw: percent, which nav2 takes for free below 100",
-    ),
-]
-_Format = Annotated[
-    TrajectoryFormat | None,
-    typer.Option("--format", help="of the trajectory; default: kitti for OUT.kitti, else tum"),
-]
-_Cloud = Annotated[
-    Path | None,
-    typer.Option(
-        "--cloud",
-        metavar="OUT.ply|.pcd",
-        help="the 3D points of the session, if it has any, else the walls at z = 0",
-    ),
-]
-_Graph = Annotated[
-    Path | None,
-    typer.Option("--graph", metavar="OUT.graphml", help="junctions, ends, and the ways between"),
-]
-_G2o = Annotated[
-    Path | None, typer.Option("--g2o", metavar="OUT.g2o", help="the pose graph: steps and loops")
-]
-_Mcap = Annotated[
-    Path | None, typer.Option("--mcap", metavar="OUT.mcap", help="map, path, submaps for Foxglove, rerun")
-]
-_Session = Annotated[str | None, typer.Option("--session", help="which, if there are several")]
-
-
-def export_command(
-    context: typer.Context,
-    database: Database,
-    map_: _Map = None,
-    map_of_: _MapOf = None,
-    trajectory: TrajectoryFile = None,
-    format_: _Format = None,
-    cloud: _Cloud = None,
-    graph: _Graph = None,
-    g2o: _G2o = None,
-    mcap: _Mcap = None,
-    plot: Plot = None,
-    report: Report = None,
-    session: _Session = None,
-    building: Building = None,
-    floor: Floor = None,
-    frame: Frame = "building",
-    force: Force = False,
-    json: AsJson = False,
-) -> None:
-    """Write a session's map, trajectory or picture, or a page that shows all sessions.
-
-    Of sessions that are joined (`db join`), --map, --cloud and --plot show all that are on a floor as one,
-    unless --session names one. Maps, clouds and trajectories are in the frame of the building; pages,
-    graphs, the picture of a session and the files of other viewers are in the session's own map frame.
-
-    Example: pc2grid export building.submaps --map building --trajectory building.tum
-    """
-    terminal = console.of(context)
-    outputs = files_of(
-        trajectory=trajectory,
-        cloud=cloud,
-        graph=graph,
-        g2o=g2o,
-        mcap=mcap,
-        plot=plot,
-        map=map_ and map_stem(map_),
-        report=report,
-    )
-    _check(outputs, map_of_, format_, force)
-    as_told = _As(of=map_of_ or "everything", format=format_, force=force)
-    extras.require(extras.of_addresses(database))
-    with open_database(database) as opened:
-        if building is not None or floor is not None:
-            opened.keep_only(building=building, floor=floor)
-        frames = opened.frames() if frame == "building" else {}
-        name = _write(outputs, as_told, opened, session, frames, terminal)
-        about: Export = {
-            "database": opened.location,
-            "session": name,
-            "written": [str(path) for path in written_files(outputs)],
-        }
-    if as_told.of != "everything":
-        terminal.note(f"--map-of {as_told.of}: {_SHOWN[as_told.of]}")
-    for path in written_files(outputs):
-        terminal.note(f"wrote {path}")
-    if json:
-        console.print_result(plain(Export, about))
-
-
-def _check(
-    outputs: Mapping[str, Path], of: MapOf | None, format_: TrajectoryFormat | None, force: bool
+def check(
+    outputs: Mapping[str, Path], of: MapOf | None, format_: options.TrajectoryFormat | None, force: bool
 ) -> None:
     """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written."""
     if of is not None and not {"map", "mcap"} & outputs.keys():
@@ -172,17 +62,17 @@ def _check(
 
 
 @dataclass(frozen=True, slots=True)
-class _As:
+class As:
     """How it is written: what maps show, the format of the trajectory (None: by its suffix), --force."""
 
     of: MapOf
-    format: TrajectoryFormat | None
+    format: options.TrajectoryFormat | None
     force: bool
 
 
-def _write(
+def write(
     outputs: Mapping[str, Path],
-    as_told: _As,
+    as_told: As,
     database: SubmapDatabase,
     session: str | None,
     frames: Mapping[str, BuildingFrame],
@@ -221,7 +111,7 @@ def _only_session(database: SubmapDatabase, of_one: Collection[str], *, joined: 
 
 def _write_building(
     outputs: Mapping[str, Path],
-    as_told: _As,
+    as_told: As,
     database: SubmapDatabase,
     names: Sequence[str],
     frames: Mapping[str, BuildingFrame],
@@ -242,7 +132,7 @@ def _write_building(
 
 def _write_session(
     outputs: Mapping[str, Path],
-    as_told: _As,
+    as_told: As,
     database: SubmapDatabase,
     name: str,
     frame: BuildingFrame | None,
@@ -282,7 +172,7 @@ def _write_map(
         stem,
         mode="raw" if of == "raw" else "trinary",
         of=of,
-        comment=f"pc2grid {__version__}, {' and '.join(planes)}:\n{_SHOWN[of]}",
+        comment=f"pc2grid {__version__}, {' and '.join(planes)}:\n{SHOWN[of]}",
     )
 
 

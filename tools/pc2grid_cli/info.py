@@ -7,25 +7,23 @@ import math
 from dataclasses import dataclass, fields
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import typer
-from rich import markup
-from rich.console import Console
-from rich.table import Table
 
+from pc2grid import extras
 from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io import open_log
+from pc2grid.io.building_file import is_building_file
+from pc2grid.io.containers.detect import is_submap_file
 from pc2grid.io.message_source import Choice, LogInfo
+from pc2grid.io.nav2_map import is_map_file
 from pc2grid.io.robots import Namespaces, camera_info_topic
-from pc2grid.mapping.drawn_map import is_drawn_map, load_drawn_map
 from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid_cli.console import LOSSY, print_result, warn
-from pc2grid_cli.db import db_info_command
-from pc2grid_cli.options import AsJson, Assignments, Recover, Topic, make_config
-from signature.database.maintenance import is_database
+from pc2grid_cli.options import make_config
 from signature.localization.answer_json import TypedDict, plain
 
 if TYPE_CHECKING:
@@ -72,32 +70,20 @@ class InfoMap(TypedDict):
     tilt_deg: float
 
 
-def info_command(
-    log: Annotated[
-        str,
-        typer.Argument(
-            metavar="LOG|MAP|DATABASE", help="recording, map (.yaml, .pcd, .ply, mesh) or database"
-        ),
-    ],
-    topic: Topic = None,
-    recover: Recover = False,
-    set_: Assignments = None,
-    json: AsJson = False,
-) -> None:
-    """Say what is in a recording, and which topic convert would use and why; or in a map, or a database.
+def run(log: str, topic: str | None, assignments: list[str] | None, *, recover: bool, json: bool) -> None:
+    """Print what is in a recording, a map or a database."""
+    if "postgres" in extras.of_addresses(log) or is_submap_file(Path(log)):
+        from pc2grid_cli.db import tell_sessions
 
-    Example: pc2grid info monday.mcap
-    """
-    if is_database(log):
-        db_info_command(log, json)
+        tell_sessions(log, json=json)
         return
-    if is_drawn_map(Path(log)):
-        of_map = describe_map(Path(log), set_)
+    if is_map_file(Path(log)) or is_building_file(Path(log)):
+        of_map = describe_map(Path(log), assignments)
         print_result(plain(InfoMap, of_map) if json else one_line(_map_as_text(of_map)))
         for warning in of_map["warnings"]:
             warn(warning)
         return
-    info = describe(Path(log), topic=topic, recover=recover, assignments=set_)
+    info = describe(Path(log), topic=topic, recover=recover, assignments=assignments)
     if json:
         print_result(plain(Info, info))
     else:
@@ -108,6 +94,7 @@ def info_command(
 
 def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
     """The document of a map. Raises MapFileError if it cannot be read."""
+    from pc2grid.mapping.drawn_map import load_drawn_map
 
     drawn = load_drawn_map(path, make_config(None, assignments))
     grid, R = drawn.grid, drawn.T_map_file[:3, :3]
@@ -188,6 +175,10 @@ def _fields(of: Choice | LogInfo) -> dict[str, Any]:
 
 
 def _show(info: Info) -> None:
+    from rich import markup
+    from rich.console import Console
+    from rich.table import Table
+
     def escape(text: str) -> str:
         # Names come from the log, and may hold control sequences for a terminal.
         return markup.escape(one_line(text))

@@ -5,22 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from pc2grid.display import counted, probability
-from pc2grid.errors import ConfigError, one_line
+from pc2grid.display import probability
+from pc2grid.errors import one_line
 from pc2grid.geometry import SE2
 from pc2grid_cli import console
-from pc2grid_cli.options import AsJson, Database, Force, Plot
-from pc2grid_cli.output_files import check_file
 from pc2grid_cli.session_documents import JoinedSession, OfDatabase, buildings, joined_document
 from pc2grid_cli.tables import show, table
 from signature.bend import largest_m
-from signature.database import SubmapDatabase, maintenance, open_database
-from signature.localization.answer_json import TypedDict, plain
-from signature.localization.joining.building import Joined, join_sessions
+from signature.database import SubmapDatabase, maintenance
+from signature.localization.answer_json import TypedDict
+from signature.localization.joining.building import Joined
 from signature.localization.joining.join import JoinStatus
 from signature.localization.joining.pairing import SessionPair
 from signature.localization.shown.picture import draw_building
@@ -53,49 +48,6 @@ class DbJoin(OfDatabase):
     pairs: list[ComparedSessions]
     sessions: list[JoinedSession]
     alone: list[str]
-
-
-def db_join_command(
-    context: typer.Context,
-    database: Database,
-    frame: Annotated[
-        str | None,
-        typer.Option(
-            "--frame",
-            metavar="SESSION",
-            help="whose frame is the building's; default: as it was, or the oldest",
-        ),
-    ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="only say it; nothing is stored")] = False,
-    plot: Plot = None,
-    force: Force = False,
-    json: AsJson = False,
-) -> None:
-    """Find out which sessions show one building, and how they lie to each other.
-
-    Every two sessions are compared, but for those with labels of different buildings or floors: some
-    seconds a pair. What is found is stored: from then on, answers in a joined session are in the frame of its
-    building; `--frame session` gives them as before.
-
-    Example: pc2grid db join building.submaps
-    """
-    check_file("plot", plot, force)
-    with open_database(database) as opened:
-        names = [info.name for info in opened.sessions()]
-        if len(names) < 2:
-            raise ConfigError(
-                f"{opened.location}: holds {counted(len(names), 'session')}, and two can be joined",
-                hint="`pc2grid convert LOG --add` adds one, `pc2grid db merge` puts databases together",
-            )
-        found = join_sessions(opened, frame=frame, observer=console.of(context).observer())
-        if plot is not None:
-            draw(plot, opened, found)
-    if not dry_run:
-        store(database, found, names)
-    if json:
-        console.print_result(plain(DbJoin, _document(maintenance.shown(database), found, names, dry_run)))
-    else:
-        report(found, names, dry_run=dry_run)
 
 
 def store(database: str, found: Joined, names: list[str]) -> None:
@@ -157,7 +109,8 @@ def draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
     draw_building(path, name, {s: (database.grid(s), at) for s, at in known[name].items()})
 
 
-def _document(where: str, found: Joined, names: list[str], dry_run: bool) -> DbJoin:
+def document(where: str, found: Joined, names: list[str], dry_run: bool) -> DbJoin:
+    """Return the document of the pairs and of the sessions that are joined."""
     return {
         "database": where,
         "stored": not dry_run,

@@ -20,44 +20,44 @@ _NEW_OBJECTS = 100_000
 of a laser."""
 # Name, "package.module:function", and what lists of commands say of it.
 COMMANDS = {
-    "demo": ("pc2grid_cli.demo:demo_command", "Map a simulated office, and find another robot in it."),
-    "simulate": ("pc2grid_cli.simulate:simulate_command", "Drive a robot through a building and record it."),
-    "info": ("pc2grid_cli.info:info_command", "Say what is in a recording, a map or a database."),
-    "convert": ("pc2grid_cli.convert:convert_command", "Make a submap database from recordings or maps."),
-    "relocalize": ("pc2grid_cli.relocalize:relocalize_command", "Find where a recording was made."),
-    "watch": ("pc2grid_cli.watch:watch_command", "Find where a running robot is, while it drives."),
-    "export": ("pc2grid_cli.export:export_command", "Write a session's map, trajectory, picture or page."),
-    "view": ("pc2grid_cli.view:view_command", "Look into a database in the browser, and locate there."),
+    "demo": ("pc2grid_cli.commands:demo_command", "Map a simulated office, and find another robot in it."),
+    "simulate": ("pc2grid_cli.commands:simulate_command", "Drive a robot through a building and record it."),
+    "info": ("pc2grid_cli.commands:info_command", "Say what is in a recording, a map or a database."),
+    "convert": ("pc2grid_cli.commands:convert_command", "Make a submap database from recordings or maps."),
+    "relocalize": ("pc2grid_cli.commands:relocalize_command", "Find where a recording was made."),
+    "watch": ("pc2grid_cli.commands:watch_command", "Find where a running robot is, while it drives."),
+    "export": ("pc2grid_cli.commands:export_command", "Write a session's map, trajectory, picture or page."),
+    "view": ("pc2grid_cli.commands:view_command", "Look into a database in the browser, and locate there."),
 }
 DB = {
-    "info": ("pc2grid_cli.db:db_info_command", "Show the sessions of a database."),
-    "check": ("pc2grid_cli.db:db_check_command", "Read everything and list all damage."),
-    "merge": ("pc2grid_cli.db:db_merge_command", "Put the sessions of several databases into one."),
+    "info": ("pc2grid_cli.commands:db_info_command", "Show the sessions of a database."),
+    "check": ("pc2grid_cli.commands:db_check_command", "Read everything and list all damage."),
+    "merge": ("pc2grid_cli.commands:db_merge_command", "Put the sessions of several databases into one."),
     "join": (
-        "pc2grid_cli.join:db_join_command",
+        "pc2grid_cli.commands:db_join_command",
         "Find out how sessions of a building lie to each other.",
     ),
-    "copy": ("pc2grid_cli.db:db_copy_command", "Write a compact copy of a database."),
-    "split": ("pc2grid_cli.db:db_split_command", "Copy sessions into a database of their own."),
-    "rename": ("pc2grid_cli.db:db_rename_command", "Give a session another name."),
-    "remove": ("pc2grid_cli.db:db_remove_command", "Remove sessions from a database."),
+    "copy": ("pc2grid_cli.commands:db_copy_command", "Write a compact copy of a database."),
+    "split": ("pc2grid_cli.commands:db_split_command", "Copy sessions into a database of their own."),
+    "rename": ("pc2grid_cli.commands:db_rename_command", "Give a session another name."),
+    "remove": ("pc2grid_cli.commands:db_remove_command", "Remove sessions from a database."),
 }
 CONFIG = {
-    "dump": ("pc2grid_cli.config:config_dump_command", "Print every setting as TOML."),
-    "schema": ("pc2grid_cli.config:config_schema_command", "Print the JSON Schema of a document."),
+    "dump": ("pc2grid_cli.commands:config_dump_command", "Print every setting as TOML."),
+    "schema": ("pc2grid_cli.commands:config_schema_command", "Print the JSON Schema of a document."),
 }
 # Commands of the laboratory. No module of the product imports it: it is loaded by name when it is asked for.
 COMPARE = {
     "recordings": (
-        "pc2grid_lab.compare.recordings:compare_recordings_command",
+        "pc2grid_lab.commands:compare_recordings_command",
         "Real recordings as maps, located in each other; and what changed.",
     ),
-    "sensors": ("pc2grid_lab.compare.sensors:compare_sensors_command", "Each sensor in the maps of each."),
+    "sensors": ("pc2grid_lab.commands:compare_sensors_command", "Each sensor in the maps of each."),
     "peers": (
-        "pc2grid_lab.compare.peers:compare_peers_command",
+        "pc2grid_lab.commands:compare_peers_command",
         "Other programs, the same maps and queries.",
     ),
-    "paper": ("pc2grid_lab.paper.command:compare_paper_command", "The paper's tables and figures 9 and 10."),
+    "paper": ("pc2grid_lab.commands:compare_paper_command", "The paper's tables and figures 9 and 10."),
 }
 
 app = typer.Typer(

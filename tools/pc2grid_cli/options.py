@@ -19,6 +19,9 @@ Assignments = Annotated[
 
 
 PresetName = Literal["default", "paper"]
+TrajectoryFormat = Literal["tum", "kitti"]
+Publish = Literal["none", "initialpose", "tf"]
+"""What the robot is told."""
 Frame = Annotated[
     Literal["building", "session"],
     typer.Option(

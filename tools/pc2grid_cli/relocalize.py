@@ -7,10 +7,9 @@ import math
 from collections.abc import Collection, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
-import typer
 
 from pc2grid import extras
 from pc2grid.display import probability
@@ -20,18 +19,15 @@ from pc2grid.io.trajectory import write_trajectory
 from pc2grid.mapping.drawn_map import is_drawn_map
 from pc2grid.mapping.precision import PRECISION
 from pc2grid.sensor_model import SENSOR_MODELS
-from pc2grid.time_span import TimeSpan
 from pc2grid_cli import console, data_loss
 from pc2grid_cli import options as options
-from pc2grid_cli.check_pose import check_log, report_check
 from pc2grid_cli.foxglove import write_answer, write_located_map
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import in_map, searched
+from pc2grid_cli.locate import in_map
 from pc2grid_cli.nav2_pose import write_initialpose
-from pc2grid_cli.output_files import check_file, files_of
-from pc2grid_cli.windows import Window, find_all, show, windows_of, write_csv, write_places
+from pc2grid_cli.output_files import check_file
+from pc2grid_cli.windows import Window, show, write_csv, write_places
 from signature.database.maintenance import is_database
-from signature.files import find
 from signature.localization.answer_json import QueryRecording, Result, Sessions
 from signature.localization.in_building import answer_in_building
 from signature.localization.shown.picture import draw_answer, draw_answers
@@ -68,118 +64,9 @@ _OF_ONE = {"initialpose", "output", "report"}
 """The options that take one query."""
 _OF_ANSWER = {"trajectory", "initialpose", "output"}
 """The options whose files only an answer can fill."""
-_Logs = Annotated[
-    list[Path],
-    typer.Argument(metavar="LOG|MAP...", help="recordings or maps to locate: .yaml, .pcd, .ply, a mesh"),
-]
-_NearPose = Annotated[
-    str | None,
-    typer.Option(
-        "--near-pose",
-        metavar="FILE|TOPIC",
-        help="the robot is where this pose with covariance says: /initialpose in the log, or in a file",
-    ),
-]
-_Check = Annotated[
-    tuple[float, float, float] | None,
-    typer.Option("--check", metavar="X Y YAW_DEG", help="is this pose at the last scan right?"),
-]
-_Every = Annotated[
-    float | None,
-    typer.Option(
-        "--every", metavar="S", min=0.1, help="locate a window every S seconds, as long as --duration, else S"
-    ),
-]
-_InitialPose = Annotated[
-    Path | None,
-    typer.Option("--initialpose", metavar="OUT.json", help="the pose as nav2 takes it"),
-]
-_Csv = Annotated[
-    Path | None, typer.Option("--csv", metavar="OUT.csv", help="a line for each query, with its pose")
-]
-_Trajectory = Annotated[
-    Path | None,
-    typer.Option(
-        "--trajectory",
-        metavar="OUT.tum",
-        help="poses of the base, for evo; of several queries, where each was located",
-    ),
-]
-_Output = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", metavar="OUT.mcap", help="map, pose, path for Foxglove, rerun"),
-]
 
 
-def relocalize_command(
-    context: typer.Context,
-    logs: _Logs,
-    database: options.SearchedDatabase,
-    building: options.Building = None,
-    floor: options.Floor = None,
-    near: options.Near = None,
-    near_pose: _NearPose = None,
-    check: _Check = None,
-    check_topic: options.CheckTopic = None,
-    session: options.KnownSession = None,
-    topic: options.Topic = None,
-    odometry: options.OdometryTopic = None,
-    imu: options.ImuTopic = None,
-    start: options.Start = 0.0,
-    duration: options.Duration = None,
-    every: _Every = None,
-    trajectory: _Trajectory = None,
-    csv: _Csv = None,
-    initialpose: _InitialPose = None,
-    output: _Output = None,
-    plot: options.Plot = None,
-    report: options.Report = None,
-    frame: options.Frame = "building",
-    config: options.ConfigFile = None,
-    set_: options.Assignments = None,
-    force: options.Force = False,
-    recover: options.Recover = False,
-    strict: options.Strict = False,
-    assume_identity: options.AssumeIdentity = False,
-    json: options.AsJson = False,
-) -> None:
-    """Find where a recording was made. Exit code 4: there is no confident single answer.
-
-    Of several recordings, and with --every, each query has a line: of a table, of --csv, or with --json a
-    document.
-
-    With --near or --near-pose, places elsewhere are no answers. With --check or --check-topic, no place is
-    found, but a pose is judged: fine, lost, or unsure; exit code 4 unless it is fine.
-
-    Example: pc2grid relocalize tuesday.mcap --database building.submaps
-    """
-    wanted = files_of(
-        trajectory=trajectory, csv=csv, initialpose=initialpose, output=output, plot=plot, report=report
-    )
-    known = KnownPose(near=near, near_pose=near_pose, check=check, check_topic=check_topic, session=session)
-    several = every is not None or len(logs) > 1
-    _check_options(logs, database, wanted, force, known, several=several)
-    settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
-    )
-    windows = windows_of(logs, every, TimeSpan(start, duration), settings, recover=recover)
-    with searched(database, building, floor) as (opened, left_out):
-        frames = opened.frames() if frame == "building" else {}
-        told = _Told(opened, frames, left_out, strict=strict, as_json=json)
-        given: Any = {"recover": recover, "observer": console.of(context).observer()}
-        if known.is_check:
-            judged = check_log(logs[0], opened, settings, known, span=windows[0].span, **given)
-            code = report_check(*judged, as_json=json)
-        elif several:
-            found_in_turn = find_all(windows, opened, settings, known, **given)
-            code = _tell_all(found_in_turn, told, wanted, console.of(context))
-        else:
-            found = find(logs[0], opened, settings, span=windows[0].span, prior=known.prior, **given)
-            code = _tell_one(windows[0], found, told, wanted, force, settings, console.of(context))
-    raise typer.Exit(code)
-
-
-def _check_options(
+def check_options(
     logs: Sequence[Path],
     database: str,
     outputs: Mapping[str, Path],
@@ -215,7 +102,7 @@ def _refuse(options: Collection[str], reason: str, hint: str) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class Told:
     """What of the options and of the database decides how answers are told.
 
     frames : of the buildings that poses are in, by session. left_out : damage of the database.
@@ -251,10 +138,10 @@ class _Told:
         return console.LOSSY if any(losses) or self.left_out or failed else console.OK
 
 
-def _tell_one(
+def tell_one(
     window: Window,
     found: Found,
-    told: _Told,
+    told: Told,
     outputs: Mapping[str, Path],
     force: bool,
     settings: Config,
@@ -289,9 +176,9 @@ def _fillable(outputs: Mapping[str, Path], *, located: bool) -> Mapping[str, Pat
     return {option: path for option, path in outputs.items() if option not in missed}
 
 
-def _tell_all(
+def tell_all(
     found_in_turn: Generator[tuple[Window, Found | None]],
-    told: _Told,
+    told: Told,
     outputs: Mapping[str, Path],
     terminal: console.Console,
 ) -> int:

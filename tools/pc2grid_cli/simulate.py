@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 from pydantic import ValidationError
@@ -14,50 +14,24 @@ from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.simulate import Building, SimulatedSession, SimulationConfig, load_building, simulate_session
 from pc2grid.simulate.config import OdometryConfig
 from pc2grid_cli import console
-from pc2grid_cli.options import AsJson, Force
 from signature.localization.answer_json import plain
 
 
-def simulate_command(
-    context: typer.Context,
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="[BUILDING] OUT.mcap",
-            help="MAP.yaml, or a real building as .pcd, .ply, .obj or .stl (default: an office);"
-            " and what to write",
-        ),
-    ],
-    sensor: Annotated[SensorKind, typer.Option(help="what the robot carries")],
-    length: Annotated[float, typer.Option(min=0.1, metavar="M", help="metres to drive")] = 40.0,
-    seed: Annotated[int, typer.Option(min=0, help="route, clutter, noise and odometry")] = 0,
-    clutter: Annotated[int, typer.Option(min=0, help="movable objects in the way")] = 30,
-    start: Annotated[
-        tuple[float, float] | None,
-        typer.Option(metavar="X Y", help="where to start in the map; default: anywhere"),
-    ] = None,
-    building_seed: Annotated[int, typer.Option(min=0, help="which office, when no building is given")] = 0,
-    no_odometry: Annotated[bool, typer.Option("--no-odometry", help="leave odometry out of the log")] = False,
-    force: Force = False,
-    json: AsJson = False,
+def run(
+    files: list[Path],
+    sensor: SensorKind,
+    terminal: console.Console,
+    *,
+    force: bool,
+    json: bool,
+    clutter: int,
+    odometry: bool,
+    **drive: Any,
 ) -> None:
-    """Drive a robot through a building and record it: OUT.mcap, and OUT.tum with the true poses.
-
-    A cloud or a mesh of a real building is driven through as it is: its floor is found and levelled, and
-    rays hit its surfaces.
-
-    Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
-    """
+    """Simulate, and print what was written. drive : the further fields of `SimulationConfig`."""
     grid = _building(files, force)
-    config = _config(
-        length_m=length,
-        seed=seed,
-        clutter=clutter,
-        start_m=start,
-        building_seed=building_seed,
-        odometry=OdometryConfig(enabled=not no_odometry),
-    )
-    with console.of(context).progress(f"simulate {sensor}") as update:
+    config = _config(clutter=clutter, odometry=OdometryConfig(enabled=odometry), **drive)
+    with terminal.progress(f"simulate {sensor}") as update:
         made = simulate_session(
             files[-1], sensor=sensor, grid=grid, config=config, progress=update, overwrite=force
         )

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from pc2grid import extras
-from pc2grid.errors import ConfigError, OutputError, Pc2GridError
+from pc2grid.errors import ConfigError, Pc2GridError
 from pc2grid.io.live.targets import open_live
 from pc2grid.observer import Observer
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.followed import run
 from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import searched
 from pc2grid_cli.view_events import Events, Progress
 from pc2grid_cli.view_server import Cancelled, Options, ViewServer
 from signature.files import find, query_config
@@ -37,67 +32,11 @@ if TYPE_CHECKING:
     from signature.database import SubmapDatabase
     from signature.localization.localizer import Estimate
 
-_MOST_GB = 4.0
 _SHARES_EVERY_S = 0.2
 _META = '<meta http-equiv="Content-Security-Policy"'
 
 
-def view_command(
-    context: typer.Context,
-    database: options.Database,
-    source: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[ws://ROBOT:8765|RECORDING]",
-            help="a robot to be followed on the page, or a recording that is replayed there; see watch",
-        ),
-    ] = None,
-    port: Annotated[int, typer.Option("--port", min=0, max=65535, help="0: any that is free")] = 0,
-    no_browser: Annotated[bool, typer.Option("--no-browser", help="only print the address")] = False,
-    most_gb: Annotated[float, typer.Option("--most-gb", min=0.0, help="largest recording, GB")] = _MOST_GB,
-    building: options.Building = None,
-    floor: options.Floor = None,
-    topic: options.Topic = None,
-    odometry: options.OdometryTopic = None,
-    imu: options.ImuTopic = None,
-    config: options.ConfigFile = None,
-    set_: options.Assignments = None,
-    assume_identity: options.AssumeIdentity = False,
-) -> None:
-    """Look into a database in the browser, and drop recordings there to see them located, or see a running
-    robot drive. Ctrl-C ends it.
-
-    The address is printed. Only this machine is served, and nothing leaves it.
-
-    Example: pc2grid view building.submaps
-    """
-    extras.require(extras.of_addresses(source, database))
-    settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
-    )
-    terminal = console.of(context)
-    with (
-        searched(database, building, floor) as (opened, _),
-        tempfile.TemporaryDirectory(prefix="pc2grid-view-") as folder,
-    ):
-        locator = Locator(opened, settings)
-        try:
-            server = ViewServer(
-                port, locator.events, Path(folder), locator.work, most_bytes=round(most_gb * 1e9)
-            )
-        except OSError as error:
-            raise OutputError(
-                f"port {port}: {error.strerror}", hint="--port 0 takes any port that is free"
-            ) from error
-        locator.pages = server.pages
-        server.pages[""] = live_page(opened)
-        try:
-            _serve(server, locator, source, terminal, browser=not no_browser)
-        finally:
-            server.stop()
-
-
-def _serve(
+def serve(
     server: ViewServer, locator: Locator, source: str | None, terminal: console.Console, *, browser: bool
 ) -> None:
     """Serve the pages until the program is stopped."""

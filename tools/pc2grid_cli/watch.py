@@ -8,11 +8,8 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, cast
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
-import typer
-
-from pc2grid import extras
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, one_line
 from pc2grid.geometry import SE2
@@ -23,10 +20,7 @@ from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import as_text as check_as_text
 from pc2grid_cli.check_pose import live_document
-from pc2grid_cli.followed import Followed, Live, followed, live, run
-from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import searched
-from signature.files import query_config
+from pc2grid_cli.followed import Followed, Live, live, run
 from signature.localization.answer_json import (
     Labelled,
     PoseInSpace,
@@ -86,101 +80,7 @@ class Watch(Live):
 EstimateT = TypeVar("EstimateT")
 
 
-Publish = Literal["none", "initialpose", "tf"]
-"""What the robot is told."""
-_Source = Annotated[
-    str,
-    typer.Argument(
-        metavar="ws://ROBOT:8765|RECORDING",
-        help="a robot with foxglove_bridge, or a finished recording, of which every scan is used",
-    ),
-]
-_First = Annotated[bool, typer.Option("--first", help="stop when it is located for the first time")]
-_Publish = Annotated[
-    Publish,
-    typer.Option(
-        "--publish",
-        help="tell the robot: /initialpose when it is located, first and again; or the transform map -> odom",
-    ),
-]
-_PublishMap = Annotated[bool, typer.Option("--publish-map", help="also /map, the map in which it is located")]
-_MapFrame = Annotated[
-    str, typer.Option("--map-frame", metavar="FRAME", help="the frame of what is published")
-]
-_RealTime = Annotated[
-    bool,
-    typer.Option(
-        "--real-time", help="replay the recording at its own pace; scans may be dropped, as of a robot"
-    ),
-]
-_Timeout = Annotated[
-    float | None, typer.Option("--timeout", min=0.0, metavar="S", help="stop after so many seconds")
-]
-_AsJson = Annotated[bool, typer.Option("--json", help="a JSON document on each line, one a search")]
-
-
-def watch_command(
-    context: typer.Context,
-    source: _Source,
-    database: options.SearchedDatabase,
-    building: options.Building = None,
-    floor: options.Floor = None,
-    near: options.Near = None,
-    check_topic: options.CheckTopic = None,
-    session: options.KnownSession = None,
-    first: _First = False,
-    publish: _Publish = "none",
-    publish_map: _PublishMap = False,
-    map_frame: _MapFrame = "map",
-    frame: options.Frame = "building",
-    real_time: _RealTime = False,
-    timeout: _Timeout = None,
-    topic: options.Topic = None,
-    odometry: options.OdometryTopic = None,
-    imu: options.ImuTopic = None,
-    config: options.ConfigFile = None,
-    set_: options.Assignments = None,
-    assume_identity: options.AssumeIdentity = False,
-    json: _AsJson = False,
-) -> None:
-    """Find where a running robot is, while it drives, or was while it was recorded: each metre, until it is
-    stopped or to the end of the recording. Exit code 4: at last it was not located.
-
-    With --check-topic, say after each metre whether it is where it believes to be. Exit code 4: at last it
-    was not.
-
-    Example: pc2grid watch ws://robot:8765 --database building.submaps --publish initialpose
-    """
-    extras.require(extras.of_addresses(source, database))
-    settings = options.make_config(
-        config, set_, topic=topic, odometry=odometry, imu=imu, assume_identity=assume_identity
-    )
-    known = KnownPose(near=near, check_topic=check_topic, session=session)
-    prior = known.at_start()
-    if first and (publish == "tf" or check_topic is not None):
-        goes_on = "--publish tf" if publish == "tf" else "--check-topic"
-        raise ConfigError(f"--first: {goes_on} goes on until it is stopped", hint="leave --first out")
-    if publish != "none" or publish_map:
-        _check_publishes(source, check_topic)
-    terminal = console.of(context)
-    end_s = math.inf if timeout is None else time.monotonic() + timeout
-    with (
-        searched(database, building, floor) as (opened, _),
-        followed(source, settings.read, real_time=real_time) as drive,
-    ):
-        following = _Following(drive, opened, query_config(opened, settings), end_s, terminal)
-        if check_topic is not None:
-            good = _check(following, check_topic, session, as_json=json)
-        else:
-            frames = opened.frames() if frame == "building" else {}
-            with _robot(drive, opened, publish, publish_map, map_frame, frames) as robot:
-                good = _search(following, robot, prior, first=first, as_json=json)
-        _summarize(drive, terminal)
-    if not good:
-        raise typer.Exit(console.UNSURE)
-
-
-def _check_publishes(source: str, check_topic: str | None) -> None:
+def check_publishes(source: str, check_topic: str | None) -> None:
     """Raises ConfigError if nothing can be published."""
     if check_topic is not None:
         raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
@@ -189,7 +89,7 @@ def _check_publishes(source: str, check_topic: str | None) -> None:
 
 
 @dataclass(frozen=True)
-class _Following:
+class Following:
     """A robot, or a recording of one, that is followed until `end_s` of `time.monotonic`, or to its end.
 
     config : see `query_config`.
@@ -219,7 +119,7 @@ class _Following:
         run(drive, follower, self.config, poll, observer=self.terminal.observer())
 
 
-def _search(following: _Following, robot: _Robot, prior: Prior | None, *, first: bool, as_json: bool) -> bool:
+def search(following: Following, robot: _Robot, prior: Prior | None, *, first: bool, as_json: bool) -> bool:
     """Follow the robot; whether it is located at last.
 
     prior : where the robot is at the beginning, as far as it is known. first : stop when it is located.
@@ -243,7 +143,7 @@ def _search(following: _Following, robot: _Robot, prior: Prior | None, *, first:
     return located
 
 
-def _check(following: _Following, topic: str, session: str | None, *, as_json: bool) -> bool:
+def check(following: Following, topic: str, session: str | None, *, as_json: bool) -> bool:
     """Follow the robot, and judge the pose that it believes in; whether the last one was fine."""
     drive, config = following.drive, following.config
     drive.listen_to_pose(topic)
@@ -277,7 +177,7 @@ class _Robot:
     drive: Followed
     database: SubmapDatabase
     sessions: dict[str, SessionInfo]
-    publish: Publish
+    publish: options.Publish
     publish_map: bool
     frames: Mapping[str, BuildingFrame]
     publisher: Nav2Publisher | None = None
@@ -341,10 +241,10 @@ class _Robot:
 
 
 @contextlib.contextmanager
-def _robot(
+def robot_of(
     drive: Followed,
     database: SubmapDatabase,
-    publish: Publish,
+    publish: options.Publish,
     publish_map: bool,
     map_frame: str,
     frames: Mapping[str, BuildingFrame],
@@ -381,7 +281,7 @@ def _tell_news(drive: Followed) -> None:
         console.warn(sentence)
 
 
-def _summarize(drive: Followed, terminal: console.Console) -> None:
+def summarize(drive: Followed, terminal: console.Console) -> None:
     """What was left out, at the end."""
     _tell_news(drive)
     report, counts = drive.report(), drive.counts

@@ -72,6 +72,14 @@ def is_submap_database(head: bytes) -> bool:
     return head.startswith(_SQLITE) and head[68:72] == SUBMAPS_ID
 
 
+def is_submap_file(path: Path) -> bool:
+    """Return whether this is the file of a submap database; not if it cannot be read."""
+    try:
+        return is_submap_database(first_bytes(path))
+    except OSError:
+        return False
+
+
 def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> MessageSource:
     if not head:
         raise LogTruncated(f"{path}: empty file", hint="was the recording interrupted?")

@@ -220,7 +220,7 @@ def test_command_line(tmp_path: Path) -> None:
     from typer.testing import CliRunner
 
     from pc2grid.io.nav2_map import save_map
-    from pc2grid_cli.simulate import simulate_command
+    from pc2grid_cli.commands import simulate_command
 
     yaml, _ = save_map(small_house(), tmp_path / "house")
     app = typer.Typer()

@@ -18,10 +18,10 @@ from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.io.nav2_map import save_map
 from pc2grid.submaps.partition import partition
 from pc2grid_cli import console
+from pc2grid_lab.commands import compare_paper_command
 from pc2grid_lab.paper import experiment
 from pc2grid_lab.paper.cells import cells_of, paper_tasks, read_map, that_share_submaps
 from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES
-from pc2grid_lab.paper.command import compare_paper_command
 from pc2grid_lab.paper.experiment import BestMatches, Experiment, MatchMeasures, draw_queries, evaluate
 from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods
 from pc2grid_lab.paper.noise import NOISE_LEVELS

@@ -74,7 +74,6 @@ SERVER.set_forkserver_preload(
         "signature.database.maintenance",
         "pydantic",
         "kiss_icp.kiss_icp",
-        "sklearn.cluster",
         "rich.progress",
     ]
 )

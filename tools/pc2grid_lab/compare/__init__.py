@@ -1,1 +1,1 @@
-"""`pc2grid compare`: one file for each command and, beside it, what draws its report."""
+"""`pc2grid compare`: one file for the work of each command and, beside it, what draws its report."""

@@ -6,16 +6,13 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from pc2grid.errors import ConfigError, LogNotFound
 from pc2grid.io.building_file import is_building_file
-from pc2grid_cli.console import json_text, of, warn
+from pc2grid_cli.console import Console, json_text, warn
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.tables import show, table
-from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.experiments.program import BACK, FRONT, LABORATORY, digest_of_sources
 from pc2grid_lab.experiments.stored import write_text
@@ -29,35 +26,18 @@ from signature.sessions import digest_of
 TITLES = {kind.name: kind.title for kind in PEERS}
 
 
-def compare_peers_command(
-    context: typer.Context,
-    recordings: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="LOG|SCAN.ply...",
-            help="recordings of a laser or lidar, true poses beside them (NAME.tum or NAME_corrected.tum);"
-            " and 3D scans, in which a lidar is simulated",
-        ),
-    ],
-    out: options.OutputFolder = Path("peers"),
-    queries: Annotated[int, typer.Option("--queries", min=1, help="queries of each building")] = 24,
-    travel: Annotated[float, typer.Option("--travel", min=0.0, help="metres that each drives")] = 10.0,
-    mapped: Annotated[
-        list[str] | None,
-        typer.Option("--mapped", metavar="NAME=S", help="seconds of a recording that become the map [55 %]"),
-    ] = None,
-    of_base: Annotated[
-        bool, typer.Option("--of-base", help="the true poses are of the base, not of the sensor")
-    ] = False,
+def run(
+    recordings: Sequence[Path],
+    out: Path,
+    terminal: Console,
+    *,
+    queries: int,
+    travel: float,
+    mapped: Sequence[str],
+    of_base: bool,
 ) -> None:
-    """Other programs and pc2grid locate later parts of real recordings in maps of earlier parts.
-
-    MRPT's particle filter gets recordings of a laser; KISS-Matcher, MapClosures and Open3D's FPFH + RANSAC
-    those of a lidar. Each query is also located in another building, where every answer is wrong.
-
-    Example: pc2grid compare peers intel.mcap fr079.mcap hall.mcap --mapped intel=900 --mapped fr079=600
-    """
-    seconds, terminal = _seconds(mapped or [], recordings), of(context)
+    """Ask every program that is installed, and write the table and its picture."""
+    seconds = _seconds(mapped, recordings)
     not_installed = {kind.name: command for kind in PEERS if (command := missing(kind)) is not None}
     for name, command in not_installed.items():
         warn(f"{name} is not installed: {command}")

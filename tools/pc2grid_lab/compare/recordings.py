@@ -7,13 +7,9 @@ import json
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from pc2grid.errors import ConfigError
 from pc2grid_cli import console
-from pc2grid_cli.options import OUTPUT_FOLDER
 from pc2grid_cli.output_files import make_folder
 from pc2grid_lab.experiments.program import commit, digest_of_product
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, Recording
@@ -28,49 +24,19 @@ from pc2grid_lab.experiments.stored import write_text
 from signature.config import ShortlistBy
 
 
-def compare_recordings_command(
-    context: typer.Context,
-    data: Annotated[
-        Path, typer.Argument(metavar="DATA", help="the folder of real recordings, or one of your own")
-    ],
-    out: Annotated[
-        Path, typer.Option(*OUTPUT_FOLDER, metavar="FOLDER", help="for maps and answers; run again to go on")
-    ] = Path("real-recordings"),
-    table: Annotated[
-        Path | None,
-        typer.Option(
-            "--table",
-            metavar="FILE.json",
-            help="what is compared with, and replaced by a whole run, with the page beside it; default: "
-            "real.json in the folder",
-        ),
-    ] = None,
-    only: Annotated[
-        str | None,
-        typer.Option(
-            "--only", metavar="PATTERN", help="of recordings, buildings, sensors or kinds, such as 'wean*'"
-        ),
-    ] = None,
-    of_base: Annotated[
-        bool,
-        typer.Option(
-            "--of-base", help="poses in NAME.tum beside NAME.mcap are of the base, not of the sensor"
-        ),
-    ] = False,
-    quick: Annotated[bool, typer.Option("--quick", help="a small part of all, always the same")] = False,
-    shortlist: Annotated[
-        ShortlistBy,
-        typer.Option("--shortlist", help="what selects places; a control is not written to the table"),
-    ] = "signatures",
-    jobs: Annotated[int, typer.Option("--jobs", min=1, help="processes at a time")] = 2,
+def run(
+    data: Path,
+    out: Path,
+    table: Path | None,
+    terminal: console.Console,
+    *,
+    only: str | None,
+    of_base: bool,
+    quick: bool,
+    shortlist: ShortlistBy,
+    jobs: int,
 ) -> None:
-    """Map every real recording, locate parts of it in other maps, and tell what changed since the last time.
-
-    Of recordings that the catalogue does not name, later parts are located in the map of the beginning. They
-    are judged by NAME.tum or NAME.relations beside them; without, by whether the answers fit together.
-
-    Example: pc2grid compare recordings data --output real-recordings --quick
-    """
+    """Map and locate what is not in `out` yet, judge all, and print the table and what changed."""
     own = own_recordings(data, without=out, of_base=of_base)
     catalogue = _catalogue(data, own, only, quick)
     work = out / "work" / (digest_of_product() + state_of(data, own[0]))
@@ -81,7 +47,6 @@ def compare_recordings_command(
     followed = () if is_control else followed_in(catalogue, folder, only)
     if not (catalogue.mapped or catalogue.pairs or followed):
         raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
-    terminal = console.of(context)
     with terminal.progress("recordings") as advance, _note_kept(terminal, out):
         mapped, further = tasks(catalogue, folder, followed)
         run_all(catalogue, folder, mapped=mapped, further=further, jobs=jobs, advance=advance)

@@ -7,17 +7,13 @@ from dataclasses import asdict
 from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Annotated
-
-import typer
 
 from pc2grid.errors import ConfigError
 from pc2grid.io.nav2_map import load_map
 from pc2grid.model import SensorKind
-from pc2grid_cli.console import Console, json_text, of
+from pc2grid_cli.console import Console, json_text
 from pc2grid_cli.output_files import make_folder
 from pc2grid_cli.tables import show, table
-from pc2grid_lab.compare import options as options
 from pc2grid_lab.compare.picture import picture
 from pc2grid_lab.experiments.answers import index_of
 from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, SensorMap, query_trials
@@ -27,34 +23,25 @@ from signature.config import Config
 from signature.localization.shown.picture import BLUE, ORANGE, VERMILLION
 
 
-def compare_sensors_command(
-    context: typer.Context,
-    plans: Annotated[
-        list[Path],
-        typer.Argument(help="Floor plans: MAP.yaml files; of several, each query is also sought in another."),
-    ],
-    out: options.OutputFolder = Path("sensor-matrix"),
-    queries: Annotated[int, typer.Option("--queries", min=1, help="query sessions a plan and sensor")] = 10,
-    map_length: Annotated[float, typer.Option("--map-length", help="metres driven to make a map")] = 200.0,
-    clutter: Annotated[
-        int, typer.Option("--clutter", help="things in the way, different in each session")
-    ] = 30,
-    rate: Annotated[float, typer.Option("--rate", help="scans a second, of every sensor")] = 10.0,
-    travel: Annotated[
-        float, typer.Option("--travel", min=1.0, help="Metres that a query drives at most.")
-    ] = 15.0,
-    seed: Annotated[int, typer.Option("--seed", help="of the first query session")] = 1,
-    jobs: options.Jobs = None,
+def run(
+    plans: Sequence[Path],
+    out: Path,
+    terminal: Console,
+    *,
+    queries: int,
+    map_length: float,
+    clutter: int,
+    rate: float,
+    travel: float,
+    seed: int,
+    jobs: int | None,
 ) -> None:
-    """Map plans with lidar, laser and depth camera, locate sessions of each in each: nine cells.
-
-    Example: pc2grid compare sensors maps/fr079.yaml maps/intel.yaml --queries 40 --out matrix
-    """
+    """Map the plans, locate the sessions, and write the table and its picture."""
     _refuse(plans)
     make_folder(out)
     setting: dict[str, float] = {"map_length": map_length, "clutter": clutter, "rate": rate, "travel": travel}
     drives = PlanDrives(out=out, setting=tuple(setting.items()), until_m=travel, length_m=travel + 3.0)
-    trials = _asked(drives, plans, range(seed, seed + queries), of(context), jobs)
+    trials = _asked(drives, plans, range(seed, seed + queries), terminal, jobs)
     cells, elsewhere = matrix(trials), [t.status for t in trials if not t.in_building]
     document = {
         "plans": [plan.stem for plan in plans],

@@ -5,66 +5,34 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
-
-import typer
+from typing import Any
 
 from pc2grid.errors import ConfigError
-from pc2grid_cli.console import json_text, of
+from pc2grid_cli.console import Console, json_text
 from pc2grid_cli.output_files import make_folder
-from pc2grid_lab.compare import options as options
 from pc2grid_lab.experiments.program import BACK, FRONT, LABORATORY, digest_of_sources
 from pc2grid_lab.experiments.stored import in_processes, write_text
 from pc2grid_lab.paper.cells import cells_of, known_maps, paper_tasks, that_share_submaps
 from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES
-from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, require_packages
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES
 from pc2grid_lab.paper.report import draw_figure, print_tables
 
 
-def compare_paper_command(
-    context: typer.Context,
-    maps: Annotated[
-        Path,
-        typer.Option(
-            "--maps",
-            help="Folder with fr079.yaml, intel.yaml, ... of the paper; or a map, or a folder of maps.",
-        ),
-    ],
-    out: options.OutputFolder = Path("paper-tables"),
-    queries: Annotated[
-        int, typer.Option("--queries", min=1, help="Queries a map. 2000 take hours; 200 for a quick look.")
-    ] = 2000,
-    methods: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--methods",
-            help=f"Only these; repeatable. Extras: {', '.join(EXTRA_METHOD_NAMES)}.",
-        ),
-    ] = None,
-    offset: Annotated[
-        list[float] | None,
-        typer.Option(
-            "--offset", help="Farthest a query lies from a submap centre, m; repeatable. [1.0 and 0.5]"
-        ),
-    ] = None,
-    open_choices: Annotated[
-        bool,
-        typer.Option("--open-choices", help="Also what each open choice moves of the method to the letter."),
-    ] = False,
-    ablation: Annotated[
-        bool, typer.Option("--ablation", help="Also the method to the letter without some of its signatures.")
-    ] = False,
-    speckles: Annotated[
-        float,
-        typer.Option("--speckles", min=0.0, help="Spread of the boundary noise, m; the paper gives none."),
-    ] = 0.1,
-    jobs: options.Jobs = None,
-    seed: Annotated[int, typer.Option("--seed", help="Of the queries and their noise.")] = 1,
+def run(
+    maps: Path,
+    out: Path,
+    terminal: Console,
+    *,
+    queries: int,
+    methods: Sequence[str] | None,
+    offset: Sequence[float] | None,
+    open_choices: bool,
+    ablation: bool,
+    speckles: float,
+    jobs: int | None,
+    seed: int,
 ) -> None:
-    """Reproduce the paper's tables and figure 9, each number beside the published one.
-
-    Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
-    """
+    """Compute the cells that are not in `out` yet, and write the tables and figures."""
     chosen, offsets_m = _chosen(methods), tuple(offset or (1.0, 0.5))
     if min(offsets_m) <= 0:
         raise ConfigError("--offset: expected a distance above 0 m")
@@ -73,7 +41,7 @@ def compare_paper_command(
     choices = (ABLATION if ablation else ()) + (OPEN_CHOICES if open_choices else ())
     setting: dict[str, Any] = {"queries": queries, "seed": seed, "speckle_sigma_m": speckles}
     tasks = list(paper_tasks(found, methods=chosen, offsets_m=offsets_m, choices=choices, **setting))
-    with of(context).progress(f"{len(tasks)} cells of the tables") as advance:
+    with terminal.progress(f"{len(tasks)} cells of the tables") as advance:
         kept = _kept_in(out, found)
         groups = [(group, kept) for group in that_share_submaps(tasks)]
         cells = itertools.chain.from_iterable(in_processes(cells_of, groups, jobs=jobs, advance=advance))
@@ -94,10 +62,9 @@ def _kept_in(out: Path, maps: Sequence[Path]) -> Path:
 
 
 def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
-    """The methods that are compared. Raises ConfigError if one is not known, or cannot be run."""
+    """The methods that are compared. Raises ConfigError if one is not known."""
     chosen, known = tuple(methods or METHOD_NAMES), METHOD_NAMES + EXTRA_METHOD_NAMES
     for name in chosen:
         if name not in known:
             raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
-    require_packages(chosen)
     return chosen

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Iterable
 
-from pc2grid import extras
 from pc2grid.arrays import F64
 from pc2grid_lab.paper.learned import LEARNED, UNLEARNED, Learned, Unlearned, Vectors
 from pc2grid_lab.paper.proposed import Proposed, Signatures
@@ -42,13 +41,6 @@ EXTRA_METHOD_NAMES = (
 """Beyond the paper: the default settings; the boundary at several radii with a learned metric, with more and
 fewer parts, and nothing learned; places described from several centres, by Eq. 6, by its boundary alone, and
 by the shape context."""
-
-
-def require_packages(names: Collection[str]) -> None:
-    """Raise ConfigError if packages are missing that the methods with these names need."""
-    wanted = [name for name in names if name.startswith("surf")]
-    if wanted:
-        extras.require({"paper": ", ".join(wanted)})
 
 
 def make_methods(
