@@ -131,7 +131,7 @@ def classify(
     sums: F32,
     low: I64,
     stamp: int,
-    floor: int,
+    ground: tuple[int, int],
     band: tuple[int, int],
     borders: tuple[int, int],
     share: float,
@@ -141,14 +141,14 @@ def classify(
     """Write the state (W, W) of the columns that carry a stamp; 0: of all. And of those with an obstacle the
     heights (W, W), see `pc2grid.model.SLICES`.
 
-    floor : index of the layer of the floor. band : of the first and behind the last layer of an obstacle.
+    ground, band : of the first and behind the last layer of the floor, and of an obstacle.
     borders : of the first layer of each slice but the lowest. A wall is occupied in at least `least` layers,
     and in so large a `share` of those that were observed, and less than `over` layers above it were observed
     to be free.
     """
     size, layers = evidence.shape[0], evidence.shape[2]
     band = max(band[0], low[2]), min(band[1], low[2] + layers)
-    ground = max(floor - 1, low[2]), min(floor + 2, low[2] + layers)
+    ground = max(ground[0], low[2]), min(ground[1], low[2] + layers)
     for a in range(size):
         for b in range(size):
             if stamp == 0 or touched[a, b] == stamp:

@@ -89,11 +89,12 @@ class ColumnMap:
         self._stamp = 0
         self._floor_m = math.nan  # z of the floor that the states are for
 
-    def add(self, points_m: F64, rays_m: F64, sensor_m: F64, floor_m: float) -> None:
+    def add(self, points_m: F64, rays_m: F64, sensor_m: F64, floor_m: float, doubt_m: float = 0.0) -> None:
         """Enter a scan at its place in the session frame.
 
         points_m : (N, 3) returns. rays_m : (M, 3) of these, those whose rays clear what is before them.
-        sensor_m : (3,) origin of the rays. floor_m : z of the floor.
+        sensor_m : (3,) origin of the rays. floor_m : z of the floor. doubt_m : the floor may lie higher or
+        lower by so much: what is there is no obstacle.
         """
         p, edge_m = self._parameters, self._config.resolution_m
         self._center(sensor_m)
@@ -115,12 +116,13 @@ class ColumnMap:
         if not same_floor:
             self._floor_m = floor_m
         low, high = (round(z / p.layer_m) for z in self._band_m(self._floor_m))
+        floor, doubt = math.floor(self._floor_m / p.layer_m), round(doubt_m / p.layer_m)
         first, second = (round((self._floor_m + border_m) / p.layer_m) for border_m in SLICE_BORDERS_M)
         changed = self._stamp if same_floor else 0
         kernels.classify(
             self._evidence, self._columns[0], self._columns[1], self._touched, self._sums, self._low, changed,
-            math.floor(self._floor_m / p.layer_m), (low, high), (first, second), p.wall_share, p.wall_layers,
-            p.over,
+            (floor - 1 - doubt, floor + 2 + doubt), (low + doubt, high), (first, second), p.wall_share,
+            p.wall_layers, p.over,
         )  # fmt: skip
 
     def cut(self, T_session_base: SE2, sensor_m: F64, stamp_ns: int) -> PlanarScan:

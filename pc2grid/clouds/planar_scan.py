@@ -40,6 +40,7 @@ class PlanarScan:
     low_m : (L, 2) float32, things on the floor that are no walls (tables, chairs), about one point per grid
         cell: the sensor looks over them, so they do not end what is free. Empty where heights are not known.
     height_m : of the plane that a planar laser sees, above the base; None of sensors that see all heights.
+    above_floor_m : height of the base above the floor, where a sensor in the hand sees it; else None.
     heights : (M + L,) uint8, of the hits and then of the things, in which slices they were observed to be
         occupied and to be free (`pc2grid.model.SLICES`), 0 where that is not known; or empty.
     """
@@ -51,6 +52,7 @@ class PlanarScan:
     free_m: F32
     low_m: F32 = field(default_factory=lambda: np.empty((0, 2), np.float32))
     height_m: float | None = None
+    above_floor_m: float | None = None
     heights: U8 = field(default_factory=lambda: np.empty(0, np.uint8))
 
     @staticmethod

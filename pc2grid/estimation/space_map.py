@@ -14,7 +14,7 @@ import numpy as np
 
 from pc2grid.arrays import F32, F64, BoolGrid
 from pc2grid.clouds.column_map import ColumnMap
-from pc2grid.clouds.level import floor_height
+from pc2grid.clouds.level import FloorBelow
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.config import ProjectionConfig, RegistrationConfig
 from pc2grid.estimation.belief import Belief
@@ -46,6 +46,9 @@ class SpaceMapParameters:
 
 
 SPACE_MAP = SpaceMapParameters()
+_DOWN = np.array([(0.05 * i, 0.05 * j, -1.0) for i, j in np.ndindex(9, 9)]) - (0.2, 0.2, 0.0)
+"""Rays from a sensor to the floor, in its height above that: who carries it walks on ground 0.4 m wide.
+So it is free, unless what was measured there says more."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +70,8 @@ class ThinnedScan:
 class SpaceMap:
     """What a carried sensor has seen around it, in the session frame (z up).
 
-    floor_m : z of the floor; None as long as none was seen.
+    Its columns stand on their own floor: each scan is entered at its height above the floor that was seen
+    around it, so that the passes of a pose that rises or sinks lie over each other.
     """
 
     def __init__(
@@ -87,7 +91,8 @@ class SpaceMap:
         self._surfaces = SurfaceMap.of_first_scan(ranges_m, 2.0 * projection.max_range_m, registration)
         self._columns = ColumnMap(self._reach_m, scan.sensor, projection)
         self._added_at: F64 | None = None  # pose of the last scan that joined
-        self.floor_m: float | None = None
+        self._floor = FloorBelow()
+        self._above_floor_m: float | None = None  # the base, by the last scan
 
     def __bool__(self) -> bool:
         return self._added_at is not None and bool(self.surfaces)
@@ -115,7 +120,7 @@ class SpaceMap:
 
     def agreement(self, thinned: ThinnedScan, pose: F64) -> tuple[float, float]:
         """How a scan at a pose (4, 4) agrees with surfaces and free space, see `ColumnMap.agreement`."""
-        return self._columns.agreement(thinned.placed(pose))
+        return self._columns.agreement(self._lowered(thinned.placed(pose)))
 
     def search(self, thinned: ThinnedScan, guess: F64, window_m: float, count: int) -> list[F64]:
         """The best few poses (4, 4) in all headings, with the height and the tilt of a guess (4, 4).
@@ -126,7 +131,7 @@ class SpaceMap:
         planar = SE2.from_matrix(guess)
         T_level_base = planar.inverse().lift() @ guess
         level = thinned.placed(T_level_base)
-        heights = level[:, 2] - self._floor(guess[:3, 3])
+        heights = level[:, 2] - self._floor_m(guess[:3, 3])
         band = level[(heights > self._projection.band_min_m) & (heights < self._projection.band_max_m), :2]
         if not len(band):
             return []
@@ -140,28 +145,49 @@ class SpaceMap:
     def extend(self, scan: Scan, points_m: F32, thinned: ThinnedScan, pose: F64) -> None:
         """Add a scan at its final pose (4, 4), if the sensor has moved enough since the last one."""
         p = self._parameters
+        self._above_floor_m, travel_m = None, 0.0
         if self._added_at is not None:
-            moved_m, turned_rad = motion_size(invert_pose(self._added_at) @ pose)
-            if moved_m < p.step_m and turned_rad < p.step_rad:
+            travel_m, turned_rad = motion_size(invert_pose(self._added_at) @ pose)
+            if travel_m < p.step_m and turned_rad < p.step_rad:
                 return
         self._added_at = pose
         self._surfaces.add(thinned.points_m, pose)
-        sensor_m = (pose @ scan.T_base_sensor)[:3, 3]
-        found = floor_height(self._surfaces.fine.shapes, self._surfaces.fine.edge_m, sensor_m)
-        self.floor_m = self.floor_m if found is None else found
-        near = points_m[self._near(scan, points_m)].astype(np.float64)
+        sensor_m, placed = (pose @ scan.T_base_sensor)[:3, 3], thinned.placed(pose)
+        near_m = points_m[self._near(scan, points_m)].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        fine = self._surfaces.fine
+        seen_m = self._floor.follow(
+            travel_m, self._surfaces.alone(near_m), fine.shapes, fine.edge_m, sensor_m
+        )
+        if seen_m is not None:
+            self._above_floor_m = float(pose[2, 3]) - seen_m
+        rays_m = placed
+        if travel_m >= p.step_m:  # who turns on the spot may hold the sensor over a table
+            rays_m = np.concatenate(
+                (placed, sensor_m + _DOWN * (1.0, 1.0, sensor_m[2] - self._floor_m(sensor_m)))
+            )
         self._columns.add(
-            near @ pose[:3, :3].T + pose[:3, 3], thinned.placed(pose), sensor_m, self._floor(sensor_m)
+            self._lowered(near_m),
+            self._lowered(rays_m),
+            self._lowered(sensor_m),
+            self._floor_m(sensor_m) - self._floor.risen_m,
+            2.0 * self._floor.sigma_m,
         )
 
     def cut(self, scan: Scan, pose: F64) -> PlanarScan:
         """The planar scan of a scan at its pose (4, 4), in the levelled base frame."""
         planar = self._columns.cut(SE2.from_matrix(pose), (pose @ scan.T_base_sensor)[:3, 3], scan.stamp_ns)
         # Without a floor, heights above it are not known.
-        return planar if self.floor_m is not None else replace(planar, heights=planar.heights[:0])
+        heights = planar.heights[:0] if self._floor.z_m is None else planar.heights
+        return replace(planar, heights=heights, above_floor_m=self._above_floor_m)
 
-    def _floor(self, sensor_m: F64) -> float:
-        return float(sensor_m[2]) - self._parameters.assumed_m if self.floor_m is None else self.floor_m
+    def _floor_m(self, sensor_m: F64) -> float:
+        """z of the floor below a sensor at (3,)."""
+        assumed_m = float(sensor_m[2]) - self._parameters.assumed_m
+        return assumed_m if self._floor.z_m is None else self._floor.z_m
+
+    def _lowered(self, points_m: F64) -> F64:
+        """Points (..., 3), session frame, by as much lower as the poses have risen."""
+        return points_m - (0.0, 0.0, self._floor.risen_m)
 
     def _near(self, scan: Scan, points_m: F32) -> BoolGrid:
         """The points (N, 3) that are near enough to be exact."""

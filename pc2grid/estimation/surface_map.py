@@ -225,6 +225,13 @@ class SurfaceMap:
         chosen = kernels.first_per_voxel(points_m, self._parameters.thinning * self.fine.edge_m)
         return points_m[chosen].astype(np.float64)
 
+    def alone(self, points_m: F64) -> F64:
+        """The shapes (V, 9) of the surfaces that points (N, 3) show by themselves."""
+        p = self._parameters
+        view = VoxelShapes(self.fine.edge_m, p.least, p.most, p.noise_m)
+        view.add(points_m)
+        return view.shapes
+
     def add(self, points_m: F64, pose: F64) -> None:
         """Add thinned points (N, 3) at their pose (4, 4); what has become far is forgotten now and then."""
         here = pose[:3, 3]

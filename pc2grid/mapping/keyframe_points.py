@@ -48,10 +48,20 @@ class KeyframePoints:
         self._clouds.append(steps[within].astype("<i2").tobytes())
         self._scans.append(index)
 
+    def __getitem__(self, number: int) -> tuple[int, F32]:
+        """The number of a scan in the session, and its points (N, 3) in the base frame."""
+        steps = np.frombuffer(self._clouds[number], "<i2").reshape(-1, 3)
+        return self._scans[number], steps * np.float32(self._step_m)
+
     def __iter__(self) -> Iterator[tuple[int, F32]]:
-        for number, index in enumerate(self._scans):
-            steps = np.frombuffer(self._clouds[number], "<i2").reshape(-1, 3)
-            yield index, steps * np.float32(self._step_m)
+        return (self[number] for number in range(len(self._scans)))
+
+    def around(self, number: int, most: int, T_session_base: F64) -> F64:
+        """The points (M, 3) of a keyframe and some on either side, at the poses (N, 4, 4) of their scans."""
+        near = range(max(number - most, 0), min(number + most + 1, len(self._scans)))
+        return np.concatenate(
+            [transform_points(T_session_base[k], m) for k, m in map(self.__getitem__, near)]
+        )
 
     def registered(self, T_session_base: F64, chosen: BoolGrid | None = None) -> PointMap | None:
         """The points at the poses (N, 4, 4) of their scans, one a voxel; None if there are none.

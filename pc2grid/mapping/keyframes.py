@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import pickle
 from array import array
 from collections.abc import Iterable, Iterator
@@ -36,12 +37,12 @@ class Keyframes:
     """The keyframes of a session, a sequence that only grows; their planar scans are in a `Spool`.
 
     scans : (K,) number of the scan of each. restarts : those whose pose relative to the one before is not
-    known.
+    known. above_floor_m : (K,) as of a `PlanarScan`, NaN for None.
     """
 
     def __init__(self) -> None:
         self._planar_scans = Spool("scans")
-        self.scans = array("q")
+        self.scans, self.above_floor_m = array("q"), array("d")
         self.restarts: set[int] = set()
         self._poses = array("d")  # x, y, yaw of one after the other
 
@@ -61,6 +62,8 @@ class Keyframes:
         if keyframe.restart:
             self.restarts.add(len(self))
         self.scans.append(keyframe.index)
+        above_m = keyframe.planar_scan.above_floor_m
+        self.above_floor_m.append(math.nan if above_m is None else above_m)
         pose = keyframe.T_session_base
         self._poses.extend((pose.x, pose.y, pose.yaw))
 

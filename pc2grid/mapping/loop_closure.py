@@ -125,7 +125,7 @@ class LoopCloser:
     def _close(self, loops: list[Edge]) -> None:
         """Add loops to the pose graph, and solve it again."""
         if loops:
-            self._drift_m = 0.0
+            self._drift_m *= 1.0 - max(loop.counts for loop in loops)
             self._graph.edges += loops
             self._graph.solve()
 
@@ -145,11 +145,11 @@ class LoopCloser:
 
         window : half widths of the search around the guess, metres and radians.
         """
-        match = self._local_maps[older].overlap(self._local_maps[newer], guess, *window)
-        if match is None:
+        overlap = self._local_maps[older].overlap(self._local_maps[newer], guess, *window)
+        if overlap is None:
             return []
-        information = self._parameters.information_share * match.information
-        return [Edge(older, newer, match.pose, information, loop=True)]
+        information = self._parameters.information_share * overlap.information
+        return [Edge(older, newer, overlap.pose, information, loop=True, counts=overlap.counts)]
 
     # --- place recognition --------------------------------------------------------------------------------
 

@@ -8,10 +8,19 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from pc2grid.arrays import F64, I64
+from pc2grid.clouds.level import LEVEL
 from pc2grid.config import ProjectionConfig
 from pc2grid.estimation.overruled import check_odometry
 from pc2grid.geometry import SE2
 from pc2grid.mapping.consistency import consistency_warning, measure_consistency
+from pc2grid.mapping.floor_levels import (
+    FLOOR_LEVELS,
+    HeightStep,
+    floor_warning,
+    floors_apart_m,
+    rise_between,
+    settled_heights,
+)
 from pc2grid.mapping.keyframe_points import KeyframePoints
 from pc2grid.mapping.keyframes import Keyframes, grid_of
 from pc2grid.mapping.parts import PARTS
@@ -37,6 +46,7 @@ def draw_parts(
     The maps have no name, no sensor and no submaps yet.
     """
     part, T_part_base = _settled(track.trajectory, closed)
+    floors_m = _level(T_part_base, part, closed, np.array(keyframes.above_floor_m), points)
     everywhere = dataclasses.replace(track.trajectory, T_session_base=T_part_base)
     drawn = []
     for number in range(int(part.max(initial=0)) + 1):
@@ -55,6 +65,7 @@ def draw_parts(
         warnings = (
             consistency_warning(consistency, trajectory, with_odometry=odometry.compared > 0),
             precision_warning(precision, trajectory),
+            floor_warning(floors_m[number]),
         )
         drawn.append(
             SessionMap(
@@ -148,6 +159,52 @@ def _moved_in_plane(T_session_base: F64, tracked: F64, settled: F64) -> F64:
     moved[:, :3, :3] = rotation @ T_session_base[:, :3, :3]
     moved[:, :2, 3] = settled[:, :2]
     return moved
+
+
+def _level(
+    T_part_base: F64, part: I64, closed: SettledKeyframes, above_floor_m: F64, points: KeyframePoints | None
+) -> list[float | None]:
+    """Give the poses (N, 4, 4) of all scans their height above one level floor, in place.
+
+    above_floor_m : (K,) of the keyframes, as seen. Returns how far the floors of each part lie apart. Where
+    no keyframe sees a floor, as on wheels, heights stay as they are.
+    """
+    apart_m: list[float | None] = []
+    for number in range(int(part.max(initial=0)) + 1):
+        own = np.flatnonzero(closed.parts == number)
+        scans, seen_m = closed.scans[own], above_floor_m[own]
+        if not np.isfinite(seen_m).any():
+            apart_m.append(None)
+            continue
+        tracked_m, way = T_part_base[scans, 2, 3], closed.poses[own, :2]
+        travel_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(way, axis=0).T)))
+        restarts = np.flatnonzero(np.diff(closed.segments[own])) + 1
+        loops = [] if points is None else _height_loops(T_part_base, closed, own, points)
+        heights_m = settled_heights(tracked_m, travel_m, seen_m, restarts, loops)
+        apart_m.append(floors_apart_m(heights_m, seen_m))
+        raised_m = heights_m - tracked_m
+        of_part = np.flatnonzero(part == number)
+        T_part_base[of_part, 2, 3] += np.interp(of_part, scans, raised_m - raised_m[0])
+    return apart_m
+
+
+def _height_loops(
+    T_part_base: F64, closed: SettledKeyframes, own: I64, points: KeyframePoints
+) -> list[HeightStep]:
+    """The loops between some keyframes (K,), as far as the points of both tell how high these lie."""
+    number, found = {int(closed.scans[k]): i for i, k in enumerate(own)}, []
+    for loop in closed.loops:
+        if not loop.accepted or loop.older not in number or loop.newer not in number:
+            continue
+        first, second = number[loop.older], number[loop.newer]
+        older_m, newer_m = (
+            points.around(int(own[k]), FLOOR_LEVELS.around, T_part_base) for k in (first, second)
+        )
+        rise_m = rise_between(older_m, newer_m)
+        if rise_m is not None:
+            apart_m = float(T_part_base[loop.newer, 2, 3] - T_part_base[loop.older, 2, 3])
+            found.append(HeightStep(first, second, apart_m + rise_m, LEVEL.seen_m))
+    return found
 
 
 def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:

@@ -51,7 +51,8 @@ POSE_GRAPH = PoseGraphParameters()
 class Edge:
     """A measured relative pose T_first_second with its information (3, 3) in the first pose's axes.
 
-    loop : whether the measurement may be wrong altogether; its weight is then robust.
+    loop : whether the measurement may be wrong altogether; its weight is then robust. counts : how much of
+    its information it has kept, 0..1, as one at the edge of being a loop.
     """
 
     first: int
@@ -59,6 +60,7 @@ class Edge:
     T_first_second: SE2
     information: F64
     loop: bool = False
+    counts: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)

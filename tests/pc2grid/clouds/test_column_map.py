@@ -74,6 +74,19 @@ def test_a_step_is_low_and_no_wall() -> None:
     assert (np.abs(found.low_m[:, 0] - 3.1) < 0.2).any()
 
 
+@pytest.mark.parametrize(("doubt_m", "is_floor"), [(0.0, False), (0.3, True)])
+def test_what_lies_within_the_doubt_of_the_floor_is_floor(doubt_m: float, is_floor: bool) -> None:
+    """The floor was expected 0.35 m lower: it is an obstacle, unless that is how far it is known."""
+    columns = ColumnMap(6.0, "depth", CONFIG)
+    scene = Scene(box((0.0, 0.0, 0.0), (5.0, 4.0, 2.5)))
+    for points in looks(scene, (25.0, 45.0), (-30.0, 0.0, 30.0)):
+        columns.add(points, points, EYE, -0.35, doubt_m)
+    found = columns.cut(SE2(), EYE, 0)
+    inside = (np.abs(found.low_m - (2.5, 2.0)) < (2.3, 1.8)).all(axis=1)
+    assert inside.any() != is_floor
+    assert found.free_m[0] > 1.0
+
+
 def test_what_has_gone_is_forgotten() -> None:
     """A cupboard stands 2 m ahead; it is carried away, and the wall behind it is seen a few times."""
     with_cupboard = Scene(

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pc2grid.arrays import F64
-from pc2grid.clouds.level import floor_height
+from pc2grid.clouds.level import LEVEL, FloorBelow, floor_height
 from pc2grid.config import RegistrationConfig
 from pc2grid.estimation.surface_map import SurfaceMap
 
@@ -63,3 +63,32 @@ def test_a_floor_that_is_seen_in_rows_is_a_floor() -> None:
     posts = upright[np.abs(upright[:, 1] % EDGE_M - 0.5 * EDGE_M) < 0.01]
     assert floor_height(shapes_of(rows, wall(2.0)), EDGE_M, SENSOR) == pytest.approx(0.0, abs=0.02)
     assert floor_height(shapes_of(posts), EDGE_M, SENSOR) is None
+
+
+def followed(*views: tuple[F64, ...]) -> tuple[FloorBelow, list[float | None]]:
+    """The floor after views of some surfaces each, a metre of travel between them, and what each showed."""
+    surfaces, floor, seen = SurfaceMap(EDGE_M, 20.0, RegistrationConfig()), FloorBelow(), []
+    for view in views:
+        surfaces.add(np.concatenate(view), np.eye(4))
+        seen.append(floor.follow(1.0, shapes_of(*view), surfaces.fine.shapes, EDGE_M, SENSOR))
+    return floor, seen
+
+
+def test_a_floor_that_rises_is_followed_and_in_between_it_is_in_doubt() -> None:
+    """By 2 cm a metre, over the floor of the views before; at last nothing but a table and a wall is seen."""
+    rising = [(slab((-1.0, -1.0), (1.0, 1.0), 0.02 * k, k), wall(2.0, k)) for k in range(12)]
+    floor, seen = followed(*rising)
+    assert floor.z_m == pytest.approx(0.22, abs=0.03)
+    assert floor.risen_m == pytest.approx(0.22, abs=0.03)
+    assert seen == pytest.approx([0.02 * k for k in range(12)], abs=0.01)
+    assert floor.sigma_m < LEVEL.seen_m
+    doubtful, unseen = followed(rising[0], *[(TABLE, wall(2.0, k)) for k in range(9)])
+    assert unseen[1:] == [None] * 9 and doubtful.z_m == pytest.approx(0.0, abs=0.02)
+    assert doubtful.sigma_m == pytest.approx(0.06, abs=0.01)  # 9 m of travel
+
+
+def test_what_was_a_table_is_no_floor_when_the_floor_is_seen() -> None:
+    floor, seen = followed((TABLE,), (TABLE, FLOOR), (FLOOR,))
+    assert seen == pytest.approx([0.72, 0.0, 0.0], abs=0.02)
+    assert floor.z_m == pytest.approx(0.0, abs=0.02)
+    assert floor.risen_m == pytest.approx(0.0, abs=0.02)  # it is the floor that was wrong, not the poses

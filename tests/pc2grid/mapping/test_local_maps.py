@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
+import pytest
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
@@ -44,3 +46,30 @@ def test_smaller_cells_place_uneven_walls_more_exactly() -> None:
     coarse_m, fine_m = rms_error_m(LOCAL_MAPS), rms_error_m(CAMERA_LOCAL_MAPS)
     assert fine_m < 0.01
     assert fine_m < 0.75 * coarse_m
+
+
+def test_an_overlap_at_the_edge_counts_by_degrees() -> None:
+    """At a step, the last bit of a number would decide whether a loop is closed. A laser keeps its step."""
+    shares = np.linspace(0.0, 1.0, 2001)
+    by_degrees, at_a_step = (
+        np.array([parameters.counts(observed, 1.0) for observed in shares.tolist()])
+        for parameters in (CAMERA_LOCAL_MAPS, LOCAL_MAPS)
+    )
+    assert np.abs(np.diff(by_degrees)).max() < 0.01
+    assert np.interp((0.2, 0.35, 0.5), shares, by_degrees).tolist() == pytest.approx([0.0, 0.5, 1.0])
+    assert np.unique(at_a_step).tolist() == [0.0, 1.0]
+    assert CAMERA_LOCAL_MAPS.counts(1.0, 0.8) == pytest.approx(0.5)
+
+
+def test_what_an_overlap_counts_is_in_its_information() -> None:
+    """A local map compared with itself is observed and agrees throughout."""
+    scan = uneven_walls(0)
+    found = []
+    for observed in (0.35, 1.0):
+        parameters = dataclasses.replace(CAMERA_LOCAL_MAPS, min_observed=observed)
+        local_map = LocalMap([Keyframe(0, scan, SE2())], [SE2()], parameters)
+        found.append(local_map.overlap(local_map, SE2(0.05, 0.0, 0.0), 0.1, 0.05))
+    full, half = found
+    assert full is not None and half is not None
+    assert (full.counts, half.counts) == pytest.approx((1.0, 0.5))
+    assert half.information == pytest.approx(0.5 * full.information)

@@ -10,10 +10,9 @@ import pytest
 
 from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
-from pc2grid.estimation.point_to_line import Match
 from pc2grid.geometry import SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.mapping.local_maps import LocalMap
+from pc2grid.mapping.local_maps import LocalMap, Overlap
 from pc2grid.mapping.loop_candidates import CandidateParameters
 from pc2grid.mapping.loop_closure import LoopCloser
 from pc2grid.mapping.loop_parameters import LoopParameters
@@ -169,7 +168,7 @@ def test_work_and_loops_grow_with_the_way_and_not_with_its_square(monkeypatch: p
     compared: list[int] = []
     overlap = LocalMap.overlap
 
-    def counted(*arguments: Any) -> Match | None:
+    def counted(*arguments: Any) -> Overlap | None:
         compared.append(1)
         return overlap(*arguments)
 
