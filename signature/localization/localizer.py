@@ -48,6 +48,11 @@ class Estimate:
     elapsed_s: float
 
     @property
+    def is_told(self) -> bool:
+        """Whether the place is sure enough to tell a robot that it is there."""
+        return self.state in ("located", "recovered")
+
+    @property
     def T_map_odom(self) -> SE2 | None:
         """The frame of the robot's own odometry in the map; None without an answer or without odometry."""
         T_map_base, T_odom_base = self.answer.T_map_base, self.registered.scan.T_odom_base
@@ -197,7 +202,9 @@ class Localizer:
         seen, index = query.map(), index or self.index
         self._clock.lap("describe")
         part, _, carried = self._last
-        found = index.look_up(seen, (*(carried if part == seen.part else ()), *known))
+        off_map = self._belief.off_map(index, seen) if prior_of is None else ()
+        beside = tuple(away.hypothesis for away in off_map)
+        found = index.look_up(seen, (*(carried if part == seen.part else ()), *beside, *known))
         self._clock.lap("look_up")
         return answer_query(
             index,
@@ -205,6 +212,7 @@ class Localizer:
             seen,
             found,
             prior_of=prior_of or partial(self._belief.prior, seen),
+            off_map=off_map,
             session_index=self._belief.session_index,
             history=tuple(self._history),
             clock=self._clock,
