@@ -45,8 +45,8 @@ from signature.localization.query import QueryMap
 
 State = Literal["searching", "located", "off_map", "doubtful", "lost", "recovered"]
 """searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`; and the
-robot was located there before, or the search before found it there no more surely, or the mass is at least
-`PosteriorParameters.certain`. off_map: most likely it is where the map shows too little of what it sees.
+robot was located there before, or the searches in a row that found it there leave no more doubt, multiplied,
+than `PosteriorParameters.certain`. off_map: most likely it is where the map shows too little of what it sees.
 doubtful: none of these, nor has all else together than where it was at least the mass `accept`. lost: this has,
 or the robot was carried away. recovered: located elsewhere, or again after it was lost."""
 
@@ -155,7 +155,7 @@ class Belief:
         self._accept = accept
         self._searches: list[Masses] = []
         self._place: tuple[int, tuple[Hypothesis, ...]] | None = None  # part and place of the last "located"
-        self._found: Masses | None = None  # of the last search, if it located the robot
+        self._found: tuple[Masses, float] | None = None  # the last search, if it located the robot; doubt
         self._was_located = False
 
     @property
@@ -211,11 +211,19 @@ class Belief:
         here = 0.0
         if self._place is not None and self._place[0] == now.part:
             here = now.mass(self._place[1])
-        before, self._found = self._found, now if located else None
-        agrees = before is not None and before.part == now.part and now.mass(before.first) >= before.masses[0]
+        doubt, before = 1.0, self._found
+        if located:
+            doubt -= now.masses[0]
+            if (
+                before is not None
+                and before[0].part == now.part
+                and now.mass(before[0].first) >= self._accept
+            ):
+                doubt *= before[1]
+        self._found = (now, doubt) if located else None
         if located:
             goes_on = here >= POSTERIOR.likely
-            if goes_on or agrees or now.masses[0] >= POSTERIOR.certain:
+            if goes_on or doubt <= 1.0 - POSTERIOR.certain:
                 state: State = "located" if goes_on or not self._was_located else "recovered"
                 self._was_located, self._place = True, (now.part, now.first)
                 return state

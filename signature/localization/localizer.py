@@ -203,8 +203,7 @@ class Localizer:
         self._clock.lap("describe")
         part, _, carried = self._last
         off_map = self._belief.off_map(index, seen) if prior_of is None else ()
-        beside = tuple(away.hypothesis for away in off_map)
-        found = index.look_up(seen, (*(carried if part == seen.part else ()), *beside, *known))
+        found = index.look_up(seen, (*(carried if part == seen.part else ()), *known))
         self._clock.lap("look_up")
         return answer_query(
             index,

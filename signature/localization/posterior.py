@@ -63,7 +63,7 @@ class PosteriorParameters:
     alike : places whose scores differ by less fit equally well: twice the spread of the score between two
         equal places (simulated twin rooms, which differ by the paths that they were seen from).
     likely : least mass of what is more likely than not.
-    certain : mass above which a single search tells a robot where it is; by hand.
+    certain : a robot is told where it is if the searches in a row that found it there are that sure; by hand.
     shown : a map that knows the ground of less than this share of the walls that are seen says nothing of a
         place; half, as where the recordings are judged.
     forgotten : least mass, beside that of "nowhere", of a place that is carried on; by hand.

@@ -57,7 +57,7 @@ def estimates_of(localizer: Localizer, steps: list[Step]) -> list[tuple[Estimate
 def check_poses(estimates: list[tuple[Estimate, SE2]]) -> None:
     for estimate, truth in estimates:
         pose = estimate.answer.T_map_base
-        assert (pose is not None) == (estimate.state in ("located", "recovered"))
+        assert pose is not None or not estimate.is_told
         assert pose is None or math.dist((pose.x, pose.y), (truth.x, truth.y)) < 0.15
 
 
@@ -92,7 +92,7 @@ def test_a_robot_that_is_seen_being_carried_away_is_lost_and_then_recovered() ->
     estimates = estimates_of(Localizer(OFFICE), [*steps, *stretch(SECOND, end)])
     states = [estimate.state for estimate, _ in estimates]
     at = states.index("lost")
-    assert set(states[:at]) == {"located"}
+    assert set(states[:at]) <= {"searching", "located"}
     assert states[at + 1 : at + 3] == ["recovered", "located"]
     assert set(states[at + 3 :]) == {"located"}
     check_poses(estimates)
@@ -124,13 +124,13 @@ def test_a_place_is_given_up_when_it_is_as_certain_that_the_robot_is_not_there()
     belief = Belief(accept=0.75)
     states = [
         belief.follow(replace(found, masses=(mass, *found.masses[1:])), located=sure)
-        for mass, sure in ((0.9, True), (0.5, False), (0.3, False), (0.8, True), (0.2, False), (0.5, False))
+        for mass, sure in ((0.995, True), (0.5, False), (0.3, False), (0.8, True), (0.2, False), (0.5, False))
     ]
     assert states == ["located", "doubtful", "doubtful", "located", "lost", "lost"]
 
 
 def test_a_place_is_told_when_a_second_search_agrees() -> None:
-    """Looks of .9 .8 .7 speak against the place more and more, and one alone may be chance."""
+    """One alone may be chance; what two leave of doubt is at most .01."""
     localizer = Localizer(OFFICE)
     estimates_of(localizer, list(stretch(FIRST)))
     here = Masses.of(localizer.query.map(), localizer.answer())
@@ -140,7 +140,7 @@ def test_a_place_is_told_when_a_second_search_agrees() -> None:
     ]
     there = replace(here, hypotheses=tuple(moved))
     for looks, expected in (
-        ([(here, 0.9), (here, 0.8), (here, 0.76), (here, 0.8)], ["searching"] * 3 + ["located"]),
+        ([(here, 0.9), (here, 0.85), (here, 0.8)], ["searching", "searching", "located"]),
         ([(here, 0.9), (there, 0.95), (there, 0.95)], ["searching", "searching", "located"]),
         ([(here, 0.995), (there, 0.8), (here, 0.8)], ["located", "doubtful", "located"]),
         ([(here, 0.995), (there, 0.8), (there, 0.9)], ["located", "doubtful", "recovered"]),
@@ -200,7 +200,7 @@ def test_after_a_restart_a_located_robot_is_recovered() -> None:
     assert estimates_of(localizer, list(stretch(FIRST)))[-1][0].state == "located"
     localizer.restart()
     estimates = estimates_of(localizer, list(stretch(FIRST, SE2(40.0, 2.0, 1.0))))
-    states = [estimate.state for estimate, _ in estimates if estimate.answer.status == "located"]
+    states = [estimate.state for estimate, _ in estimates if estimate.is_told]
     assert states[0] == "recovered" and set(states[1:]) == {"located"}
     check_poses(estimates)
 
