@@ -47,8 +47,8 @@ State = Literal["searching", "located", "off_map", "doubtful", "lost", "recovere
 """searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`; and the
 robot was located there before, or the searches in a row that found it there leave no more doubt, multiplied,
 than `PosteriorParameters.certain`. off_map: most likely it is where the map shows too little of what it sees.
-doubtful: none of these, nor has all else together than where it was at least the mass `accept`. lost: this has,
-or the robot was carried away. recovered: located elsewhere, or again after it was lost."""
+doubtful: none of these, nor has all else together than where it was at least the mass `accept`. lost: this
+has, or the robot was carried away. recovered: located elsewhere, or again after it was lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,6 +103,13 @@ class Masses:
             )
         ]
         return sum(self.masses[number] for number in found) + sum(beside)
+
+    def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
+        """Prior of a place, relative to that of "nowhere", for a query of later scans. What was beside the
+        map stays there until the map shows enough of the place."""
+        shown = place[0].fit.overlap >= POSTERIOR.shown
+        before = self if shown else replace(self, off_map=())
+        return 1.0 + self.odds(query, before.mass(place))
 
     def odds(self, query: QueryMap, mass: float) -> float:
         """A mass of this moment, relative to that of "nowhere", before a query of later scans."""
@@ -176,7 +183,7 @@ class Belief:
     def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
         """Prior of a place, relative to that of "nowhere", by the searches before the scans of a query."""
         before = self._before(query)
-        return 1.0 + before[-1].odds(query, before[-1].mass(place)) if before else 1.0
+        return before[-1].prior(query, place) if before else 1.0
 
     def off_map(self, index: MapIndex, query: QueryMap) -> tuple[OffMap, ...]:
         """Where the robot may be beside the map: the places of before of which it shows too little.
