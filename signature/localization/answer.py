@@ -24,7 +24,7 @@ from signature.localization.ambiguous_line import AmbiguousLine, ambiguous_line
 from signature.localization.answer_json import AnswerDocument, document
 from signature.localization.answer_json import Status as Status
 from signature.localization.hypotheses import Hypothesis
-from signature.localization.posterior import Evidence
+from signature.localization.posterior import POSTERIOR, Evidence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -66,6 +66,23 @@ class PoseInSpace:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OffMap:
+    """A place to which odometry has carried the robot from one that the map shows; of what is seen there the
+    map shows too little to tell.
+
+    hypothesis : its `fit.covariance` is that of the base now, grown since. mass : probability of it.
+    seen_m, T_odom_seen, seen : metres driven, the base, and its covariance (3, 3) where the map showed the
+    place last.
+    """
+
+    hypothesis: Hypothesis
+    mass: float
+    seen_m: float
+    T_odom_seen: SE2
+    seen: F64
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
     """The decision over all hypotheses.
 
@@ -73,6 +90,8 @@ class Verdict:
     hypotheses : all that fit, by the mass of their places. places : parallel to them, which of them are the
     same place, seen in the maps of different sessions; numbered from 0, best first.
     masses : of each place, by its number. evidence : what tells for the first place.
+    off_map : further places, which the map does not show, the likeliest first; their masses are parts of the
+    same probability.
     """
 
     status: Status
@@ -81,6 +100,7 @@ class Verdict:
     places: tuple[int, ...]
     masses: tuple[float, ...]
     evidence: Evidence
+    off_map: tuple[OffMap, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -138,6 +158,7 @@ class Answer:
     are in the map frames of their sessions (`signature.localization.in_building`).
     in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
     none. Of a place that was turned down because they contradict it, the pose there.
+    off_map : places beside the map, the likeliest first, see `Verdict`.
     asked : the question; None unless `pc2grid.relocalize` has answered.
 
     >>> import pc2grid
@@ -174,6 +195,7 @@ class Answer:
     views_m: tuple[tuple[float, float], ...] = ()
     map: OccupancyGrid | None = None
     frames: tuple[str | None, ...] = ()
+    off_map: tuple[OffMap, ...] = ()
     asked: Asked | None = None
 
     def __repr__(self) -> str:
@@ -262,6 +284,11 @@ class Answer:
     def slipped(self) -> float:
         """Probability that the query lay at the best place until it was carried away or tracking slipped."""
         return self.masses[0] * self.evidence.slipped() if self.masses else 0.0
+
+    @property
+    def beside_map(self) -> OffMap | None:
+        """Where the robot is, beside the map, if that is more likely than all else together."""
+        return next((away for away in self.off_map if away.mass >= POSTERIOR.likely), None)
 
     @property
     def line(self) -> AmbiguousLine | None:

@@ -146,12 +146,24 @@ class AmbiguousLine(TypedDict):
     probability: float
 
 
+class OffMap(Pose):
+    """The base at a place that the map does not show, by its odometry since the map showed where it was, in
+    the map frame of `session` or, if `frame` is not null, in that of its building. covariance (3, 3) of
+    x, y, yaw: how far odometry may have gone wrong since. probability: that it is there."""
+
+    session: str
+    frame: str | None
+    covariance: list[list[float]]
+    probability: float
+
+
 class Result(Labelled):
     """What is found. frame: of the building, in which the poses are if the session was joined with others;
     null: the map frame of the session. T_map_odom puts the query's own frame into it. confidence: the
     probability that the best hypothesis is right. hypotheses: best first. prior: null if nothing was known
     beforehand. in_space: null if the map or the query has no points. line: null unless the answer is
-    ambiguous, and most of the probability lies on one."""
+    ambiguous, and most of the probability lies on one. off_map: null, unless the robot has most likely left
+    what the map shows."""
 
     status: Status
     session: str | None
@@ -162,6 +174,7 @@ class Result(Labelled):
     hypotheses: list[Hypothesis]
     history: list[Moment]
     line: AmbiguousLine | None
+    off_map: OffMap | None
     prior: PriorUse | None
     in_space: PoseInSpace | None
     timing_ms: dict[str, float]
@@ -214,6 +227,7 @@ def document(answer: answer.Answer) -> AnswerDocument:
         ],
         "history": [_moment(moment) for moment in answer.history],
         "line": _line(answer),
+        "off_map": off_map_document(answer),
         "prior": None if answer.prior is None else {"status": answer.prior, "excluded": excluded},
         "in_space": in_space_document(answer),
         "query": {"path_m": answer.path_m, "stamp_ns": answer.stamp_ns},
@@ -236,6 +250,21 @@ def _line(answer: answer.Answer) -> AmbiguousLine | None:
         "yaw": line.yaw_rad,
         "length_m": line.length_m,
         "probability": line.probability,
+    }
+
+
+def off_map_document(answer: answer.Answer) -> OffMap | None:
+    """Where the base is beside the map; None if it is not most likely there."""
+    away = answer.beside_map
+    if away is None:
+        return None
+    h = away.hypothesis
+    return {
+        "session": answer.sessions[h.session_index],
+        "frame": answer.frame_of(h),
+        **_pose(h.fit.T_map_query @ answer.T_odom_base),
+        "covariance": h.fit.covariance.tolist(),
+        "probability": away.mass,
     }
 
 

@@ -8,15 +8,16 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.threads import one_blas_thread
-from signature.localization.answer import Answer, Moment, Verdict
+from signature.localization.answer import Answer, Moment, OffMap, Verdict
 from signature.localization.belief import Masses
-from signature.localization.decision import PriorOf, decide, judge, with_slip
+from signature.localization.decision import PriorOf, beside_map, decide, judge, with_slip
 from signature.localization.hypotheses import Hypothesis, moved_to_origin
 from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
@@ -44,6 +45,7 @@ def answer_query(
     known: tuple[Hypothesis, ...],
     *,
     prior_of: PriorOf,
+    off_map: Sequence[OffMap],
     session_index: int | None,
     history: tuple[Moment, ...],
     clock: Clock,
@@ -51,11 +53,13 @@ def answer_query(
     """Where a query is.
 
     seen : `query` drawn. known : hypotheses that are compared, too. prior_of : what was known before it, of
-    each place. session_index : of the map that is preferred among several that show the place.
+    each place. off_map : where it may be beside the map, see `signature.localization.belief.Belief.off_map`.
+    session_index : of the map that is preferred among several that show the place.
     """
     verdict, found = decide(index, seen, known, prior_of)
     clock.lap("search")
     prior, excluded = _with_prior(index, seen, verdict, found)
+    verdict = beside_map(verdict, prior_of, off_map, index.config.accept)
     verdict = _in_map(_with_slip(index, query, verdict), session_index)
     clock.lap("decide")
     in_space = None
@@ -166,6 +170,7 @@ def _answer(index: MapIndex, query: QueryMap, verdict: Verdict, history: tuple[M
         hypotheses=verdict.hypotheses,
         places=verdict.places,
         masses=verdict.masses,
+        off_map=verdict.off_map,
         history=(*history, moment_of(index, query, verdict)),
         T_odom_base=query.T_odom_base,
         path_m=query.path_m,

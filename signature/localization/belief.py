@@ -13,26 +13,42 @@ share of the mass joins "anywhere", of which each place has the mass of "nowhere
 So the past makes a place at most 1 / k times as likely, and a place that the robot was never believed to be
 at has the prior 1.
 
+Off the map: where a map shows too little of what is seen (`PosteriorParameters.shown`), it tells nothing of
+a place, neither for it nor against it. So a place of search s stays as likely beside "nowhere" as it was, at
+the pose to which odometry carries it, whose covariance grows:
+
+    mass_t(h)   =  (prior_t(h) - 1) / N,        which N contains, too
+
+When the robot comes back, the place that the map shows there has this mass before it.
+
 Fox, Burgard and Thrun 1999, "Markov localization for mobile robots in dynamic environments"; Thrun, Burgard
 and Fox, "Probabilistic Robotics", chapter 8.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
+from pc2grid.arrays import F64
 from pc2grid.geometry import SE2
-from signature.localization.answer import Answer, Verdict
+from pc2grid.matching.two_way_score import score_fit
+from signature.localization.answer import Answer, OffMap, Verdict
 from signature.localization.hypotheses import Hypothesis, same_pose
+from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR
+from signature.localization.prior import PRIOR, Prior
 from signature.localization.query import QueryMap
 
-State = Literal["searching", "located", "doubtful", "lost", "recovered"]
-"""searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`. doubtful:
-none has, nor has all else together than where the robot was. lost: this has, or the robot was carried away.
-recovered: located elsewhere, or again after it was lost."""
+State = Literal["searching", "located", "off_map", "doubtful", "lost", "recovered"]
+"""searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`; and the
+robot was located there before, or the searches in a row that found it there leave no more doubt, multiplied,
+than `PosteriorParameters.certain`. off_map: most likely it is where the map shows too little of what it sees.
+doubtful: none of these, nor has all else together than where it was at least the mass `accept`. lost: this
+has, or the robot was carried away. recovered: located elsewhere, or again after it was lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +56,7 @@ class Masses:
     """The masses of places at one moment.
 
     part : of the query, see `QueryMap.part`. place : of each hypothesis, number of its mass.
+    off_map : places that the map does not show.
     """
 
     part: int
@@ -48,6 +65,7 @@ class Masses:
     hypotheses: tuple[Hypothesis, ...] = ()
     places: tuple[int, ...] = ()
     masses: tuple[float, ...] = ()
+    off_map: tuple[OffMap, ...] = ()
 
     @staticmethod
     def of(query: QueryMap, found: Verdict | Answer) -> Masses:
@@ -59,7 +77,13 @@ class Masses:
             hypotheses=found.hypotheses,
             places=found.places,
             masses=found.masses,
+            off_map=found.off_map,
         )
+
+    @property
+    def first(self) -> tuple[Hypothesis, ...]:
+        """The first place."""
+        return self.hypotheses[: self.places.count(0)]
 
     def mass(self, place: Sequence[Hypothesis]) -> float:
         """Mass of the places that put the robot, at this moment, where one of these hypotheses does."""
@@ -70,12 +94,59 @@ class Masses:
             for session, base in at
             if h.session_index == session and same_pose(h.fit.T_map_query @ self.T_odom_base, base)
         }
-        return sum(self.masses[number] for number in found)
+        beside = [
+            away.mass
+            for away in self.off_map
+            if any(
+                away.hypothesis.session_index == session and region_of(away, self.T_odom_base).allows(base)
+                for session, base in at
+            )
+        ]
+        return sum(self.masses[number] for number in found) + sum(beside)
 
     def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
-        """Prior of a place, relative to that of "nowhere", for a query of later scans."""
+        """Prior of a place, relative to that of "nowhere", for a query of later scans. What was beside the
+        map stays there until the map shows enough of the place."""
+        shown = place[0].fit.overlap >= POSTERIOR.shown
+        before = self if shown else replace(self, off_map=())
+        return 1.0 + self.odds(query, before.mass(place))
+
+    def odds(self, query: QueryMap, mass: float) -> float:
+        """A mass of this moment, relative to that of "nowhere", before a query of later scans."""
         share = kept(query)
-        return 1.0 + share * self.mass(place) / (1.0 - share * sum(self.masses))
+        total = sum(self.masses) + sum(away.mass for away in self.off_map)
+        return share * mass / (1.0 - share * total)
+
+    def carried(self, query: QueryMap) -> Iterator[OffMap]:
+        """The places of this moment, where odometry has carried them; `mass`: `odds`."""
+        for number, mass in enumerate(self.masses):
+            h = self.hypotheses[self.places.index(number)]
+            yield OffMap(
+                hypothesis=h,
+                mass=self.odds(query, mass),
+                seen_m=self.path_m,
+                T_odom_seen=self.T_odom_base,
+                seen=h.fit.covariance,
+            )
+        for away in self.off_map:
+            yield replace(away, mass=self.odds(query, away.mass))
+
+
+def region_of(away: OffMap, T_odom_base: SE2) -> Prior:
+    """Where the robot may be if it is beside the map."""
+    fit = away.hypothesis.fit
+    return Prior.of_pose(fit.T_map_query @ T_odom_base, fit.covariance)
+
+
+def grown(away: OffMap, query: QueryMap) -> F64:
+    """The covariance (3, 3) of the base now, by the odometry since the map showed the place."""
+    T_map_query = away.hypothesis.fit.T_map_query
+    begin, now = T_map_query @ away.T_odom_seen, T_map_query @ query.T_odom_base
+    J = np.eye(3)
+    J[:2, 2] = begin.y - now.y, now.x - begin.x
+    way_m = (query.path_m - away.seen_m) / PRIOR.sigmas
+    drift = np.array([PRIOR.drift, PRIOR.drift, PRIOR.drift_rad_m]) * way_m
+    return np.asarray(J @ away.seen @ J.T + np.diag(drift**2))
 
 
 def kept(query: QueryMap) -> float:
@@ -91,6 +162,7 @@ class Belief:
         self._accept = accept
         self._searches: list[Masses] = []
         self._place: tuple[int, tuple[Hypothesis, ...]] | None = None  # part and place of the last "located"
+        self._found: tuple[Masses, float] | None = None  # the last search, if it located the robot; doubt
         self._was_located = False
 
     @property
@@ -106,12 +178,27 @@ class Belief:
     def restart(self) -> None:
         """The scans do not go on from those before. It is remembered that the robot was located once."""
         self._searches.clear()
-        self._place = None
+        self._place = self._found = None
 
     def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
         """Prior of a place, relative to that of "nowhere", by the searches before the scans of a query."""
         before = self._before(query)
         return before[-1].prior(query, place) if before else 1.0
+
+    def off_map(self, index: MapIndex, query: QueryMap) -> tuple[OffMap, ...]:
+        """Where the robot may be beside the map: the places of before of which it shows too little.
+
+        mass : relative to that of "nowhere".
+        """
+        before = self._before(query)
+        found: list[OffMap] = []
+        for away in before[-1].carried(query) if before else ():
+            h = away.hypothesis
+            walls = index.maps_for(query)[h.session_index].walls
+            fit = score_fit(walls, query.walls, h.fit.T_map_query, grown(away, query))
+            if away.mass >= POSTERIOR.forgotten and fit.overlap < POSTERIOR.shown:
+                found.append(replace(away, hypothesis=replace(h, fit=fit)))
+        return tuple(found)
 
     def add(self, query: QueryMap, found: Verdict | Answer) -> Masses:
         """Keep the masses of a search; those that no later query follows from are forgotten."""
@@ -131,12 +218,31 @@ class Belief:
         here = 0.0
         if self._place is not None and self._place[0] == now.part:
             here = now.mass(self._place[1])
+        doubt, before = 1.0, self._found
         if located:
-            goes_on = not self._was_located or here >= POSTERIOR.likely
-            self._was_located = True
-            self._place = now.part, now.hypotheses[: now.places.count(0)]
-            return "located" if goes_on else "recovered"
+            doubt -= now.masses[0]
+            if (
+                before is not None
+                and before[0].part == now.part
+                and now.mass(before[0].first) >= self._accept
+            ):
+                doubt *= before[1]
+        self._found = (now, doubt) if located else None
+        if located:
+            goes_on = here >= POSTERIOR.likely
+            if goes_on or doubt <= 1.0 - POSTERIOR.certain:
+                state: State = "located" if goes_on or not self._was_located else "recovered"
+                self._was_located, self._place = True, (now.part, now.first)
+                return state
+            return "doubtful" if self._place is not None else self._nowhere
+        if any(away.mass >= POSTERIOR.likely for away in now.off_map):
+            return "off_map"
         if here > 1.0 - self._accept:
             return "doubtful"
         self._place = None
+        return self._nowhere
+
+    @property
+    def _nowhere(self) -> State:
+        """The state of a robot that no place is told of."""
         return "lost" if self._was_located else "searching"

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from pc2grid.matching.two_way_score import Fit
-from signature.localization.answer import Status, Verdict
+from signature.localization.answer import OffMap, Status, Verdict
 from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
@@ -96,9 +96,35 @@ def with_slip(verdict: Verdict, since: float, accept: float) -> Verdict:
     evidence = replace(verdict.evidence, since=since)
     more = verdict.masses[0] * (evidence.slipped() - verdict.evidence.slipped())
     masses = tuple(mass / (1.0 + more) for mass in verdict.masses)
+    off_map = tuple(replace(away, mass=away.mass / (1.0 + more)) for away in verdict.off_map)
     doubtful = verdict.status == "located" and masses[0] < accept
     status: Status = "ambiguous" if doubtful else verdict.status
-    return replace(verdict, status=status, confidence=masses[0], masses=masses, evidence=evidence)
+    return replace(
+        verdict, status=status, confidence=masses[0], masses=masses, evidence=evidence, off_map=off_map
+    )
+
+
+def beside_map(verdict: Verdict, prior_of: PriorOf, off_map: Sequence[OffMap], accept: float) -> Verdict:
+    """The verdict with places that the map does not show. off_map : with masses relative to "nowhere"."""
+    if not off_map:
+        return verdict
+    odds = 1.0
+    if verdict.confidence:
+        first = tuple(h for h, n in zip(verdict.hypotheses, verdict.places, strict=True) if n == 0)
+        odds = prior_of(first) * math.exp(verdict.evidence.log_odds()) / verdict.masses[0]
+    share = 1.0 / (odds + sum(away.mass for away in off_map))
+    masses = tuple(mass * odds * share for mass in verdict.masses)
+    confidence = masses[0] if masses else 0.0
+    doubtful = verdict.status == "located" and confidence < accept
+    return replace(
+        verdict,
+        status="ambiguous" if doubtful else verdict.status,
+        confidence=confidence,
+        masses=masses,
+        off_map=tuple(
+            replace(away, mass=away.mass * share) for away in sorted(off_map, key=lambda away: -away.mass)
+        ),
+    )
 
 
 def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:

@@ -30,6 +30,15 @@ def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> A
     stated = replace(
         answer,
         hypotheses=hypotheses,
+        off_map=tuple(
+            replace(
+                away,
+                hypothesis=_hypothesis(
+                    away.hypothesis, frame_of[away.hypothesis.session_index], answer.T_odom_base
+                ),
+            )
+            for away in answer.off_map
+        ),
         history=tuple(_moment(moment, frames) for moment in answer.history),
         excluded=answer.excluded and _moment(answer.excluded, frames),
         frames=tuple(frame.name or None for frame in frame_of),

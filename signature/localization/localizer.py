@@ -48,6 +48,11 @@ class Estimate:
     elapsed_s: float
 
     @property
+    def is_told(self) -> bool:
+        """Whether the place is sure enough to tell a robot that it is there."""
+        return self.state in ("located", "recovered")
+
+    @property
     def T_map_odom(self) -> SE2 | None:
         """The frame of the robot's own odometry in the map; None without an answer or without odometry."""
         T_map_base, T_odom_base = self.answer.T_map_base, self.registered.scan.T_odom_base
@@ -197,12 +202,14 @@ class Localizer:
         seen, index = query.map(), index or self.index
         self._clock.lap("describe")
         part, _, carried = self._last
+        off_map = self._belief.off_map(index, seen) if prior_of is None else ()
         return answer_query(
             index,
             query,
             seen,
             (*(carried if part == seen.part else ()), *known),
             prior_of=prior_of or partial(self._belief.prior, seen),
+            off_map=off_map,
             session_index=self._belief.session_index,
             history=tuple(self._history),
             clock=self._clock,

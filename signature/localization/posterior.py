@@ -63,6 +63,10 @@ class PosteriorParameters:
     alike : places whose scores differ by less fit equally well: twice the spread of the score between two
         equal places (simulated twin rooms, which differ by the paths that they were seen from).
     likely : least mass of what is more likely than not.
+    certain : a robot is told where it is if the searches in a row that found it there are that sure; by hand.
+    shown : a map that knows the ground of less than this share of the walls that are seen says nothing of a
+        place; half, as where the recordings are judged.
+    forgotten : least mass, beside that of "nowhere", of a place that is carried on; by hand.
     """
 
     bias: float = -7.33
@@ -75,6 +79,9 @@ class PosteriorParameters:
     least_agreement: float = 0.01
     alike: float = 0.02
     likely: float = 0.5
+    certain: float = 0.99
+    shown: float = 0.5
+    forgotten: float = 1e-3
 
 
 POSTERIOR = PosteriorParameters()

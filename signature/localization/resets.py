@@ -26,13 +26,13 @@ class ResetPolicy:
     _last_s: float | None = None
     _count: int = 0
 
-    def allows(self, state: State, *, located: bool) -> bool:
+    def allows(self, state: State) -> bool:
         """Whether the pose of an estimate is to be sent; it then counts as sent.
 
-        state, located : of each estimate in turn, and whether it has a pose.
+        state : of each estimate in turn.
         """
         self._is_due = self._is_due or state in ("lost", "recovered")
-        if not located or not self._is_due:
+        if state not in ("located", "recovered") or not self._is_due:
             return False
         now_s = self.clock()
         if self._last_s is not None:

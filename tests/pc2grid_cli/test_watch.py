@@ -268,7 +268,8 @@ def test_resets_are_paused_and_bounded() -> None:
     policy = ResetPolicy(pause_s=10.0, most=2, calm_s=60.0, clock=lambda: now_s)
     allowed = {}
     for now_s in (0.0, 5.0, 11.0, 22.0, 40.0, 80.0, 85.0):
-        assert not policy.allows("lost", located=False)  # from now on the next pose is news
-        allowed[now_s] = policy.allows("located", located=True)
-        assert not policy.allows("located", located=True)
+        assert not policy.allows("lost")  # from now on the next pose is news
+        assert not policy.allows("doubtful")
+        allowed[now_s] = policy.allows("located")
+        assert not policy.allows("located")
     assert [now_s for now_s, may in allowed.items() if may] == [0.0, 11.0, 80.0]

@@ -10,6 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
+import numpy as np
+
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, one_line
 from pc2grid.geometry import SE2
@@ -23,10 +25,12 @@ from pc2grid_cli.check_pose import live_document
 from pc2grid_cli.followed import Followed, Live, live, run
 from signature.localization.answer_json import (
     Labelled,
+    OffMap,
     PoseInSpace,
     StampedPose,
     Status,
     in_space_document,
+    off_map_document,
     plain,
     stamped_pose,
 )
@@ -58,11 +62,13 @@ class WatchedMap(Labelled):
 
 class Watch(Live):
     """A line of `pc2grid watch --json`: what one search of the database said. state: searching (not located
-    yet), located, doubtful (certain neither where it was nor elsewhere), lost, recovered (located elsewhere
-    or again). pose: of the base at `stamp_ns`; null unless the status is `located`. T_map_odom: of
-    the robot's own odometry frame. frame: of the building, in which the pose is; null: the map frame of the
-    session. in_space: null if the map or the scans have no points. confidence: the probability that the best
-    place is right. published: topics on which it was said."""
+    yet), located, off_map (the map does not show what it sees), doubtful (certain neither where it was nor
+    elsewhere), lost, recovered (located elsewhere or again). pose: of the base at `stamp_ns`; null unless the
+    status is `located`. The state is that only when a second search agrees, or beyond doubt; no other pose
+    is published. T_map_odom: of the robot's own odometry frame. frame: of the building, in which the pose is;
+    null: the map frame of the session. in_space: null if the map or the scans have no points. off_map: where
+    odometry says that it is; null unless the map shows too little there. confidence: the probability that
+    the best place is right. published: topics on which it was said."""
 
     state: State
     status: Status
@@ -73,6 +79,7 @@ class Watch(Live):
     pose: StampedPose | None
     T_map_odom: SE2 | None
     in_space: PoseInSpace | None
+    off_map: OffMap | None
     confidence: float
     published: list[str]
 
@@ -137,7 +144,7 @@ def search(following: Following, robot: _Robot, prior: Prior | None, *, first: b
             document = _document(estimate, drive, robot, published)
             console.print_result(document if as_json else as_text(estimate, published), indent=None)
             located = estimate.answer.status == "located"
-            return located and first
+            return estimate.is_told and first
 
         following.run(follower, use)
     return located
@@ -203,8 +210,8 @@ class _Robot:
             return []
         if estimate.state == "lost":
             publisher.stop_tf()
-        may_reset = self.resets.allows(estimate.state, located=session is not None)
-        if session is None:
+        may_reset = self.resets.allows(estimate.state)
+        if session is None or not estimate.is_told:
             return []
         return [
             *self._tell_map(publisher, estimate, session, lock),
@@ -299,13 +306,23 @@ def summarize(drive: Followed, terminal: console.Console) -> None:
 def as_text(estimate: Estimate, published: list[str]) -> str:
     """An estimate in one line."""
     answer = estimate.answer
-    begin = f"after {answer.path_m:.1f} m: {estimate.state}"
+    begin = f"after {answer.path_m:.1f} m: {estimate.state.replace('_', ' the ')}"
+    away = answer.beside_map
+    if away is not None:
+        fit = away.hypothesis.fit
+        at, sigmas = fit.T_map_query @ answer.T_odom_base, np.sqrt(np.diag(fit.covariance))
+        return one_line(
+            f"{begin} of {answer.sessions[away.hypothesis.session_index]}: by odometry x {at.x:.2f} m,"
+            f" y {at.y:.2f} m, yaw {math.degrees(at.yaw):.1f} deg, give or take {sigmas[:2].max():.2f} m and"
+            f" {math.degrees(sigmas[2]):.1f} deg, confidence {probability(away.mass)}"
+        )
     if answer.T_map_base is None:
         places = len(set(answer.places))
         return f"{begin}, {places} places fit" if answer.status == "ambiguous" else f"{begin}, no place fits"
     pose = answer.T_map_base
     told = f", published {' and '.join(published)}" if published else ""
     yaw_deg = math.degrees(pose.yaw)
+    begin += "" if estimate.is_told else ", perhaps"
     return one_line(
         f"{begin} in {answer.session}: x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {yaw_deg:.1f} deg,"
         f" confidence {probability(answer.confidence)}{told}"
@@ -324,6 +341,7 @@ def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: lis
         "pose": stamped_pose(answer),
         "T_map_odom": estimate.T_map_odom,
         "in_space": in_space_document(answer),
+        "off_map": off_map_document(answer),
         "confidence": answer.confidence,
         "published": published,
         **live(drive, estimate.elapsed_s),

@@ -38,6 +38,7 @@ LEVELS = {
     "located": DiagnosticStatus.OK,
     "recovered": DiagnosticStatus.OK,
     "searching": DiagnosticStatus.WARN,
+    "off_map": DiagnosticStatus.WARN,
     "doubtful": DiagnosticStatus.WARN,
     "lost": DiagnosticStatus.ERROR,
 }
@@ -209,8 +210,10 @@ class Pc2gridNode(LifecycleNode):
         self.get_logger().info(f"{estimate.state} after {answer.path_m:.1f} m")
         if estimate.state == "lost":
             self._nav2.stop_tf()
-        may_reset = self._resets.allows(estimate.state, located=answer.session is not None)
-        if answer.session is None or answer.T_map_base is None or answer.covariance is None:
+        may_reset = self._resets.allows(estimate.state)
+        if not estimate.is_told or answer.session is None:
+            return
+        if answer.T_map_base is None or answer.covariance is None:
             return
         stamp_ns, pose = answer.stamp_ns, answer.T_map_base
         if self._set("publish_map") and answer.session != self._map_of:

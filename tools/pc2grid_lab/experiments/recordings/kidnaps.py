@@ -265,7 +265,7 @@ def _judged(row: FollowedRow, looks: Sequence[_Look]) -> FollowedRow:
     """What a row says of its looks."""
     before = [look for look in looks if look.since_s is None]
     after = looks[len(before) :]
-    knew = bool(before) and before[-1].state in ("located", "recovered", "doubtful")
+    knew = bool(before) and before[-1].state in ("located", "recovered", "off_map", "doubtful")
     if knew:  # until it is noticed, the old place is told
         noticed = (k for k, look in enumerate(after) if look.state in NOTICED)
         after = after[next(noticed, len(after)) :]
