@@ -119,8 +119,13 @@ class Masses:
 
     def carried(self, query: QueryMap) -> Iterator[OffMap]:
         """The places of this moment, where odometry has carried them; `mass`: `odds`."""
+        beside = list(self.off_map)
         for number, mass in enumerate(self.masses):
             h = self.hypotheses[self.places.index(number)]
+            k = self._beside(h)
+            if k is not None:
+                beside[k] = replace(beside[k], mass=beside[k].mass + mass)
+                continue
             yield OffMap(
                 hypothesis=h,
                 mass=self.odds(query, mass),
@@ -128,8 +133,19 @@ class Masses:
                 T_odom_seen=self.T_odom_base,
                 seen=h.fit.covariance,
             )
-        for away in self.off_map:
+        for away in beside:
             yield replace(away, mass=self.odds(query, away.mass))
+
+    def _beside(self, h: Hypothesis) -> int | None:
+        """The place beside the map that a hypothesis is at, if the map shows too little to align it."""
+        if h.fit.overlap >= POSTERIOR.shown:
+            return None
+        base = h.fit.T_map_query @ self.T_odom_base
+        for k, away in enumerate(self.off_map):
+            same = away.hypothesis.session_index == h.session_index
+            if same and region_of(away, self.T_odom_base).allows(base):
+                return k
+        return None
 
 
 def region_of(away: OffMap, T_odom_base: SE2) -> Prior:

@@ -221,7 +221,7 @@ def test_the_first_answer_is_enough_if_it_is_asked_for(
 
 def test_a_robot_that_was_carried_away_is_told_so_in_words(here: Path, tmp_path: Path) -> None:
     """Along the corridor of the office, with wheels that do not turn."""
-    config = SimulationConfig(length_m=4.0, seed=5, clutter=0, start_m=(2.0, 7.0))
+    config = SimulationConfig(length_m=6.0, seed=5, clutter=0, start_m=(2.0, 7.0))
     simulate_session(tmp_path / "there.mcap", sensor="laser", grid=office(), config=config)
     write_joined(Part(here / "tuesday.mcap"), Part(tmp_path / "there.mcap"), tmp_path / "carried.mcap")
     result = CliRunner().invoke(app, ["watch", str(tmp_path / "carried.mcap"), "-d", "plan.submaps"])
@@ -229,7 +229,8 @@ def test_a_robot_that_was_carried_away_is_told_so_in_words(here: Path, tmp_path:
     said = [line.partition(" m: ")[2] for line in result.stdout.splitlines()]
     lost = next(number for number, line in enumerate(said) if line.startswith("lost, no place fits"))
     assert all(line.startswith("located in plan: x ") for line in said[:lost])
-    assert said[lost + 1].startswith("recovered in plan: x ") and said[-1].startswith("located in plan: x ")
+    assert said[lost + 1].startswith("lost, perhaps in plan: x ")  # until a second look agrees
+    assert said[lost + 2].startswith("recovered in plan: x ") and said[-1].startswith("located in plan: x ")
 
 
 @pytest.mark.parametrize(
