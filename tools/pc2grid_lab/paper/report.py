@@ -124,14 +124,18 @@ def _with_means(by_map: dict[str, F64], maps: Sequence[str], sign: str) -> list[
 
 
 def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Path:
-    """figure-9-offset-OFFSET.png: precision over recall by map and noise level; returns its path."""
+    """Draw figure-9-offset-OFFSET.png, precision over recall by map and noise level; returns its path."""
+    from matplotlib import colormaps
+
     plain = [
         r for r in results if not r.task.overrides and (r.task.offset_m, r.task.radius_m) == (offset_m, 8.0)
     ]
     maps = list(dict.fromkeys(r.task.map_name for r in plain))
     path = out / f"figure-9-offset-{offset_m:g}.png"
-    with picture(path, 3.2 * len(maps), 8.5) as figure:
+    with picture(path, 3.2 * len(maps), 9.0) as figure:
         axes = figure.subplots(len(_LEVELS), len(maps), squeeze=False, sharex=True, sharey=True)
+        colours = colormaps["tab20"].colors
+        number = {name: k for k, name in enumerate(dict.fromkeys(r.task.method for r in plain))}
         for (level, title), (k, name) in itertools.product(enumerate(_LEVELS), enumerate(maps)):
             axis = axes[level, k]
             for cell in (r for r in plain if (r.task.level, r.task.map_name) == (level, name)):
@@ -139,11 +143,12 @@ def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Pat
                 if len(curve.recall):
                     # Like the area under the curve: from recall 0 at the precision of the first point.
                     recall, precision = [0.0, *curve.recall], [curve.precision[0], *curve.precision]
-                    axis.plot(recall, precision, label=cell.task.method, linewidth=1.2)
+                    colour = colours[number[cell.task.method] % len(colours)]
+                    axis.plot(recall, precision, label=cell.task.method, linewidth=1.2, color=colour)
             axis.set_title(f"{name}, {title}", fontsize=9)
             axis.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="recall", ylabel="precision")
             axis.label_outer()
             axis.grid(alpha=0.3)
         if axes[0, 0].lines:
-            axes[0, 0].legend(fontsize=7, loc="lower left")
+            figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return path
