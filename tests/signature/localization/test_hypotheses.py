@@ -83,14 +83,16 @@ def test_a_shoulder_is_led_to_its_peak_and_is_no_place_of_its_own() -> None:
     shoulder = Hypothesis(
         session_index=0, row=3, fit=score_fit(target.walls, query.walls, aside, peak.fit.covariance)
     )
-    assert distinct(query, (shoulder, peak)) == (peak, shoulder)
+    assert distinct(query, (shoulder, peak)) == (replace(peak, row=3),)
     led = best_around(query, shoulder, target)
     pose = led.fit.T_map_query
     assert abs(pose.x) + abs(pose.y) < 0.05 and led.fit.score > shoulder.fit.score
     (one,) = distinct(query, (led, peak))
     assert one.row == 3  # of the place that proposed it
     elsewhere = replace(led, session_index=1)
-    assert len(distinct(query, (elsewhere, peak))) == 2
+    farther = replace(shoulder, fit=replace(shoulder.fit, T_map_query=SE2(0.9, 0.0, 0.0)))
+    for other in (elsewhere, farther):
+        assert len(distinct(query, (other, peak))) == 2
 
 
 @pytest.mark.parametrize("by", ["signatures", "random"])
