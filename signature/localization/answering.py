@@ -59,7 +59,7 @@ def answer_query(
     verdict, found = decide(index, seen, known, prior_of)
     clock.lap("search")
     prior, excluded = _with_prior(index, seen, verdict, found)
-    verdict = beside_map(verdict, prior_of, off_map, index.config.accept)
+    verdict = beside_map(verdict, seen, prior_of, off_map, index.config.accept)
     verdict = _in_map(_with_slip(index, query, verdict), session_index)
     clock.lap("decide")
     in_space = None

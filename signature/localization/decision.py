@@ -12,6 +12,9 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
+from pc2grid.geometry import wrap_angle
 from pc2grid.matching.two_way_score import Fit
 from signature.localization.answer import OffMap, Status, Verdict
 from signature.localization.hypotheses import Hypothesis, same_pose
@@ -22,6 +25,7 @@ from signature.localization.posterior import (
     masses,
     tail_of,
 )
+from signature.localization.prior import PRIOR
 from signature.localization.query import QueryMap
 
 Place = tuple[Hypothesis, ...]
@@ -104,8 +108,14 @@ def with_slip(verdict: Verdict, since: float, accept: float) -> Verdict:
     )
 
 
-def beside_map(verdict: Verdict, prior_of: PriorOf, off_map: Sequence[OffMap], accept: float) -> Verdict:
-    """The verdict with places that the map does not show. off_map : with masses relative to "nowhere"."""
+def beside_map(
+    verdict: Verdict, query: QueryMap, prior_of: PriorOf, off_map: Sequence[OffMap], accept: float
+) -> Verdict:
+    """Return the verdict with places that the map does not show; of one that it puts where the query lies by
+    its walls, too, both masses count for the confidence.
+
+    off_map : with masses relative to "nowhere".
+    """
     if not off_map:
         return verdict
     odds = 1.0
@@ -115,6 +125,8 @@ def beside_map(verdict: Verdict, prior_of: PriorOf, off_map: Sequence[OffMap], a
     share = 1.0 / (odds + sum(away.mass for away in off_map))
     masses = tuple(mass * odds * share for mass in verdict.masses)
     confidence = masses[0] if masses else 0.0
+    for best in verdict.hypotheses[:1]:
+        confidence += share * sum(away.mass for away in off_map if _agree(query, away, best))
     doubtful = verdict.status == "located" and confidence < accept
     return replace(
         verdict,
@@ -125,6 +137,18 @@ def beside_map(verdict: Verdict, prior_of: PriorOf, off_map: Sequence[OffMap], a
             replace(away, mass=away.mass * share) for away in sorted(off_map, key=lambda away: -away.mass)
         ),
     )
+
+
+def _agree(query: QueryMap, away: OffMap, h: Hypothesis) -> bool:
+    """Whether the walls put the robot where odometry does, by the covariances of both, and more exactly: on
+    few walls a pose slides."""
+    by_odometry, by_walls = away.hypothesis.fit, h.fit
+    base, other = (fit.T_map_query @ query.T_odom_base for fit in (by_odometry, by_walls))
+    off = np.array([base.x - other.x, base.y - other.y, wrap_angle(base.yaw - other.yaw)])
+    squared = off @ np.linalg.solve(by_odometry.covariance + by_walls.covariance, off)
+    exact = np.trace(by_walls.covariance[:2, :2]) < np.trace(by_odometry.covariance[:2, :2])
+    same_map = away.hypothesis.session_index == h.session_index
+    return same_map and bool(exact and squared <= PRIOR.sigmas**2)
 
 
 def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:

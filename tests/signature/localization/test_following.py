@@ -13,9 +13,12 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config, RelocalizeConfig
+from signature.localization.answer import OffMap
 from signature.localization.belief import Belief, Masses
+from signature.localization.decision import anywhere, beside_map, decide
 from signature.localization.localizer import Estimate, Localizer
 from signature.localization.prior import Prior
+from signature.localization.query import query_of
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 OFFICE = building({"office": office()})
@@ -52,6 +55,32 @@ def estimates_of(localizer: Localizer, steps: list[Step]) -> list[tuple[Estimate
         if estimate is not None:
             found.append((estimate, truth))
     return found
+
+
+@pytest.mark.parametrize(
+    ("aside_m", "sigma_m", "counts"), [(0.1, 0.1, True), (1.0, 0.1, False), (0.0, 0.001, False)]
+)
+def test_what_odometry_says_counts_for_the_place_where_walls_say_it_more_exactly(
+    aside_m: float, sigma_m: float, counts: bool
+) -> None:
+    query = query_of(office(), np.array([(2.0, 7.0), (7.0, 7.0)]), Config(), Config().relocalize)
+    verdict, _ = decide(OFFICE, query)
+    first = verdict.hypotheses[0]
+    moved = replace(
+        first.fit,
+        T_map_query=SE2(aside_m, 0.0, 0.0) @ first.fit.T_map_query,
+        covariance=np.eye(3) * sigma_m**2,
+    )
+    away = OffMap(
+        hypothesis=replace(first, fit=moved),
+        mass=1e3 * math.exp(verdict.evidence.log_odds()),
+        seen_m=0.0,
+        T_odom_seen=query.T_odom_base,
+        seen=moved.covariance,
+    )
+    assert verdict.status == "located"
+    found = beside_map(verdict, query, anywhere, [away], 0.75)
+    assert (found.status == "located") == counts == (found.confidence > 0.75)
 
 
 def check_poses(estimates: list[tuple[Estimate, SE2]]) -> None:
