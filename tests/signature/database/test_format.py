@@ -59,7 +59,7 @@ PARTS: dict[str, tuple[Any, dict[str, tuple[str, tuple[int, ...]]]]] = {
     ),
     "seen": (
         {},
-        {"at_m": ("float32", (3, 2)), "place": ("int64", (3,)), "signatures": ("uint8", (3, 111))},
+        {"at_m": ("float32", (3, 2)), "place": ("int64", (3,)), "signatures": ("uint8", (3, 199))},
     ),
     "frame": (None, {}),
 }
