@@ -18,7 +18,7 @@ help:
 	@echo 'make check   lint, format, types, import order'
 	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
-	@echo 'make pictures draw all pictures of README and the pages again (2 minutes)'
+	@echo 'make pictures draw all pictures of README and the pages again (2 hours, of it 2 minutes without the paper)'
 	@echo 'make modules list the modules by what they import, in CONTRIBUTING.md'
 	@echo 'make docs    the documentation site: site/index.html'
 	@echo 'make clean   remove .venv and everything that was made'
@@ -65,12 +65,16 @@ fuzz: $(READY) browser
 	$(FUZZ) tests/signature/database/test_faults.py tests/signature/database/test_durability.py \
 		tests/pc2grid_cli/test_view.py -k fuzz
 
-# Every picture of README and the pages, by the program as it is.
+# Every picture of README and the pages, by the program as it is. Those of the paper need its maps.
 pictures: demo
 	cp demo_out/answer.png examples/demo.png
 	$(BIN)/python examples/how_it_works.py demo_out/lidar.mcap demo_out/depth.mcap --out examples/how_it_works.png
 	$(BIN)/pc2grid export demo_out/office.submaps --map demo_out/office --force
 	$(BIN)/python examples/signature_of_a_submap.py demo_out/office.yaml --out docs/signatures.png
+	$(BIN)/pc2grid compare paper --maps $(REAL_DATA)/maps --offset 1.0 --ablation --out results/paper
+	cp results/paper/figure-9-offset-1.png examples/paper.png
+	$(BIN)/pc2grid compare scale --maps $(REAL_DATA)/maps --out results/scale
+	cp results/scale/scale.png examples/scale.png
 
 modules: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py CONTRIBUTING.md
