@@ -18,7 +18,7 @@ help:
 	@echo 'make check   lint, format, types, import order'
 	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
-	@echo 'make pictures draw all pictures of README and the pages again (an hour, of it 2 minutes without paper.png)'
+	@echo 'make pictures draw all pictures of README and the pages again (2 hours, of it 2 minutes without the paper)'
 	@echo 'make modules list the modules by what they import, in CONTRIBUTING.md'
 	@echo 'make docs    the documentation site: site/index.html'
 	@echo 'make clean   remove .venv and everything that was made'
@@ -65,7 +65,7 @@ fuzz: $(READY) browser
 	$(FUZZ) tests/signature/database/test_faults.py tests/signature/database/test_durability.py \
 		tests/pc2grid_cli/test_view.py -k fuzz
 
-# Every picture of README and the pages, by the program as it is. paper.png needs the maps of the paper.
+# Every picture of README and the pages, by the program as it is. Those of the paper need its maps.
 pictures: demo
 	cp demo_out/answer.png examples/demo.png
 	$(BIN)/python examples/how_it_works.py demo_out/lidar.mcap demo_out/depth.mcap --out examples/how_it_works.png
@@ -75,6 +75,8 @@ pictures: demo
 		--methods proposed_ln_bc --methods shape_context --methods sift_bow --methods surf_bow --methods sift_tfidf \
 		--methods surf_tfidf --methods sdf --methods unlearned --methods learned
 	cp results/paper/figure-9-offset-1.png examples/paper.png
+	$(BIN)/pc2grid compare scale --maps $(REAL_DATA)/maps --out results/scale
+	cp results/scale/scale.png examples/scale.png
 
 modules: $(READY)
 	PYTHONPATH=tools $(BIN)/python tools/architecture.py CONTRIBUTING.md

@@ -23,6 +23,7 @@ from pc2grid_cli.console import Console
 from pc2grid_cli.view_server import ViewServer
 from pc2grid_lab.compare import sensors
 from pc2grid_lab.experiments import sensor_matrix
+from pc2grid_lab.paper import scale
 from tests.helpers.rooms import grid_of, rectangle
 
 COMMANDS = (
@@ -59,10 +60,11 @@ MEASURING = {
         b"matrix.png"
     ),
     "compare peers drive.mcap --of-base --queries 1 --travel 1": b"peers.png",
+    "compare scale --maps . --queries 1 --jobs 1": b"scale.png",
     "compare recordings own": b"No answer is wrong.",
 }
 """Print how long it took, so their bytes differ from run to run; with some of these bytes."""
-_NIGHTLY = [command for command in MEASURING if "paper" in command or "recordings" in command]
+_NIGHTLY = [command for command in MEASURING if {"paper", "scale", "recordings"} & {*command.split()}]
 
 
 @pytest.fixture(scope="module")
@@ -128,6 +130,7 @@ def work(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(demo, "QUERY_LENGTH_M", 1.0)
     monkeypatch.setattr(ViewServer, "serve_forever", lambda server: None)
     monkeypatch.setattr(ViewServer, "url", "http://localhost/")
+    monkeypatch.setattr(scale, "FLOORS", 0)
     for module in (sensor_matrix, sensors):
         monkeypatch.setattr(module, "SENSORS", ("laser",))
     return shutil.copytree(folder, tmp_path / "work")

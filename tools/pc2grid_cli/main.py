@@ -58,6 +58,7 @@ COMPARE = {
         "Other programs, the same maps and queries.",
     ),
     "paper": ("pc2grid_lab.commands:compare_paper_command", "The paper's tables and figures 9 and 10."),
+    "scale": ("pc2grid_lab.commands:compare_scale_command", "The paper's recall in larger databases."),
 }
 
 app = typer.Typer(

@@ -223,3 +223,21 @@ def compare_paper_command(
         jobs=jobs,
         seed=seed,
     )
+
+
+def compare_scale_command(
+    context: typer.Context,
+    maps: Annotated[Path, typer.Option("--maps", help="Folder with maps, those of the paper among them.")],
+    out: _OutputFolder = Path("paper-scale"),
+    queries: Annotated[int, typer.Option("--queries", min=1, help="Queries a map.")] = 500,
+    jobs: _Jobs = None,
+    seed: Annotated[int, typer.Option("--seed", help="Of the queries and their noise.")] = 1,
+) -> None:
+    """Measure how recall falls with the number of places: Eq. 6 and the learned metric, on the paper's maps.
+
+    Example: pc2grid compare scale --maps maps/
+    """
+    extras.require({"paper": "compare scale"})
+    from pc2grid_lab.paper import scale
+
+    scale.run(maps, out, console.of(context), queries=queries, jobs=jobs, seed=seed)

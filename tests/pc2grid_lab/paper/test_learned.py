@@ -124,7 +124,7 @@ def test_on_a_real_floor_it_is_right_more_often_than_the_paper(
     monkeypatch.setattr(learned, "LEARNED_FROM", 60)
     grid = read_map(maps / "intel.yaml")
     within = learned.differences(grid, partition(grid, PartitionConfig.paper()), 1)
-    monkeypatch.setattr("pc2grid_lab.paper.cells._within", lambda *_: within)
+    monkeypatch.setattr("pc2grid_lab.paper.cells.within_others", lambda *_: within)
     names = ["learned", "unlearned", "proposed"]
     tasks = [
         t

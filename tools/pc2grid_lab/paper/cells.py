@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from pc2grid.arrays import F64
@@ -98,19 +99,19 @@ def read_map(path: Path) -> OccupancyGrid:
     The image of killian has 0.10 m a pixel, while the paper says 0.05: it is read half as large.
     """
     grid, published = load_map(path), SIZE_PX.get(path.stem)
-    if published is not None and grid.cells.shape[1] > 1.5 * published[0]:
-        return halved(grid)
-    return grid
+    return rescaled(grid, 0.5) if published and grid.cells.shape[1] > 1.5 * published[0] else grid
 
 
-def halved(grid: OccupancyGrid) -> OccupancyGrid:
-    """The grid as an image of half the size with the same resolution, therefore half as large in metres.
+def rescaled(grid: OccupancyGrid, factor: float) -> OccupancyGrid:
+    """The grid with the same resolution, but `factor` times as large in metres.
 
-    A cell is occupied if any of the four cells that it replaces is; else free if any is; else unknown.
+    A cell is occupied if any of the cells that it replaces is; else free if any is; else unknown.
     """
-    height, width = (n // 2 * 2 for n in grid.cells.shape)
+    height, width = grid.cells.shape
+    size = (int(width * factor), int(height * factor))
+    how = cv2.INTER_AREA if factor < 1.0 else cv2.INTER_NEAREST
     occupied, free = (
-        mask[:height, :width].reshape(height // 2, 2, width // 2, 2).any(axis=(1, 3))
+        cv2.resize(mask.astype(np.float32), size, interpolation=how) > 0.0
         for mask in (grid.occupied, grid.free)
     )
     cells = np.where(occupied, 100, np.where(free, 0, UNKNOWN)).astype(np.int8)
@@ -182,7 +183,11 @@ def _run(tasks: Sequence[PaperTask], folder: Path) -> Iterator[PaperCell]:
 def _methods_of(tasks: Sequence[PaperTask], folder: Path) -> dict[tuple[str, Overrides], Method]:
     """The methods of tasks of one map, those of the same features made together."""
     plain = dict.fromkeys(task.method for task in tasks if not task.overrides)
-    within = None if LEARNED.keys().isdisjoint(plain) else _within(tasks[0], folder)
+    within = (
+        None
+        if LEARNED.keys().isdisjoint(plain)
+        else within_others(tasks[0].map_path, tasks[0].radius_m, tasks[0].seed, folder)
+    )
     signatures = Signatures()
     made = make_methods(plain, within, signatures)
     found: dict[tuple[str, Overrides], Method] = {(name, ()): method for name, method in made.items()}
@@ -193,18 +198,18 @@ def _methods_of(tasks: Sequence[PaperTask], folder: Path) -> dict[tuple[str, Ove
     return found
 
 
-def _within(task: PaperTask, folder: Path) -> F64:
-    """`differences` of the other maps in the folder of a map, each kept in a file. Raises MapFileError."""
-    others = [path for path in known_maps(task.map_path.parent) if path.stem != task.map_name]
+def within_others(asked: Path, radius_m: float, seed: int, folder: Path) -> F64:
+    """`differences` of the maps beside one, each kept in a file of a folder. Raises MapFileError."""
+    others = [path for path in known_maps(asked.parent) if path.stem != asked.stem]
     if not others:
         raise MapFileError(
-            f"{task.map_path.parent}: no other map to learn from",
+            f"{asked.parent}: no other map to learn from",
             hint="put other maps beside it, or leave out the methods that learn",
         )
     found = []
     for path in others:
-        file = folder / f"differences.{path.stem}.r{task.radius_m:g}.seed{task.seed}.pickle"
-        found.append(once(file, partial(_differences, path, task.radius_m, task.seed)))
+        file = folder / f"differences.{path.stem}.r{radius_m:g}.seed{seed}.pickle"
+        found.append(once(file, partial(_differences, path, radius_m, seed)))
     return np.concatenate(found)
 
 

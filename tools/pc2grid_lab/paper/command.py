@@ -42,7 +42,7 @@ def run(
     setting: dict[str, Any] = {"queries": queries, "seed": seed, "speckle_sigma_m": speckles}
     tasks = list(paper_tasks(found, methods=chosen, offsets_m=offsets_m, choices=choices, **setting))
     with terminal.progress(f"{len(tasks)} cells of the tables") as advance:
-        kept = _kept_in(out, found)
+        kept = kept_in(out, found)
         groups = [(group, kept) for group in that_share_submaps(tasks)]
         cells = itertools.chain.from_iterable(in_processes(cells_of, groups, jobs=jobs, advance=advance))
     by_task = {cell.task: cell for cell in cells}
@@ -54,7 +54,7 @@ def run(
     print(f"written: {out / 'results.json'}, {', '.join(map(str, pictures))}")
 
 
-def _kept_in(out: Path, maps: Sequence[Path]) -> Path:
+def kept_in(out: Path, maps: Sequence[Path]) -> Path:
     """The folder of the results of these sources, these maps, and those beside them to learn from."""
     beside = {path for folder in {path.parent for path in maps} for path in known_maps(folder)}
     images = {file for path in {*maps, *beside} for file in path.parent.glob(f"{path.stem}.*")}

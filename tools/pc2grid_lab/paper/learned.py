@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pc2grid.arrays import F64
@@ -66,6 +67,12 @@ def vector(submap: Submap) -> F64:
 
     Free space and symmetry are the paper's.
     """
+    signature = Signatures().of(submap, CONFIG)
+    return np.concatenate((boundary_vector(submap), _roots(signature.freespace), signature.symmetry / 255))
+
+
+def boundary_vector(submap: Submap) -> F64:
+    """Its first parts, `BOUNDARY_PARTS`."""
     resolution_m = submap.grid.resolution_m
     edges = boundary_edges(submap, CONFIG)
     cells = boundary_points(edges, resolution_m, CONFIG)
@@ -75,10 +82,11 @@ def vector(submap: Submap) -> F64:
     bin_of = bins_of_squares(resolution_m / CONFIG.boundary_bin_m, bins)
     whole, soft, near = _kernels.weighed_pairs(cells, weights, bin_of, bins)
     rings = np.bincount(np.minimum((away_m / _RING_M).astype(np.int64), _RINGS - 1), minlength=_RINGS)
-    signature = Signatures().of(submap, CONFIG)
-    counts = (whole, soft, near[:_NEAR_BINS], rings, signature.freespace)
-    roots = [np.sqrt(c / max(c.sum(), 1e-9)) for c in counts]
-    return np.concatenate((*roots, signature.symmetry / 255))
+    return np.concatenate([_roots(counts) for counts in (whole, soft, near[:_NEAR_BINS], rings)])
+
+
+def _roots(counts: NDArray[np.number]) -> F64:
+    return np.asarray(np.sqrt(counts / max(counts.sum(), 1e-9)))
 
 
 LEARNED = {
@@ -119,6 +127,14 @@ def differences(grid: OccupancyGrid, submaps: Sequence[Submap], seed: int) -> F6
     return np.asarray(np.array([vector(query) for query in queries]) - table[own])
 
 
+def metric(within: F64) -> F64:
+    """(K, K): Mahalanobis's distance is the Euclidean one of vectors times it. within : `differences`."""
+    covariance = within.T @ within / len(within)
+    variances = np.diag(covariance)
+    covariance = (1 - _SHRUNK) * covariance + np.diag(_SHRUNK * variances + _RIDGE * variances.mean())
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)))
+
+
 @dataclass(frozen=True, slots=True)
 class Learned:
     """Parts of the vectors, compared by Mahalanobis's distance.
@@ -133,12 +149,8 @@ class Learned:
     def fit(self, submaps: Sequence[Submap]) -> _Table:
         """Describe every submap."""
         columns = np.concatenate([np.arange(SIZE)[COLUMNS[part]] for part in self.parts])
-        apart = self.within[:, columns]
-        covariance = apart.T @ apart / len(apart)
-        variances = np.diag(covariance)
-        covariance = (1 - _SHRUNK) * covariance + np.diag(_SHRUNK * variances + _RIDGE * variances.mean())
         whitening = np.zeros((SIZE, len(columns)))
-        whitening[columns] = np.linalg.cholesky(np.linalg.inv(covariance))
+        whitening[columns] = metric(self.within[:, columns])
         return _Table(self.vectors, whitening, np.array([self.vectors.of(s) for s in submaps]) @ whitening)
 
 

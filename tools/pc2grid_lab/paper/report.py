@@ -134,7 +134,7 @@ def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Pat
     path = out / f"figure-9-offset-{offset_m:g}.png"
     with picture(path, 3.2 * len(maps), 9.0) as figure:
         axes = figure.subplots(len(_LEVELS), len(maps), squeeze=False, sharex=True, sharey=True)
-        colours = colormaps["tab20"].colors
+        colours = colormaps["tab20"]
         number = {name: k for k, name in enumerate(dict.fromkeys(r.task.method for r in plain))}
         for (level, title), (k, name) in itertools.product(enumerate(_LEVELS), enumerate(maps)):
             axis = axes[level, k]
@@ -143,7 +143,7 @@ def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Pat
                 if len(curve.recall):
                     # Like the area under the curve: from recall 0 at the precision of the first point.
                     recall, precision = [0.0, *curve.recall], [curve.precision[0], *curve.precision]
-                    colour = colours[number[cell.task.method] % len(colours)]
+                    colour = colours(number[cell.task.method] % colours.N)
                     axis.plot(recall, precision, label=cell.task.method, linewidth=1.2, color=colour)
             axis.set_title(f"{name}, {title}", fontsize=9)
             axis.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="recall", ylabel="precision")
