@@ -101,10 +101,11 @@ def with_slip(verdict: Verdict, since: float, accept: float) -> Verdict:
     more = verdict.masses[0] * (evidence.slipped() - verdict.evidence.slipped())
     masses = tuple(mass / (1.0 + more) for mass in verdict.masses)
     off_map = tuple(replace(away, mass=away.mass / (1.0 + more)) for away in verdict.off_map)
-    doubtful = verdict.status == "located" and masses[0] < accept
+    confidence = verdict.confidence / (1.0 + more)
+    doubtful = verdict.status == "located" and confidence < accept
     status: Status = "ambiguous" if doubtful else verdict.status
     return replace(
-        verdict, status=status, confidence=masses[0], masses=masses, evidence=evidence, off_map=off_map
+        verdict, status=status, confidence=confidence, masses=masses, evidence=evidence, off_map=off_map
     )
 
 
