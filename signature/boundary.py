@@ -77,15 +77,6 @@ def bins_of_squares(cell_bins: float, bins: int) -> NDArray[np.int32]:
     return at
 
 
-def pair_distance_counts(points: F64, bins: int) -> I64:
-    """How many pairs of points (N, 2), in units of the bin width, lie how far from each other: (bins,). The
-    last bin holds the longer distances as well."""
-    from scipy.spatial.distance import pdist
-
-    at = (pdist(points) + ROUNDING_BINS).astype(np.int64)
-    return np.bincount(np.minimum(at, bins - 1), minlength=bins)
-
-
 def normalized(counts: NDArray[np.generic]) -> F32:
     """Counts (N,) as shares, float32 of sum 1; all 0 stays all 0."""
     return np.asarray(counts / max(counts.sum(), 1), np.float32)
