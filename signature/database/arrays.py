@@ -11,6 +11,7 @@ import enum
 import io
 import json
 import re
+import threading
 import zipfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -31,6 +32,8 @@ MOST_BYTES = 1_200_000_000
 """Largest part that is read: the steps of 100 million points in space, 50,000 m2 at 5 cm."""
 _DOCUMENT = "document"
 """The array with the bytes of the document."""
+_HEADERS = threading.Lock()
+"""One thread at a time reads headers of arrays."""
 _NO_UTF8 = re.compile("[\udc80-\udcff]")
 """Bytes of a name that are no UTF-8, as Python reads them (`surrogateescape`)."""
 
@@ -66,7 +69,9 @@ def unpack(data: bytes) -> tuple[Any, dict[str, Array]]:
         size = sum(member.file_size for member in file.infolist())
     if size > MOST_BYTES:
         raise ValueError(f"{size} bytes, more than {MOST_BYTES}")
-    with np.load(io.BytesIO(data)) as members:
+    # numpy parses the header of each array by `ast`, which before Python 3.11.9 must not run in two threads
+    # at once ("AST constructor recursion depth mismatch", python/cpython#106905).
+    with _HEADERS, np.load(io.BytesIO(data)) as members:
         arrays = dict(members)
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():

@@ -90,7 +90,7 @@ def options(
 app.add_typer(
     typer.Typer(
         cls=group(COMPARE),
-        help="Measure: recordings, sensors, peers, the paper's tables. Only where a clone is installed.",
+        help="Measure: recordings, sensors, peers, the paper's tables, scale. Only in a clone.",
         no_args_is_help=True,
     ),
     name="compare",

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import io
 import json
+import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -101,3 +104,20 @@ def test_rows_that_differ_have_other_checksums(a: list[Any], b: list[Any]) -> No
 )
 def test_values_that_look_alike(a: list[Any], b: list[Any]) -> None:
     assert row_crc(a) != row_crc(b)
+
+
+def test_two_threads_never_read_headers_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Python before 3.11.9 has one depth counter for all threads that parse; a server test met it."""
+    reading, most, literal_eval = [0], [0], ast.literal_eval
+
+    def slow(text: str) -> Any:
+        reading[0] += 1
+        most[0] = max(most[0], reading[0])
+        time.sleep(0.002)
+        reading[0] -= 1
+        return literal_eval(text)
+
+    monkeypatch.setattr(ast, "literal_eval", slow)
+    with ThreadPoolExecutor(4) as pool:
+        assert len(list(pool.map(unpack, [pack(1, {"a": ONE})] * 8))) == 8
+    assert most[0] == 1
