@@ -16,10 +16,9 @@ import numpy as np
 import typer
 
 import pc2grid
-from pc2grid.config import PartitionConfig
-from pc2grid_lab.paper.experiment import Experiment, evaluate
+from pc2grid.settings import PartitionConfig
+from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, evaluate
 from pc2grid_lab.paper.methods import make_methods
-from pc2grid_lab.paper.noise import NOISE_LEVELS
 
 
 class WallDistances:

@@ -15,15 +15,15 @@ import numpy as np
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
-from pc2grid.config import PartitionConfig
-from pc2grid.io.nav2_map import load_map
+from pc2grid.io.maps import load_map
 from pc2grid.model import OccupancyGrid, Submap
+from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.junction_graph import junction_graph, map_skeleton
-from pc2grid.submaps.partition import partition
+from pc2grid.submaps.submaps import partition
 from signature.boundary import boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
-from signature.describe import describe
 from signature.freespace import freespace_graph, freespace_histogram, shortest_paths
+from signature.paper import describe
 from signature.symmetry import blurred, line_segments, symmetry_axes
 
 FREE, WALL, UNSEEN = (1.0, 1.0, 1.0), (0.1, 0.1, 0.1), (0.86, 0.86, 0.86)

@@ -49,8 +49,8 @@ from pc2grid._version import __version__
 if TYPE_CHECKING:
     from pc2grid.errors import Pc2GridError as Pc2GridError
     from pc2grid.geometry import SE2 as SE2
-    from pc2grid.io.nav2_map import load_map as load_map
-    from pc2grid.io.nav2_map import save_map as save_map
+    from pc2grid.io.maps import load_map as load_map
+    from pc2grid.io.maps import save_map as save_map
     from pc2grid.io.recording import Log as Log
     from pc2grid.io.recording import open_log as open_log
     from pc2grid.io.trajectory import read_tum as read_tum
@@ -65,33 +65,33 @@ if TYPE_CHECKING:
     from pc2grid.model import Submap as Submap
     from pc2grid.model import Trajectory as Trajectory
     from pc2grid.observer import Observer as Observer
+    from pc2grid.observer import TimeSpan as TimeSpan
     from pc2grid.pipeline import build_map as build_map
     from pc2grid.pipeline import build_maps as build_maps
     from pc2grid.pipeline import follow as follow
     from pc2grid.pipeline import map_scans as map_scans
     from pc2grid.simulate import SimulationConfig as SimulationConfig
     from pc2grid.simulate import simulate_session as simulate_session
-    from pc2grid.submaps.partition import partition as submaps_of  # noqa: F401
-    from pc2grid.time_span import TimeSpan as TimeSpan
+    from pc2grid.submaps.submaps import partition as submaps_of  # noqa: F401
 
     # Of the package above this one, so that a user needs one import. `pyproject.toml` allows it here only.
     from signature.config import Config as Config
     from signature.database import Label as Label
     from signature.database import SubmapDatabase as SubmapDatabase
     from signature.database import open_database as open_database
-    from signature.files import convert as convert
-    from signature.files import relocalize as relocalize
     from signature.localization.answer import Answer as Answer
     from signature.localization.localizer import Localizer as Localizer
     from signature.localization.map_index import MapIndex as MapIndex
-    from signature.localization.prior import Prior as Prior
+    from signature.localization.posterior import Prior as Prior
+    from signature.sessions import convert as convert
+    from signature.sessions import relocalize as relocalize
 
 # Where each is found; with another name there, behind the colon. A test compares this with the list above.
 _HOMES = {
     "Pc2GridError": "pc2grid.errors",
     "SE2": "pc2grid.geometry",
-    "load_map": "pc2grid.io.nav2_map",
-    "save_map": "pc2grid.io.nav2_map",
+    "load_map": "pc2grid.io.maps",
+    "save_map": "pc2grid.io.maps",
     "Log": "pc2grid.io.recording",
     "open_log": "pc2grid.io.recording",
     "read_tum": "pc2grid.io.trajectory",
@@ -112,17 +112,17 @@ _HOMES = {
     "map_scans": "pc2grid.pipeline",
     "SimulationConfig": "pc2grid.simulate",
     "simulate_session": "pc2grid.simulate",
-    "submaps_of": "pc2grid.submaps.partition:partition",
-    "TimeSpan": "pc2grid.time_span",
+    "submaps_of": "pc2grid.submaps.submaps:partition",
+    "TimeSpan": "pc2grid.observer",
     "Config": "signature.config",
     "Label": "signature.database",
     "SubmapDatabase": "signature.database",
     "open_database": "signature.database",
-    "convert": "signature.files",
-    "relocalize": "signature.files",
+    "convert": "signature.sessions",
+    "relocalize": "signature.sessions",
     "Answer": "signature.localization.answer",
     "MapIndex": "signature.localization.map_index",
-    "Prior": "signature.localization.prior",
+    "Prior": "signature.localization.posterior",
     "Localizer": "signature.localization.localizer",
 }
 __all__ = ["__version__", *_HOMES]

@@ -16,7 +16,7 @@ import numpy as np
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from pc2grid.arrays import F64, U8
+    from pc2grid.geometry import F64, U8
 
 UNKNOWN_GREY, FREE_GREY, WALL_GREY = 222, 255, 38
 PATH_BLUE, CENTRE_GREEN = (178, 114, 0), (115, 158, 0)

@@ -2,6 +2,8 @@
 
 Metres, radians, int64 nanoseconds. The arrays inside are read-only, and no other code can write to them, so
 a stage cannot change what another one holds.
+
+What sets the kinds of sensors apart, in one place: `SENSOR_MODELS[scan.sensor]`.
 """
 
 from __future__ import annotations
@@ -16,12 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BeforeValidator, PlainSerializer, computed_field
 
-from pc2grid.arrays import F32, F64, I64, U8, BoolGrid, freeze, hand_over
 from pc2grid.display import html_picture, html_table, map_png, short
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F32, F64, I64, SE2, U8, BoolGrid, freeze, hand_over
 
 if TYPE_CHECKING:
     import networkx as nx
+
 
 SensorKind = Literal["lidar", "laser", "depth"]
 MapOf = Literal["everything", "walls", "raw"]
@@ -106,7 +108,7 @@ class Health(enum.Enum):
 
     FINE : in every direction, and odometry, if there is any, agrees. DEGENERATE : some direction rests on
     odometry or the motion before. LOST : not at all; the scan is not mapped. OVERRULED : as FINE, but
-    odometry says something else (`pc2grid.estimation.overruled`).
+    odometry says something else (`pc2grid.estimation.tracker`).
     """
 
     FINE = "fine"
@@ -441,7 +443,7 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consistency:
-    """How well a map agrees with its own scans (`pc2grid.mapping.consistency`).
+    """How well a map agrees with its own scans (`pc2grid.mapping.quality`).
 
     hits_on_free : share of all wall hits that lie on ground which the map calls free, 0..1. Hits on what
         moves are not counted.
@@ -478,7 +480,7 @@ class UncertainStretch:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precision:
-    """How exactly the places of a map lie to each other (`pc2grid.mapping.precision`).
+    """How exactly the places of a map lie to each other (`pc2grid.mapping.quality`).
 
     stamps_ns : (N,) increasing, of scans along the travel, a few metres apart.
     sigma_m : (N,) standard deviation of the position there, in the least certain direction, relative to the
@@ -529,7 +531,7 @@ class Overruled:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryCheck:
-    """What the scans of a session say of its odometry (`pc2grid.estimation.overruled`).
+    """What the scans of a session say of its odometry (`pc2grid.estimation.tracker`).
 
     compared : scans that were tracked and have odometry. overruled : of these, scans that fit the map where
         odometry does not lead.
@@ -693,3 +695,32 @@ def is_part_of(name: str, session: str) -> bool:
     """
     head, mark, number = name.rpartition("#")
     return mark == "#" and head == session and number.isdecimal()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorModel:
+    """A kind of sensor.
+
+    planar : it measures in one plane, so it shows no floor, no slope, and no points in space.
+    image : its scans are images in optical axes (REP-103), with a CameraInfo, of one moment; others sweep.
+    narrow : it looks ahead only, and there densely: the floor ahead is seen, and its walls hold a pose in
+    fewer directions than those all around.
+    noise_per_m2 : standard deviation of a range over its square; 0: the noise does not grow with the range.
+    """
+
+    planar: bool = False
+    image: bool = False
+    narrow: bool = False
+    noise_per_m2: float = 0.0
+
+    def range_of_noise_m(self, sigma_m: float) -> float:
+        """The range at which the noise has this standard deviation; infinite if it does not grow."""
+        return math.sqrt(sigma_m / self.noise_per_m2) if self.noise_per_m2 else math.inf
+
+
+SENSOR_MODELS: dict[SensorKind, SensorModel] = {
+    "lidar": SensorModel(),
+    "laser": SensorModel(planar=True),
+    # Of stereo and structured light; Khoshelham and Elberink (2012) give 0.0014 for the Kinect.
+    "depth": SensorModel(image=True, narrow=True, noise_per_m2=0.0015),
+}

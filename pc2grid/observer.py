@@ -2,6 +2,8 @@
 
 `Observer` is also the null object: all its methods do nothing, so a stage calls them without asking whether
 anybody is interested. A subclass overrides the methods that it needs.
+
+A part of a recording, by time.
 """
 
 from __future__ import annotations
@@ -10,12 +12,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
     from pc2grid.model import RegisteredScan
+
 
 _UPDATE_EVERY_S = 0.1
 """How often at most what shows progress is told of it, as often as rich draws; stages report each scan."""
@@ -119,3 +123,29 @@ def seldom(update: Callable[[float], None]) -> Callable[[float], None]:
             update(share)
 
     return at_most
+
+
+@dataclass(frozen=True, slots=True)
+class TimeSpan:
+    """A part of a recording.
+
+    start_s : its begin, in seconds after the begin of the recording.
+    duration_s : its length; None: to the end of the recording.
+
+    >>> TimeSpan(10.0).share_done(40_000_000_000, start_ns=0, end_ns=70_000_000_000)
+    0.5
+    """
+
+    start_s: float = 0.0
+    duration_s: float | None = None
+
+    def length_ns(self, start_ns: int, end_ns: int) -> int:
+        """Length of this part of a recording from `start_ns` to `end_ns`; at least 1."""
+        if self.duration_s is not None:
+            return max(int(self.duration_s * 1e9), 1)
+        return max(end_ns - start_ns - int(self.start_s * 1e9), 1)
+
+    def share_done(self, stamp_ns: int, start_ns: int, end_ns: int) -> float:
+        """How much of this part, 0..1, lies before `stamp_ns`."""
+        elapsed_ns = stamp_ns - start_ns - int(self.start_s * 1e9)
+        return min(max(elapsed_ns / self.length_ns(start_ns, end_ns), 0.0), 1.0)

@@ -9,20 +9,23 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import Config, PartitionConfig
 from pc2grid.errors import NoScans
-from pc2grid.estimation.carried import begin
+from pc2grid.estimation.spatial import begin
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
-from pc2grid.mapping.keyframe_points import KeyframePoints
-from pc2grid.mapping.keyframes import Keyframe, Keyframes
+from pc2grid.libraries import one_blas_thread, one_blas_thread_each
+from pc2grid.mapping.keyframes import Keyframe, KeyframePoints, Keyframes, Track, TrackRecord
 from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, HAND_LOCAL_MAPS, LOCAL_MAPS
-from pc2grid.mapping.loop_closure import LoopCloser
-from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LOOPS
-from pc2grid.mapping.part_maps import draw_parts, long_enough
-from pc2grid.mapping.report import check_followed, part_reports, with_track_warnings
-from pc2grid.mapping.track import Track, TrackRecord
+from pc2grid.mapping.loops import EXACT_TRACKING, LOOPS, LoopCloser
+from pc2grid.mapping.part_maps import (
+    check_followed,
+    draw_parts,
+    long_enough,
+    part_reports,
+    with_track_warnings,
+)
 from pc2grid.model import (
+    SENSOR_MODELS,
     Loop,
     OccupancyGrid,
     ReadReport,
@@ -33,15 +36,13 @@ from pc2grid.model import (
     Trajectory,
     part_name,
 )
-from pc2grid.observer import Observer
-from pc2grid.sensor_model import SENSOR_MODELS
-from pc2grid.submaps.partition import divide
-from pc2grid.threads import one_blas_thread, one_blas_thread_each
-from pc2grid.time_span import TimeSpan
+from pc2grid.observer import Observer, TimeSpan
+from pc2grid.settings import Config, PartitionConfig
+from pc2grid.submaps.submaps import divide
 
 if TYPE_CHECKING:
     from pc2grid.io import Log
-    from pc2grid.mapping.place_recognition import PlaceRecognizer
+    from pc2grid.mapping.loops import PlaceRecognizer
 
 _SHARE_BEFORE_LOOPS = 0.8
 """Share of the work of `build_map` that is done when the last scan has been tracked; chosen by hand."""
@@ -55,7 +56,7 @@ def follow(
     The memory needed is that of one local map, however many scans there are.
 
     observer : is warned of scans before the first that shows which way is up, which are left out
-        (`pc2grid.estimation.carried.begin`).
+        (`pc2grid.estimation.spatial.begin`).
 
     >>> import pc2grid
     >>> with pc2grid.open_log("tuesday.mcap") as log:

@@ -45,24 +45,24 @@ if TYPE_CHECKING:
     from signature.database import SubmapDatabase as SubmapDatabase
     from signature.database import create_database as create_database
     from signature.database import open_database as open_database
-    from signature.describe import Signature as Signature
-    from signature.describe import describe as signature_of  # noqa: F401
-    from signature.files import convert as convert
-    from signature.files import relocalize as relocalize
     from signature.localization.answer import Answer as Answer
-    from signature.localization.answering import locate_map as locate_map
     from signature.localization.localizer import Estimate as Estimate
     from signature.localization.localizer import Localizer as Localizer
+    from signature.localization.localizer import locate_map as locate_map
     from signature.localization.map_index import MapIndex as MapIndex
     from signature.localization.pose_check import PoseCheck as PoseCheck
     from signature.localization.pose_check import check_pose as check_pose
-    from signature.localization.prior import Prior as Prior
+    from signature.localization.posterior import Prior as Prior
+    from signature.paper import Signature as Signature
+    from signature.paper import SignatureTable as SignatureTable
+    from signature.paper import describe as signature_of  # noqa: F401
+    from signature.paper import distances as distances
     from signature.sessions import add_session as add_session
     from signature.sessions import build_session as build_session
     from signature.sessions import build_sessions as build_sessions
+    from signature.sessions import convert as convert
     from signature.sessions import provenance as provenance
-    from signature.similarity import SignatureTable as SignatureTable
-    from signature.similarity import distances as distances
+    from signature.sessions import relocalize as relocalize
 
 # Where each is found; with another name there, behind the colon. A test compares this with the list above.
 _HOMES = {
@@ -71,24 +71,24 @@ _HOMES = {
     "SubmapDatabase": "signature.database",
     "create_database": "signature.database",
     "open_database": "signature.database",
-    "Signature": "signature.describe",
-    "signature_of": "signature.describe:describe",
-    "convert": "signature.files",
-    "relocalize": "signature.files",
+    "Signature": "signature.paper",
+    "signature_of": "signature.paper:describe",
+    "convert": "signature.sessions",
+    "relocalize": "signature.sessions",
     "Answer": "signature.localization.answer",
     "MapIndex": "signature.localization.map_index",
     "PoseCheck": "signature.localization.pose_check",
     "check_pose": "signature.localization.pose_check",
-    "Prior": "signature.localization.prior",
+    "Prior": "signature.localization.posterior",
     "Estimate": "signature.localization.localizer",
     "Localizer": "signature.localization.localizer",
-    "locate_map": "signature.localization.answering",
+    "locate_map": "signature.localization.localizer",
     "add_session": "signature.sessions",
     "build_session": "signature.sessions",
     "build_sessions": "signature.sessions",
     "provenance": "signature.sessions",
-    "SignatureTable": "signature.similarity",
-    "distances": "signature.similarity",
+    "SignatureTable": "signature.paper",
+    "distances": "signature.paper",
 }
 __all__ = [*_HOMES]
 

@@ -4,6 +4,8 @@ Of a submap, and of what is seen from a viewpoint. A submap is cut out of a map 
 are spread evenly over its walls. The points of a view are the ends of its rays. What hides from it counts
 neither for nor against: each bin is a share of what *was seen*, so that a part has about the histogram of the
 whole.
+
+The steps of the description where compiling pays. The tests compare them with plain forms in numpy.
 """
 
 from __future__ import annotations
@@ -11,14 +13,14 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.model import Submap
-from pc2grid.submaps.isovist import HIDDEN, OPEN, WALL, ray_ends
-from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import thin
+from pc2grid.submaps.junction_graph import sample_evenly, thin
+from pc2grid.submaps.submaps import HIDDEN, OPEN, WALL, ray_ends
 from signature.config import SignatureConfig
 
 ROUNDING_BINS = 1e-6
@@ -58,11 +60,10 @@ def boundary_histogram(points: I64, radius_m: float, resolution_m: float, config
     points : (N, 2) cells. Returns (N_hb,) float32, sum 1; all 0 if there are fewer than two points.
     Distances of 2 r and more count in the last bin.
     """
-    from signature import _kernels
 
     bins = boundary_bins(radius_m, config)
     bin_of = bins_of_squares(resolution_m / config.boundary_bin_m, bins)
-    return normalized(_kernels.pair_counts(points, bin_of, bins))
+    return normalized(pair_counts(points, bin_of, bins))
 
 
 @lru_cache(maxsize=8)
@@ -90,7 +91,6 @@ def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
     that there is none: such rays, pairs with one and pairs of two have bins of their own. A ray whose end is
     hidden is known to be free up to there.
     """
-    from signature import _kernels
 
     at = np.minimum((ranges_m / sight_m * RANGE_BINS).astype(np.int64), RANGE_BINS - 1)
     ranges = shares(np.where(ends == OPEN, RANGE_BINS, at), ends != HIDDEN, RANGE_BINS + 1)
@@ -98,7 +98,7 @@ def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
     inside = np.where((ends == OPEN)[:, None], 0.0, inside)
     pairs = np.zeros((len(ranges_m), len(RIMS), PAIR_BINS + 2))
     points = ray_ends(ranges_m) * (PAIR_BINS / (2.0 * sight_m))
-    _kernels.weighed_pairs(points, inside * (ends == WALL)[:, None], 1.0 - inside, pairs)
+    weighed_pairs(points, inside * (ends == WALL)[:, None], 1.0 - inside, pairs)
     pairs = pairs / np.maximum(pairs.sum(axis=2, keepdims=True), 1e-9)
     filled = [pairs[:, number, rim_columns(rim)] for number, rim in enumerate(RIMS)]
     return np.asarray(np.sqrt(np.concatenate((ranges, *filled), axis=1)), np.float64)
@@ -129,3 +129,50 @@ def shares(at: NDArray[np.int64], valid: NDArray[np.bool_], bins: int) -> F64:
 def as_shares(counts: NDArray[np.number]) -> F64:
     """Counts (N, bins) as shares of their row; all 0 stays all 0."""
     return np.asarray(counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0), np.float64)
+
+
+@numba.njit(cache=True)
+def pair_counts(cells: I64, bin_of: NDArray[np.int32], bins: int) -> I64:
+    """How many pairs of cells (N, 2) lie in each bin of their distance: (bins,).
+
+    bin_of : the bin of each squared distance in cells; longer distances count in the last bin.
+
+    Measured: 1,200 points of a disc of 8 m in 1.1 ms, where their distances as floating point take 5.
+    """
+    counts = np.zeros(bins, np.int64)
+    rows, columns = np.empty(len(cells), np.int32), np.empty(len(cells), np.int32)
+    for i in range(len(cells)):
+        rows[i], columns[i] = cells[i, 0], cells[i, 1]
+    for i in range(len(cells)):
+        row, column = rows[i], columns[i]
+        for j in range(i + 1, len(cells)):
+            down, across = rows[j] - row, columns[j] - column
+            squared = down * down + across * across
+            counts[bin_of[squared] if squared < len(bin_of) else bins - 1] += 1
+    return counts
+
+
+@numba.njit(cache=True)
+def weighed_pairs(points: F64, walls: F64, opens: F64, counts: F64) -> None:
+    """Add the weights of all pairs of points (N, B, 2) to `counts` (N, R, bins + 2) of their distance.
+
+    points : in units of the width of a bin; longer distances count in the last bin. walls, opens (N, R, B) :
+    how far each point is on a wall, and how far there is none. A pair of walls counts in the bin of its
+    distance, by the product of both weights; the last two bins hold the pairs of a wall and none, and of
+    none and none.
+
+    Measured: 48 points with four weights in 0.01 ms.
+    """
+    bins = counts.shape[2] - 2
+    for row in range(points.shape[0]):
+        for i in range(points.shape[1]):
+            for j in range(i + 1, points.shape[1]):
+                x = points[row, i, 0] - points[row, j, 0]
+                y = points[row, i, 1] - points[row, j, 1]
+                at = min(int(np.sqrt(x * x + y * y) + 1e-6), bins - 1)
+                for rim in range(walls.shape[1]):
+                    counts[row, rim, at] += walls[row, rim, i] * walls[row, rim, j]
+        for rim in range(walls.shape[1]):
+            wall, none = walls[row, rim], opens[row, rim]
+            counts[row, rim, bins] += wall.sum() * none.sum() - (wall * none).sum()
+            counts[row, rim, bins + 1] += 0.5 * (none.sum() ** 2 - (none * none).sum())

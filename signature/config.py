@@ -7,8 +7,8 @@ from typing import Literal
 from pydantic import Field
 from typing_extensions import Self
 
-import pc2grid.config
-from pc2grid.config import PartitionConfig, Section
+import pc2grid.settings
+from pc2grid.settings import PartitionConfig, Section
 
 Thinning = Literal["guo_hall", "zhang_suen"]
 
@@ -182,7 +182,7 @@ class RelocalizeConfig(Section):
     accept: float = Field(0.75, gt=0, lt=1, description="least confidence to answer located")
 
 
-class Config(pc2grid.config.Config):
+class Config(pc2grid.settings.Config):
     """All sections; what `pc2grid config dump` prints.
 
     >>> config = Config()

@@ -20,12 +20,11 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from pc2grid import extras
+from pc2grid import libraries as extras
 from pc2grid._version import __version__
 from pc2grid.errors import ClusterError, DatabaseError
-from pc2grid.mapping.drawn_map import is_drawn_map
-from pc2grid.observer import Observer
-from pc2grid.time_span import TimeSpan
+from pc2grid.mapping.drawn import is_drawn_map
+from pc2grid.observer import Observer, TimeSpan
 from signature.config import Config
 from signature.database.protocol import Entry, Label, Provenance
 from signature.sessions import build_sessions, describe_all, digest_of, provenance

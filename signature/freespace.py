@@ -12,19 +12,20 @@ import math
 from itertools import chain
 from typing import TYPE_CHECKING
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.model import OccupancyGrid, Submap
-from pc2grid.submaps.isovist import HIDDEN, ray_ends
-from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import skeleton_of
+from pc2grid.submaps.junction_graph import sample_evenly, skeleton_of
+from pc2grid.submaps.submaps import HIDDEN, ray_ends
 from signature.boundary import ROUNDING_BINS, normalized, shares
 from signature.config import SignatureConfig
 
 if TYPE_CHECKING:
     import networkx as nx
+
 
 PATH_BINS = 20
 """Bins of lengths of paths in what is seen, up to twice the limit of sight."""
@@ -95,8 +96,6 @@ def _edges(
     """The edges of `visibility_graph`: their nodes i < j (E,) and (E,), and their lengths (E,) in metres."""
     from scipy.spatial.distance import pdist
 
-    from signature import _kernels
-
     # Both list the pairs i < j in the same order.
     first, second = np.triu_indices(len(cells), 1)
     length_m = pdist(cells) * grid.resolution_m
@@ -104,7 +103,7 @@ def _edges(
         near = length_m <= config.freespace_join_m
         first, second, length_m = first[near], second[near], length_m[near]
     occupied = np.ascontiguousarray(grid.occupied)
-    joined = _kernels.in_sight(occupied, np.ascontiguousarray(cells), first, second)
+    joined = in_sight(occupied, np.ascontiguousarray(cells), first, second)
     return first[joined], second[joined], length_m[joined]
 
 
@@ -245,3 +244,41 @@ def _nodes(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, NDArray[np.bool_
         visible[:, 1 + a, 1 + b], visible[:, 1 + b, 1 + a] = clear, clear
     visible &= known[:, :, None] & known[:, None]
     return points_m, known, visible
+
+
+@numba.njit(cache=True)
+def in_sight(
+    occupied: NDArray[np.bool_], cells: I64, first: NDArray[np.intp], second: NDArray[np.intp]
+) -> NDArray[np.bool_]:
+    """Whether the straight lines between the centres of cells[first] and cells[second] meet no occupied cell.
+
+    occupied (H, W); cells (N, 2) as (row, column); first, second (P,) indices. Returns (P,).
+
+    Every cell that a line passes through is tested, so no line crosses a wall of one pixel. A line through
+    the common corner of four cells is blocked only if both cells beside the corner are occupied (Amanatides
+    and Woo 1987, in integers).
+
+    Measured: a disc of 8 m is described in 9.5 instead of 75 ms, a view of 5 m in 1.1 instead of 6.4 ms.
+    """
+    width = occupied.shape[1]
+    flat = occupied.reshape(-1)
+    visible = np.empty(len(first), np.bool_)
+    for pair in range(len(first)):
+        a, b = first[pair], second[pair]
+        r0, c0, r1, c1 = cells[a, 0], cells[a, 1], cells[b, 0], cells[b, 1]
+        rows, columns = abs(r1 - r0), abs(c1 - c0)
+        down, across = (width if r1 > r0 else -width), (1 if c1 > c0 else -1)
+        at, end = r0 * width + c0, r1 * width + c1
+        lead = rows - columns
+        while not flat[at] and at != end:
+            if lead == 0:
+                if flat[at + down] and flat[at + across]:
+                    break
+                at += down + across
+                lead += 2 * (rows - columns)
+            else:
+                row = int(lead > 0)
+                at += across + row * (down - across)
+                lead += 2 * (rows - row * (rows + columns))
+        visible[pair] = at == end and not flat[end]
+    return visible

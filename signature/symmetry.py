@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid, cells_of
-from pc2grid.submaps.isovist import HIDDEN
+from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.submaps.submaps import HIDDEN
 from signature.config import SignatureConfig
 
 _DIRECTIONS = 180

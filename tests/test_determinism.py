@@ -8,7 +8,7 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.model import SensorKind
 from pc2grid.simulate import SimulationConfig, simulate_session
 from tests.helpers.rooms import small_house

@@ -40,7 +40,7 @@ import pytest
 
 from pc2grid import errors
 from pc2grid.errors import Pc2GridError
-from pc2grid.io.export.cloud import write_cloud
+from pc2grid.io.export import write_cloud
 from pc2grid_cli import console
 from signature.database import open_database
 from signature.database.maintenance import check, store

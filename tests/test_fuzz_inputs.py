@@ -17,10 +17,10 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import DatabaseError, MapFileError, Pc2GridError
-from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.maps import load_map, save_map
 from pc2grid.model import OccupancyGrid
+from pc2grid.settings import ReadConfig
 from signature.database import open_database
 from signature.database.maintenance import check, copy, store
 from tests.helpers import foxglove_messages as foxglove

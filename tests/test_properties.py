@@ -13,7 +13,6 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from pc2grid.config import Section
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import (
     SE2,
@@ -28,7 +27,7 @@ from pc2grid.geometry import (
 )
 from pc2grid.io.trajectory import write_kitti
 from pc2grid.model import Trajectory
-from pc2grid.settings import dump_settings, load_settings
+from pc2grid.settings import Section, dump_settings, load_settings
 from signature.config import Config
 
 METRES = st.floats(-1e4, 1e4)

@@ -12,17 +12,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pc2grid.arrays import hand_over
 from pc2grid.errors import ClusterError, ConfigError
-from pc2grid.geometry import SE2
+from pc2grid.geometry import SE2, hand_over
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Health, Loop, OccupancyGrid, Scan, SessionMap, Trajectory
 from pc2grid.settings import load_settings
-from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
+from pc2grid_lab.experiments.truth import read_relations, relation_error
 from signature.config import Config
-from signature.describe import Signature
-from signature.retrieval.lazy_maps import LazySequence
-from signature.similarity import SignatureTable
+from signature.paper import Signature, SignatureTable
+from signature.retrieval.places import LazySequence
 
 GRID = OccupancyGrid(cells=np.zeros((2, 2)), resolution_m=0.05, origin_m=(0.0, 0.0))
 STILL = Trajectory(stamps_ns=np.arange(3), T_session_base=np.stack([np.eye(4)] * 3))

@@ -14,9 +14,8 @@ from packaging.specifiers import SpecifierSet
 from typer.testing import CliRunner
 
 import pc2grid
-from pc2grid.config import PartitionConfig
 from pc2grid.errors import ConfigError
-from pc2grid.settings import dump_settings, load_settings
+from pc2grid.settings import PartitionConfig, dump_settings, load_settings
 from pc2grid_cli.main import app
 from signature.config import Config
 
@@ -53,7 +52,7 @@ def test_scripts_are_posix_shell() -> None:
 
 def test_library_neither_prints_nor_exits_nor_imports_upward() -> None:
     code = (
-        "import sys, pc2grid, pc2grid.model, pc2grid.errors, pc2grid.config, signature.config\n"
+        "import sys, pc2grid, pc2grid.model, pc2grid.errors, pc2grid.settings, signature.config\n"
         "print([m for m in ('pc2grid_cli', 'open3d', 'cv2', 'matplotlib') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)

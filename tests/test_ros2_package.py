@@ -24,7 +24,7 @@ import pytest
 import yaml
 from rosbags.typesys import Stores, get_typestore
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.config import Config

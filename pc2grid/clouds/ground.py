@@ -2,19 +2,311 @@
 
 The tf of a robot says where the floor should be; a hand-held sensor has no such knowledge. Both cases are
 treated alike: the floor is the lowest large, roughly level plane of a scan. Planes are found by Open3D.
+
+The floor in a map of surfaces, and how high it lies from scan to scan.
+
+A single view of a tilted camera may show a table only. In what several views have shown together, walls
+stand, floors and table tops lie, and the floor is the lowest large level. From there it is followed: one
+recording is one floor, and a floor is level, so that what rises is the pose by which it is seen.
+
+Which way is up, by the walls that one scan shows.
+
+A plane that slants, such as the back of a chair, may be taken for a floor. Walls are upright: the vertical is
+the direction to which their normals are perpendicular.
+
+The numbers of the cloud stage. Where no other origin is given, a number was chosen by hand.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64
-from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
-from pc2grid.clouds.sampling import random_subset
-from pc2grid.geometry import leveling
+from pc2grid.clouds.cloud import random_subset
+from pc2grid.geometry import F64, BoolGrid, leveling
+from pc2grid.model import SENSOR_MODELS, Scan
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelParameters:
+    """Numbers of the search. Chosen by hand.
+
+    flat : least information along the vertical of a voxel of a level surface.
+    level : cosine of its normal with the vertical above which it lies.
+    least_m2 : smallest floor.
+    share : of the largest level that the floor must have: less below it are reflections.
+    radius_m : around the sensor. bin_m : height of a slab. below_m : the floor is so far below the sensor.
+
+    Of the floor that is followed:
+
+    near_m : a level so near to where it is expected, beside three standard deviations, is the floor: a seat
+        lies higher.
+    seen_m : standard deviation of the height that one view tells.
+    drift_per_m : variance that the height of a pose gains on a metre of travel, m2: 2 cm on the first, 10 cm
+        on 25 m, where the odometry of a phone drifts by half a percent.
+    """
+
+    flat: float = 0.3
+    level: float = 0.97
+    least_m2: float = 0.4
+    share: float = 0.15
+    radius_m: float = 5.0
+    bin_m: float = 0.1
+    below_m: float = 0.3
+    near_m: float = 0.2
+    seen_m: float = 0.03
+    drift_per_m: float = 0.02**2
+
+
+LEVEL = LevelParameters()
+
+
+def floor_height(
+    shapes: F64, edge_m: float, sensor_m: F64, parameters: LevelParameters = LEVEL
+) -> float | None:
+    """z of the floor below a sensor at (3,), in a map whose z axis is up; None if it was not seen.
+
+    The floor is the lowest large level around the sensor: tables lie above it, reflections below are small.
+    """
+    p = parameters
+    heights = shapes[_lying_below(shapes, sensor_m, p), 2]
+    if not len(heights):
+        return None
+    slab = np.floor((heights - heights.min()) / p.bin_m).astype(np.int64)
+    counts = np.bincount(slab, minlength=2)
+    # A floor on the border of two slabs is in both.
+    pairs = np.append(counts[:-1] + counts[1:], counts[-1]) * edge_m**2
+    large = np.flatnonzero(pairs > max(p.least_m2, p.share * pairs.max()))
+    if not len(large):
+        return None
+    lowest = int(large[0])
+    if lowest + 1 < len(pairs) and pairs[lowest + 1] > pairs[lowest]:
+        lowest += 1
+    return float(np.median(heights[(slab == lowest) | (slab == lowest + 1)]))
+
+
+def _lying_below(shapes: F64, sensor_m: F64, p: LevelParameters) -> BoolGrid:
+    """The shapes (V, 9) of level surfaces around and below a sensor at (3,)."""
+    near = (np.abs(shapes[:, :2] - sensor_m[:2]) < p.radius_m).all(axis=1)
+    # Of a plane, each column of the information points along the normal.
+    _, _, xz, _, yz, zz = shapes[:, 3:].T
+    lying = (zz > p.flat) & (zz > p.level * np.sqrt(xz**2 + yz**2 + zz**2))
+    below: BoolGrid = near & lying & (shapes[:, 2] < sensor_m[2] - p.below_m)
+    return below
+
+
+class FloorBelow:
+    """z of the floor below a sensor in the hand, by poses whose height drifts.
+
+    z_m : None as long as none was seen. sigma_m : its standard deviation.
+    risen_m : how far the poses have risen since the floor was first seen.
+    """
+
+    def __init__(self, parameters: LevelParameters = LEVEL) -> None:
+        self._parameters = parameters
+        self.z_m: float | None = None
+        self.sigma_m = self.risen_m = 0.0
+
+    def follow(self, travel_m: float, view: F64, surfaces: F64, edge_m: float, sensor_m: F64) -> float | None:
+        """Go on after some travel; returns z of the floor by a view alone, None if that does not show it.
+
+        view : (V, 9) the shapes that it shows by itself; surfaces : (W, 9) those of all views.
+        """
+        p = self._parameters
+        variance = self.sigma_m**2 + p.drift_per_m * travel_m
+        self.sigma_m = math.sqrt(variance)
+        near_m = p.near_m + 3.0 * self.sigma_m
+        # A view may show a reflection, and all views the floor of another pass; a lower floor is in both.
+        if self.z_m is None or self._lower(view, near_m, edge_m, sensor_m) is not None:
+            lowest_m = self._lower(surfaces, near_m, edge_m, sensor_m)
+            if lowest_m is not None:
+                self.z_m, self.sigma_m = lowest_m, p.seen_m
+        if self.z_m is None:
+            return None
+        heights_m = view[_lying_below(view, sensor_m, p), 2]
+        heights_m = heights_m[np.abs(heights_m - self.z_m) < near_m]
+        if len(heights_m) * edge_m**2 < p.least_m2:
+            return None
+        seen_m = float(np.median(heights_m))
+        gain = variance / (variance + p.seen_m**2)
+        rise_m = gain * (seen_m - self.z_m)
+        self.z_m, self.risen_m = self.z_m + rise_m, self.risen_m + rise_m
+        self.sigma_m = math.sqrt((1.0 - gain) * variance)
+        return seen_m
+
+    def _lower(self, surfaces: F64, near_m: float, edge_m: float, sensor_m: F64) -> float | None:
+        """z of the floor in surfaces (V, 9), if it lies far below what was taken for it, such as a table, or
+        none is known; else None."""
+        lowest_m = floor_height(surfaces, edge_m, sensor_m, self._parameters)
+        if lowest_m is not None and self.z_m is not None and lowest_m > self.z_m - near_m:
+            return None
+        return lowest_m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UprightParameters:
+    """How the vertical is measured. Chosen by hand, on simulated scans of a 16-beam lidar.
+
+    points, voxel_m, normals : so many of a scan are used, of these one a voxel, so that near walls count no
+        more, and for so many of them a normal is estimated.
+    neighbours : points of which a normal is estimated. squeeze : their heights count this many times when
+        neighbours are looked for, so that they lie on several rings of a lidar.
+    flatness : largest ratio of the variances across a surface and along its shorter side.
+    breadth_m : least standard deviation along that side: points of a single ring have no normal.
+    steepest_rad : normals nearer to the vertical than 90 degrees minus this are not of walls.
+    scale : of the robust weight of a normal, sine of its angle with the horizontal.
+    rounds : of reweighting.
+    least_normals, least_share : with fewer normals, or with less weight on the second direction of walls,
+        the vertical is not determined.
+    side_share : weight, as a share of that of all normals, of the vertical being perpendicular to the y axis
+        of the base, about which a hand turns a camera most. So one wall ahead, which shows the pitch, is
+        enough.
+    """
+
+    points: int = 12_000
+    voxel_m: float = 0.07
+    normals: int = 700
+    neighbours: int = 40
+    squeeze: float = 0.4
+    flatness: float = 0.05
+    breadth_m: float = 0.12
+    steepest_rad: float = math.radians(37.0)
+    scale: float = 0.05
+    rounds: int = 8
+    least_normals: int = 30
+    least_share: float = 0.05
+    side_share: float = 0.0
+
+
+UPRIGHT = UprightParameters()
+CAMERA_UPRIGHT = UprightParameters(voxel_m=0.1, squeeze=0.7, side_share=0.1)
+"""Of a depth camera. It sees small patches densely: with the voxels of a lidar, the neighbours of a point
+span less than `breadth_m`. Chosen by hand; in a room by a phone (`depth/room`) 3 planes of 25, tilted by 14
+to 27 degrees, are told from the floor by it."""
+
+
+def level_floor(scan: Scan, points_m: NDArray[np.floating]) -> Ground | None:
+    """The floor in the points (N, 3) of a scan, base frame; None if it shows none.
+
+    What the walls of the scan do not stand on is no floor, but a slanting plane such as the back of a chair.
+    """
+    ground = find_ground(points_m, scan.T_base_sensor[:3, 3])
+    if ground is None:
+        return None
+    parameters = CAMERA_UPRIGHT if SENSOR_MODELS[scan.sensor].narrow else UPRIGHT
+    vertical = vertical_of(points_m, ground.normal, parameters)
+    return ground if vertical is None or float(vertical @ ground.normal) > LEVEL.level else None
+
+
+def vertical_of(
+    points_m: NDArray[np.floating], guess: F64, parameters: UprightParameters = UPRIGHT
+) -> F64 | None:
+    """The vertical (3,), a unit vector that points up, by the walls in a scan; None if they do not show it.
+
+    points_m : (N, 3) in the base frame, without the sensor's motion. guess : (3,) direction around which the
+    vertical is looked for: the one that is perpendicular to most normals.
+    """
+    p, normals = parameters, _normals(points_m, parameters)
+    walls = normals[np.abs(normals @ guess) < math.sin(p.steepest_rad)]
+    if len(walls) < p.least_normals:
+        return None
+    vertical, spread, weight = guess, np.zeros(3), np.zeros(1)
+    for _ in range(p.rounds):
+        weight = (1.0 + ((walls @ vertical) / p.scale) ** 2) ** -2
+        scatter = (walls * weight[:, None]).T @ walls
+        scatter[1, 1] += p.side_share * weight.sum()
+        spread, axes = np.linalg.eigh(scatter)
+        vertical = axes[:, 0] if axes[:, 0] @ guess > 0.0 else -axes[:, 0]
+    return vertical if spread[1] > p.least_share * float(weight.sum()) else None
+
+
+def _normals(points_m: NDArray[np.floating], p: UprightParameters) -> F64:
+    """Normals (K, 3) of flat surfaces."""
+    from scipy.spatial import cKDTree
+
+    points = points_m[random_subset(len(points_m), p.points)].astype(np.float64)
+    _, first = np.unique(np.floor(points / p.voxel_m).astype(np.int64), axis=0, return_index=True)
+    points = points[np.sort(first)]
+    if len(points) < p.neighbours:
+        return np.empty((0, 3))
+    squeezed = points * (1.0, 1.0, p.squeeze)
+    _, near = cKDTree(squeezed).query(squeezed[random_subset(len(points), p.normals)], k=p.neighbours)
+    around = points[near]
+    around -= around.mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / p.neighbours)
+    flat = (variances[:, 0] < p.flatness * variances[:, 1]) & (variances[:, 1] > p.breadth_m**2)
+    normals: F64 = axes[flat, :, 0]
+    return normals
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CloudParameters:
+    """How one cloud is processed.
+
+    Ground plane:
+
+    ground_sample, ground_voxel_m, ground_points : the floor is looked for in a random sample of a scan, of
+        which Open3D keeps one point a voxel, and of these again a sample, each of at most this size.
+    ground_min_points : with fewer points no plane is looked for.
+    max_tilt_rad : largest angle between a floor's normal and the z axis of the base.
+    plane_tolerance_m : half thickness of a floor, three to four times the range noise of a lidar.
+    search_iterations, search_planes : RANSAC iterations for each plane, and how many planes are taken out
+        of a cloud, the largest first, before the search gives up. 300 draws of three points contain three
+        floor points with a probability of 99 % where a quarter of the points lies on the floor.
+    expected_iterations : the same where the plane is known to 2 * `plane_tolerance_m`, so that nearly all
+        candidates lie on it.
+    min_plane_share : smallest share of a scan that lies on a floor (`min_plane_points`: or this many).
+    beneath_m, max_beneath_share : a floor has at most this share of the points farther than this below it.
+        This separates a floor from a table.
+    min_plane_extent_m : standard deviation of the points of a floor along its shorter side. A narrower
+        strip, such as the foot of a wall, does not determine the tilt.
+    step_tilt_rad, step_height_m : largest change of the floor against what was expected.
+
+    Normals:
+
+    reach_m, reach_per_m : radius of the neighbourhood of a hit, and its growth with the range, since the
+        distance between beams grows with it.
+    sparse_factor : the neighbourhood is this many times as wide where it contains fewer than three hits.
+    max_flatness : largest ratio of the variances across and along a surface.
+
+    Planar scan:
+
+    limit_sigmas : hits so many standard deviations before the farthest depth of a camera, or beyond, are left
+        out; see `pc2grid.clouds.planar_scan`.
+    max_gap_bins : bearings without a return between two with one count as seen up to this many.
+    """
+
+    ground_sample: int = 10_000
+    ground_voxel_m: float = 0.1
+    ground_points: int = 2500
+    ground_min_points: int = 50
+    max_tilt_rad: float = math.radians(35.0)
+    plane_tolerance_m: float = 0.04
+    search_iterations: int = 300
+    search_planes: int = 8
+    expected_iterations: int = 20
+    min_plane_share: float = 0.02
+    min_plane_points: int = 30
+    beneath_m: float = 0.12
+    max_beneath_share: float = 0.05
+    min_plane_extent_m: float = 0.15
+    step_tilt_rad: float = math.radians(3.0)
+    step_height_m: float = 0.06
+
+    reach_m: float = 0.08
+    reach_per_m: float = 0.02
+    sparse_factor: float = 4.0
+    max_flatness: float = 0.3
+
+    limit_sigmas: float = 2.0
+    max_gap_bins: int = 5
+
+
+CLOUD_PARAMETERS = CloudParameters()
+
 
 Plane = tuple[F64, float]
 """Unit normal (3,) that points up, and offset: height = normal . p + offset."""

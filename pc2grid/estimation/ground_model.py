@@ -6,12 +6,10 @@ import math
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64
 from pc2grid.clouds.ground import Ground, assumed_ground, find_ground
-from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.geometry import SE2
-from pc2grid.model import Scan
-from pc2grid.sensor_model import SENSOR_MODELS
+from pc2grid.estimation.line_map import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.geometry import F32, F64, SE2
+from pc2grid.model import SENSOR_MODELS, Scan
 
 _UPRIGHT_HEIGHT_M, _UPRIGHT_TILT_RAD = 0.05, math.radians(0.5)
 """A base on wheels keeps its height and its tilt within these, as its odometry reports them: an EKF in three

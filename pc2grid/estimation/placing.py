@@ -15,11 +15,10 @@ from typing import Protocol
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.estimation.belief import KERNEL, Belief
-from pc2grid.estimation.manifold import steps
-from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.estimation.line_map import TRACKING_PARAMETERS, TrackingParameters, steps
+from pc2grid.estimation.smoother import KERNEL, Belief
+from pc2grid.geometry import F32, F64
 from pc2grid.model import Scan
 
 Estimate = tuple[F64, F64]
@@ -49,7 +48,7 @@ class Fit:
 class PlacingSensor(Protocol):
     """Takes in the scans of a session, one after another, and matches them with a local map.
 
-    free : directions of the pose that can change, `PLANAR` or `SPATIAL` of `pc2grid.estimation.belief`.
+    free : directions of the pose that can change, `PLANAR` or `SPATIAL` of `pc2grid.estimation.smoother`.
     points_m : (N, 3) deskewed points of a scan in the base frame.
     """
 

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64
-from pc2grid.config import RegistrationConfig
-from pc2grid.geometry import pose_from_rotation_vector, rotation_vector
+from pc2grid.geometry import F64, pose_from_rotation_vector, rotation_vector
 from pc2grid.model import Scan
+from pc2grid.settings import RegistrationConfig
 
 _EXACT = 1e-12
 """A rotation matrix times its transpose differs from 1 by less; products of a few of them do, too."""

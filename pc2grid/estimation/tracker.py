@@ -4,33 +4,212 @@ Each source counts by what it measures. Odometry knows the motion to a few perce
 knows the pose to millimetres, but only across the surfaces that it shows. A sensor places a scan by itself
 (`SensorOnWheels` in the plane, `CarriedSensor` in space); the smoother weighs that against odometry and
 against the scans before.
+
+What the pose of a scan is worth: by how the scan fits the local map.
+
+What odometry reports from scan to scan, and whether that can be.
+
+Where the scans overruled odometry.
+
+Wheels slip, and odometry of real robots comes late, bunched or repeated. The scans then show another motion,
+and tracking follows them; the poses are fine, but a user wants to know where and how often that was so.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64
-from pc2grid.clouds.deskew import deskew
+from pc2grid.clouds.cloud import deskew, random_subset
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.clouds.sampling import random_subset
-from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.estimation.belief import Belief
-from pc2grid.estimation.carried import CarriedSensor
-from pc2grid.estimation.health import HealthJudge, Standstill
-from pc2grid.estimation.odometer import Odometer
-from pc2grid.estimation.on_wheels import SensorOnWheels
-from pc2grid.estimation.overruled import Disagreement
-from pc2grid.estimation.parameters import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.estimation.line_map import TRACKING_PARAMETERS, TrackingParameters
 from pc2grid.estimation.placing import Placed, Placer, PlacingSensor
-from pc2grid.estimation.smoother import Evidence, Smoother
-from pc2grid.estimation.window import IN_THE_HAND, SMOOTHER
-from pc2grid.geometry import SE2, invert_pose
-from pc2grid.model import Health, RegisteredScan, Scan
+from pc2grid.estimation.planar import SensorOnWheels
+from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, Belief, Evidence, Smoother
+from pc2grid.estimation.spatial import CarriedSensor
+from pc2grid.geometry import F32, F64, SE2, invert_pose, motion_size
+from pc2grid.model import Health, OdometryCheck, Overruled, RegisteredScan, Scan
+from pc2grid.settings import ProjectionConfig, RegistrationConfig
+
+
+class HealthJudge:
+    """Judges each scan, and counts the lost ones in a row."""
+
+    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters = parameters
+        self._lost_scans = 0
+
+    def judge(self, placed: Placed, unaided: Belief | None, *, bridged: bool) -> Health:
+        """Judge a scan by where it was placed.
+
+        unaided : what is known of the pose of a sensor in the hand by scans alone; None on wheels, which do
+        not slip along a wall, and with odometry. bridged : odometry goes on from the scan before.
+
+        A scan that fits is FINE; DEGENERATE if one direction of its position is not determined; LOST if a
+        direction of an unaided pose is not known. One that does not fit is DEGENERATE, too, where odometry
+        tells where it is from a scan that was not lost; else LOST.
+        """
+        p, (sigma_m, sigma_rad) = self._parameters, (0.0, 0.0) if unaided is None else unaided.sigmas
+        fits = placed.first or placed.alone is not None
+        if fits and sigma_m <= p.known_m and sigma_rad <= p.known_rad:
+            self.restart()
+            return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
+        if bridged and not self._lost_scans:
+            return Health.DEGENERATE
+        if fits:  # a pose that fits anywhere along a wall does not become known by waiting
+            return self.give_up()
+        self._lost_scans += 1
+        return Health.LOST
+
+    @property
+    def gives_up(self) -> bool:
+        """Whether tracking must start again: so many scans in a row were lost."""
+        return self._lost_scans > self._parameters.give_up_scans
+
+    def give_up(self) -> Health:
+        """Start tracking again at once: the scan is lost."""
+        self._lost_scans += self._parameters.give_up_scans + 1
+        return Health.LOST
+
+    def restart(self) -> None:
+        """Start to count again."""
+        self._lost_scans = 0
+
+
+class Standstill:
+    """Notices that the walls have changed for good while odometry stood still, as after a ride in a lift.
+
+    Walls that come back, while the base stands or when it leaves, have not changed.
+    """
+
+    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters = parameters
+        self._known: tuple[int, F64] | None = None  # stamp and T_odom_base of the last scan that fits well
+
+    def left(self, scan: Scan, *, sure: bool) -> bool:
+        """Take in the next scan; returns whether the base leaves a place whose walls have changed.
+
+        sure : it fits the local map well; not so the first scan of a map, which fits in any case. Where no
+        scan has fitted well yet, as behind glass, nothing can be said to have changed.
+        """
+        T_odom_base = scan.T_odom_base
+        if sure and T_odom_base is not None:
+            self._known = scan.stamp_ns, T_odom_base
+        known = self._known
+        if sure or known is None or T_odom_base is None:
+            return False
+        p, (distance_m, turn_rad) = self._parameters, motion_size(invert_pose(known[1]) @ T_odom_base)
+        if distance_m <= p.standing_m and turn_rad <= p.standing_rad:
+            return False
+        self._known = scan.stamp_ns, T_odom_base
+        return (scan.stamp_ns - known[0]) * 1e-9 > p.changed_s
+
+
+class Odometer:
+    """Remembers the last reading, and the pose of the base then. begin_ns : stamp of the first scan."""
+
+    def __init__(self, begin_ns: int = 0, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters, self._begin_ns = parameters, begin_ns
+        self._scans = 0
+        self._last: tuple[F64, F64] | None = None  # T_odom_base and T_session_base
+
+    def remember(self, scan: Scan, pose: F64) -> None:
+        """Keep the reading of a scan, if it has one, with its final pose (4, 4)."""
+        self._scans += 1
+        if scan.T_odom_base is not None:
+            self._last = scan.T_odom_base, pose
+
+    def reported(self, scan: Scan) -> F64 | None:
+        """The motion (4, 4) since the last reading; None if there is none."""
+        if scan.T_odom_base is None or self._last is None:
+            return None
+        return invert_pose(self._last[0]) @ scan.T_odom_base
+
+    def continues(self, scan: Scan, seconds: float) -> bool:
+        """Whether odometry goes on from where it was last known; `seconds` since the last scan.
+
+        It does not if it reports an impossible motion, nor over a gap in which the log has neither scans nor
+        readings: its driver may have been restarted meanwhile. Nor does its first reading: odometry may begin
+        after the first scan, anywhere.
+        """
+        if scan.T_odom_base is None:
+            return True
+        reported = self.reported(scan)
+        usual_s = (scan.stamp_ns - self._begin_ns) * 1e-9 / max(self._scans, 1)
+        gap = min(seconds, scan.odometry_gap_s) > self._parameters.gap * usual_s
+        return reported is not None and not gap and self.is_possible(reported, seconds)
+
+    def is_possible(self, motion: F64, seconds: float) -> bool:
+        """Whether a robot or a person indoors can make a motion (4, 4) in a time."""
+        p, (distance_m, turn_rad) = self._parameters, motion_size(motion)
+        return max(distance_m, turn_rad) <= p.jump + p.fastest * seconds
+
+    def disagreement(self, scan: Scan, pose: F64) -> Disagreement | None:
+        """By how much the reported motion differs from that to the final pose (4, 4) of a scan."""
+        reported = self.reported(scan)
+        if reported is None or self._last is None:
+            return None
+        return disagreement(reported, invert_pose(self._last[1]) @ pose)
+
+
+_INEXACT_M, _INEXACT_RAD, _INEXACT_SHARE = 0.1, 0.1, 0.1
+"""Odometry that differs by less, or by less than this share of the motion, is merely inexact; by hand."""
+_TOGETHER_NS = 10**9
+"""Overruled scans that follow each other within this time are one stretch; chosen by hand."""
+_SHOWN = 20
+"""Stretches that are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disagreement:
+    """By how much the motion to a scan that odometry reports differs from that which the scan shows.
+
+    distance_m, turn_rad : size of the difference. overrules : whether it is more than odometry that is merely
+        inexact explains.
+    """
+
+    distance_m: float
+    turn_rad: float
+    overrules: bool
+
+
+def disagreement(reported: F64, moved: F64) -> Disagreement:
+    """By how much the motion (4, 4) that odometry reports differs from that of the poses."""
+    distance_m, turn_rad = motion_size(invert_pose(reported) @ moved)
+    (reported_m, reported_rad), (moved_m, moved_rad) = motion_size(reported), motion_size(moved)
+    overrules = distance_m > _INEXACT_M + _INEXACT_SHARE * max(
+        reported_m, moved_m
+    ) or turn_rad > _INEXACT_RAD + _INEXACT_SHARE * max(reported_rad, moved_rad)
+    return Disagreement(distance_m, turn_rad, overrules)
+
+
+def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None]) -> OdometryCheck:
+    """What the scans of a session say of its odometry.
+
+    disagreements : of each scan; None where there was nothing to compare.
+    """
+    compared = [(stamp, found) for stamp, found in zip(stamps_ns, disagreements, strict=True) if found]
+    overruled = [(stamp_ns, found) for stamp_ns, found in compared if found.overrules]
+    ends = np.flatnonzero(np.diff([stamp_ns for stamp_ns, _ in overruled]) > _TOGETHER_NS) + 1
+    cuts = [0, *ends.tolist(), len(overruled)]
+    stretches = [
+        Overruled(
+            from_ns=group[0][0],
+            to_ns=group[-1][0],
+            distance_m=max(found.distance_m for _, found in group),
+            turn_rad=max(found.turn_rad for _, found in group),
+        )
+        for group in (overruled[first:end] for first, end in itertools.pairwise(cuts) if first < end)
+    ]
+    stretches.sort(key=lambda s: (-(s.distance_m + s.turn_rad), s.from_ns))
+    return OdometryCheck(
+        compared=len(compared), overruled=len(overruled), stretches=tuple(stretches[:_SHOWN])
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +246,7 @@ class Tracker:
         *,
         in_hand: bool,
     ) -> None:
-        """in_hand : how the sensor is carried; `pc2grid.estimation.carried.begin` finds it out."""
+        """in_hand : how the sensor is carried; `pc2grid.estimation.spatial.begin` finds it out."""
         self._config = registration
         self._parameters = parameters
         self._last: Scan | None = None

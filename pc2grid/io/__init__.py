@@ -17,7 +17,7 @@ trajectory, all through atomic.
 
 from __future__ import annotations
 
-from pc2grid.io.message_source import Choice, LogInfo, TopicInfo
 from pc2grid.io.recording import Log, open_log
+from pc2grid.io.source import Choice, LogInfo, TopicInfo
 
 __all__ = ["Choice", "Log", "LogInfo", "TopicInfo", "open_log"]

@@ -21,13 +21,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pc2grid.arrays import F64, I64
-from pc2grid.config import ReadConfig
 from pc2grid.errors import LogError, MapFileError
-from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
-from pc2grid.io.messages.cloud_files import HEADER_BYTES, parser
+from pc2grid.geometry import F64, I64
+from pc2grid.io.messages.clouds import HEADER_BYTES, parser
 from pc2grid.io.messages.types import Header
 from pc2grid.io.sensors.pointcloud2 import decode
+from pc2grid.io.source import LFS_HINT, is_lfs_pointer
+from pc2grid.settings import ReadConfig
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
@@ -86,7 +86,7 @@ def building_points(
     Raises MapFileError if there is no such file, it cannot be read, is damaged, or its coordinates are too
     large for float32.
 
-    >>> from pc2grid.io.export.cloud import write_cloud
+    >>> from pc2grid.io.export import write_cloud
     >>> write_cloud("corner.ply", [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     >>> sum(len(block) for block in building_points(Path("corner.ply"), ReadConfig()))
     2

@@ -1,18 +1,44 @@
-"""The tree of coordinate frames of a log (tf, REP-105), and the pose of one frame in another over time."""
+"""The tree of coordinate frames of a log (tf, REP-105), and the pose of one frame in another over time.
+
+The attitude of an IMU: which way is up, and how it turns (sensor_msgs/Imu, REP-145).
+
+The gyroscope tells how the IMU turns, but not which way is up. The accelerometer measures what holds the IMU
+against gravity, and how it is shaken. In the frame that the gyroscope carries on, gravity stands still, and
+the shaking of a hand or of steps cancels over a second. So the vertical is the mean of the accelerations in
+that frame over the last time: a complementary filter (Mahony, Hamel and Pflimlin, "Nonlinear complementary
+filters on the special orthogonal group", 2008) that is read behind the moment that is asked for.
+
+Assumed: no lasting acceleration, as in a car or a lift that starts; accelerations in m/s2; an error of the
+gyroscope that turns its frame little within that time.
+
+The transforms of the robot: all static ones, and as many of the moving ones as are needed.
+"""
 
 from __future__ import annotations
 
 import bisect
 import difflib
 import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pc2grid.arrays import F64
 from pc2grid.errors import FrameError
-from pc2grid.geometry import interpolate_pose, invert_pose, pose_from_xyz_quat
-from pc2grid.io.messages.types import Seven, Transform, valid_pose
+from pc2grid.geometry import (
+    F64,
+    interpolate_pose,
+    invert_pose,
+    leveling,
+    pose_from_rotation_vector,
+    pose_from_xyz_quat,
+    quat_xyzw_from_pose,
+)
+from pc2grid.io import topics
+from pc2grid.io.messages.decoders import decoder_for
+from pc2grid.io.messages.types import Imu, Seven, Transform, valid_pose
+from pc2grid.io.source import MessageSource, TopicInfo
+from pc2grid.io.topics import FIRST, First, tolerant
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,3 +313,126 @@ class FrameTree:
     def _warn(self, sentence: str) -> None:
         if sentence not in self.warnings:
             self.warnings.append(sentence)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AttitudeParameters:
+    """Numbers of the filter. Chosen by hand.
+
+    memory_s : time over which accelerations are averaged: two steps of somebody who walks.
+    gravity_mps2 : standard gravity. slack : an acceleration that differs from it by more than this share says
+        nothing.
+    """
+
+    memory_s: float = 1.0
+    gravity_mps2: float = 9.81
+    slack: float = 0.3
+
+
+ATTITUDE = AttitudeParameters()
+
+
+class Attitude:
+    """Follows an IMU message by message. Memory is bounded.
+
+    received : messages since the beginning.
+    """
+
+    def __init__(self, parameters: AttitudeParameters = ATTITUDE) -> None:
+        self._parameters = parameters
+        self.received = 0
+        self._restart()
+
+    def _restart(self) -> None:
+        """Begin a new frame: how the IMU has turned is not known."""
+        self._track = PoseTrack()  # T_turning_imu: the frame that the gyroscope carries on
+        self._turned = np.eye(4)
+        self._rate_rps = np.zeros(3)  # of the message before
+        self._up = np.zeros(3)  # mean acceleration in that frame, in standard gravities
+        self._counted = 0  # accelerations in it
+
+    @property
+    def newest_ns(self) -> int:
+        """The stamp up to which the attitude is known; 0 if it is not."""
+        return self._track.newest_ns
+
+    def add(self, imu: Imu, stamp_ns: int) -> None:
+        """Take in the next message; one that is late or repeated is ignored."""
+        p, last_ns = self._parameters, self._track.newest_ns
+        self.received += 1
+        if stamp_ns <= last_ns:
+            return
+        if last_ns and stamp_ns - last_ns > PARAMETERS.max_gap_ns:
+            self._restart()
+            last_ns = 0
+        seconds = (stamp_ns - last_ns) * 1e-9 if last_ns else 0.0
+        if imu.acceleration_mps2 is None and imu.orientation is not None:
+            self._turned = pose_from_xyz_quat((0.0, 0.0, 0.0), imu.orientation)
+            self._up, self._counted = np.array([0.0, 0.0, 1.0]), 1
+        elif imu.turn_rate_rps is not None:
+            rate_rps = np.array(imu.turn_rate_rps)
+            between = 0.5 * seconds * (self._rate_rps + rate_rps)
+            self._turned, self._rate_rps = self._turned @ pose_from_rotation_vector(between), rate_rps
+        x, y, z, w = quat_xyzw_from_pose(self._turned).tolist()
+        self._track.add(stamp_ns, (0.0, 0.0, 0.0, x, y, z, w))
+        if imu.acceleration_mps2 is None:
+            return
+        felt = np.array(imu.acceleration_mps2) / p.gravity_mps2
+        if abs(float(np.linalg.norm(felt)) - 1.0) < p.slack:
+            self._counted += 1
+            gain = max(1.0 / self._counted, min(seconds / p.memory_s, 1.0))
+            self._up += gain * (self._turned[:3, :3] @ felt - self._up)
+
+    def at(self, stamp_ns: int) -> F64 | None:
+        """T_level_imu (4, 4) at a time, without translation: z is up, the heading drifts; None if not
+        known."""
+        T_turning_imu = self._track.at(stamp_ns)
+        size = float(np.linalg.norm(self._up))
+        if T_turning_imu is None or not self._counted or size < 1.0 - self._parameters.slack:
+            return None
+        return leveling(self._up / size) @ T_turning_imu
+
+
+class Transforms:
+    """Fills a tree of frames.
+
+    frames : the tree. moving : the topics of moving transforms. edges : those of them that were read.
+    """
+
+    def __init__(
+        self, source: MessageSource, tf: Sequence[TopicInfo], frames: FrameTree, end_ns: int
+    ) -> None:
+        """Take in the static transforms of some topics. end_ns : up to which moving ones are read."""
+        self._source, self.frames = source, frames
+        self.moving = [t for t in tf if not topics.is_static(t)]
+        self.edges: list[First] = []
+        for _ in self._read([t for t in tf if topics.is_static(t)], None):
+            pass
+        self._later = self._read(self.moving, end_ns)
+
+    def read_on(self) -> bool:
+        """Take in the next message of moving transforms; returns whether there is one."""
+        found = next(self._later, None)
+        self.edges += found or ()
+        return found is not None
+
+    def read_odometry(self, base: str) -> str | None:
+        """Return the frame above the base in which tf holds its odometry, after enough of it was read to know
+        its clock."""
+        while (len(self.edges) < FIRST or self.odometry_frame(base) is None) and self.read_on():
+            pass
+        return self.odometry_frame(base)
+
+    def odometry_frame(self, base: str) -> str | None:
+        """Return the frame above the base in which tf holds its odometry, as far as it was read."""
+        above = self.frames.chain(base)[1:]
+        return next((f for f in above if f == "odom" or f.endswith(("/odom", "_odom"))), None)
+
+    def _read(self, tf: Sequence[TopicInfo], end_ns: int | None) -> Iterator[list[First]]:
+        """Take in the transforms of some topics; yields those of each message."""
+        decoders = {t: decoder_for(t) for t in tf}
+        for message in self._source.messages({t.topic for t in tf}, end_ns=end_ns):
+            if message.channel in decoders:
+                at_ns, edges = message.log_time_ns, tolerant(decoders[message.channel], message.data)
+                self.frames.add_all(edges, static=topics.is_static(message.channel), log_time_ns=at_ns)
+                yield [First(at_ns, edge) for edge in edges or ()]

@@ -7,16 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pc2grid.arrays import F64
 from pc2grid.errors import FrameError, NoScans, TopicError
-from pc2grid.geometry import SE2, pose_from_xyz_quat
+from pc2grid.geometry import F64, SE2, pose_from_xyz_quat
 from pc2grid.io import topics
-from pc2grid.io.first_messages import tolerant
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.message_source import MessageSource, RawMessage, TopicInfo
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, PoseStamped, Seven, valid_pose
 from pc2grid.io.robots import Namespaces
+from pc2grid.io.source import MessageSource, RawMessage, TopicInfo
+from pc2grid.io.topics import tolerant
 
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """x, y and yaw among x, y, z, roll, pitch, yaw."""

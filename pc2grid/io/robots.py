@@ -11,9 +11,9 @@ from collections.abc import Sequence
 
 from pc2grid.errors import TopicError
 from pc2grid.io import topics
-from pc2grid.io.first_messages import FirstMessages
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.message_source import TopicInfo
+from pc2grid.io.source import TopicInfo
+from pc2grid.io.topics import FirstMessages
 
 BASE_FRAMES = ("base_link", "base_footprint")  # REP-105 and REP-120
 

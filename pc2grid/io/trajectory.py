@@ -12,9 +12,8 @@ from typing import Literal
 
 import numpy as np
 
-from pc2grid.arrays import F64
 from pc2grid.errors import TrajectoryFileError
-from pc2grid.geometry import pose_from_xyz_quat, quat_xyzw_from_pose
+from pc2grid.geometry import F64, pose_from_xyz_quat, quat_xyzw_from_pose
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Trajectory
 

@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64, SUBPIXEL_BITS, polygon_corners
-from pc2grid.estimation.point_to_line import Match, PointGrid, best_placements, evenly
-from pc2grid.geometry import SE2
+from pc2grid.estimation.line_map import Match, PointGrid, best_placements, evenly
+from pc2grid.geometry import F64, I64, SE2, SUBPIXEL_BITS, polygon_corners
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
+from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,12 +15,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import I64, SUBPIXEL_BITS, polygon_corners
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
-from pc2grid.geometry import SE2
+from pc2grid.geometry import I64, SE2, SUBPIXEL_BITS, polygon_corners
 from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
+from pc2grid.settings import ProjectionConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

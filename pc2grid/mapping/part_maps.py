@@ -1,19 +1,24 @@
-"""The map of each part of a session: its keyframes drawn at their poses after loop closure."""
+"""The map of each part of a session: its keyframes drawn at their poses after loop closure.
+
+Poses after loop closure: of the keyframes, and from these of every scan.
+
+The report of a session map: scans that are not in it, and warnings with what to do.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64
-from pc2grid.clouds.level import LEVEL
-from pc2grid.config import ProjectionConfig
-from pc2grid.estimation.overruled import check_odometry
-from pc2grid.geometry import SE2
-from pc2grid.mapping.consistency import consistency_warning, measure_consistency
-from pc2grid.mapping.floor_levels import (
+from pc2grid.clouds.ground import LEVEL
+from pc2grid.errors import TrackingLost
+from pc2grid.estimation.tracker import check_odometry
+from pc2grid.geometry import F64, I64, SE2, wrap_angle
+from pc2grid.mapping.graph import (
     FLOOR_LEVELS,
     HeightStep,
     floor_warning,
@@ -21,13 +26,11 @@ from pc2grid.mapping.floor_levels import (
     rise_between,
     settled_heights,
 )
-from pc2grid.mapping.keyframe_points import KeyframePoints
-from pc2grid.mapping.keyframes import Keyframes, grid_of
-from pc2grid.mapping.parts import PARTS
-from pc2grid.mapping.precision import precision_of, precision_warning
-from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
-from pc2grid.mapping.track import Track
-from pc2grid.model import Health, Loop, ReadReport, SessionMap, Trajectory
+from pc2grid.mapping.keyframes import KeyframePoints, Keyframes, Track, grid_of
+from pc2grid.mapping.parts import PARTS, odometry_warnings
+from pc2grid.mapping.quality import consistency_warning, measure_consistency, precision_of, precision_warning
+from pc2grid.model import Health, Loop, ReadReport, SessionMap, Trajectory, part_name
+from pc2grid.settings import ProjectionConfig
 
 _WARN_DEGENERATE = 0.1
 """Share of degenerate scans above which the report says so; chosen by hand."""
@@ -215,3 +218,190 @@ def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
         for loop in loops
         if loop.older in number and loop.newer in number
     )
+
+
+@dataclass(frozen=True, slots=True)
+class SettledKeyframes:
+    """The poses of a session's keyframes after loop closure.
+
+    scans : (K,) number of each keyframe's scan. poses : (K, 3) x, y, yaw of each in the session's frame.
+    loops : between the scans at the anchors of local maps that overlap.
+    segments : (K,) number of the segment of each; a new one begins where the pose relative to the keyframe
+        before is unknown. parts : (K,) number of the part of each: segments that loops join. Poses of
+        different parts have nothing to do with each other; see `pc2grid.mapping.parts`.
+    anchors : (N,) numbers, in `scans`, of the keyframes at the anchors of the local maps.
+    sigma_m : (N,) standard deviation of the position of each of these within its part, in the least certain
+        direction; see `pc2grid.mapping.quality`.
+    """
+
+    scans: I64
+    poses: F64
+    loops: tuple[Loop, ...]
+    segments: I64
+    parts: I64
+    anchors: I64
+    sigma_m: F64
+
+    @classmethod
+    def empty(cls) -> SettledKeyframes:
+        """Those of a session without keyframes."""
+        none = np.empty(0, np.int64)
+        return cls(none, np.empty((0, 3)), (), segments=none, parts=none, anchors=none, sigma_m=np.empty(0))
+
+    def undivided(self) -> SettledKeyframes:
+        """The same, as if nothing in it were unknown."""
+        together = np.zeros(len(self.scans), np.int64)
+        return replace(self, segments=together, parts=together)
+
+
+def interpolate_corrections(tracked: F64, known: Sequence[int] | I64, corrected: F64) -> F64:
+    """Poses (N, 3) of all scans, from the corrected poses (K, 3) of those of them that are `known`.
+
+    Between two of these the correction passes linearly from one to the other, so the motion that was
+    tracked between them stays smooth.
+    """
+    index = np.asarray(known)
+    scans = np.arange(len(tracked))
+    left = np.clip(np.searchsorted(index, scans, side="right") - 1, 0, len(index) - 1)
+    right = np.minimum(left + 1, len(index) - 1)
+    a, b = _moved(tracked, index, corrected, left), _moved(tracked, index, corrected, right)
+    span = np.maximum(index[right] - index[left], 1)
+    share = np.clip((scans - index[left]) / span, 0.0, 1.0)[:, None]
+    mixed: F64 = a + share * np.column_stack((b[:, :2] - a[:, :2], wrap_angle(b[:, 2] - a[:, 2])))
+    mixed[:, 2] = wrap_angle(mixed[:, 2])
+    return mixed
+
+
+def _moved(tracked: F64, index: NDArray[np.integer], corrected: F64, which: NDArray[np.integer]) -> F64:
+    """Every scan as if rigidly attached to the known scan number `which` (N,)."""
+    old, new = tracked[index[which]], corrected[which]
+    turn = new[:, 2] - old[:, 2]
+    c, s = np.cos(turn), np.sin(turn)
+    d = tracked[:, :2] - old[:, :2]
+    moved: F64 = np.column_stack(
+        (new[:, 0] + c * d[:, 0] - s * d[:, 1], new[:, 1] + s * d[:, 0] + c * d[:, 1], tracked[:, 2] + turn)
+    )
+    return moved
+
+
+_MOST_LOST = 0.2
+"""Share of lost scans above which a laser gives no map without odometry: its parts do not hang together.
+Chosen by hand."""
+_STOREY_M = 2.0
+"""A hand lifts a sensor by less than this, and storeys are at least 2.4 m high; chosen by hand."""
+
+
+def check_followed(trajectory: Trajectory, name: str) -> None:
+    """Raise TrackingLost if more than a fifth of the scans of the log `name` are lost."""
+    lost = [health is Health.LOST for health in trajectory.health]
+    if sum(lost) <= _MOST_LOST * len(lost):
+        return
+    first_s = (trajectory.stamps_ns[lost.index(True)] - trajectory.stamps_ns[0]) * 1e-9
+    raise TrackingLost(
+        f"{name}: {sum(lost)} of {len(lost)} scans could not be followed, first {first_s:.1f} s after the "
+        "first scan, and the log has no odometry",
+        hint="--odometry TOPIC names a topic with odometry, --start and --duration a part that can be "
+        "followed; else record odometry, or scans that are closer together",
+    )
+
+
+def lost_warnings(health: Sequence[Health]) -> list[str]:
+    """At most one sentence: that a query, with scans of this health, begins anew where tracking was lost."""
+    lost = [number for number, of_scan in enumerate(health, start=1) if of_scan is Health.LOST]
+    if not lost:
+        return []
+    return [
+        f"{len(lost)} of {len(health)} scans could not be followed, so only the last "
+        f"{len(health) - lost[-1]} count; record odometry, or more scans a second, or corners and furniture "
+        "in place of bare walls"
+    ]
+
+
+def part_reports(
+    report: ReadReport,
+    session: str,
+    parts: Sequence[SessionMap],
+    kept: Sequence[SessionMap],
+    walls_changed_ns: Collection[int] = (),
+) -> list[ReadReport]:
+    """The report of each part that is kept.
+
+    report : of the reader. It becomes part of that of the first part; the scans of the others are counted in
+        theirs.
+    walls_changed_ns : as of a `Track`.
+    """
+    first, *others = (part.report for part in kept)
+    elsewhere = sum(other.scans_read for other in others)
+    left_out = sum(len(part.trajectory) for part in parts) - elsewhere - first.scans_read
+    skipped = {"in a part too short to be of use": left_out} if left_out else {}
+    division = [division_warning(session, parts, kept, walls_changed_ns)] if len(parts) > 1 else []
+    first = dataclasses.replace(
+        report,
+        scans_read=report.scans_read - elsewhere,
+        scans_skipped={**report.scans_skipped, **skipped, **first.scans_skipped},
+        warnings=(*report.warnings, *division, *first.warnings),
+    )
+    return [first, *others]
+
+
+def division_warning(
+    session: str,
+    parts: Sequence[SessionMap],
+    kept: Sequence[SessionMap],
+    walls_changed_ns: Collection[int] = (),
+) -> str:
+    """One sentence that says into what a recording was divided, where, and what to do."""
+    start_ns = min(int(part.trajectory.stamps_ns[0]) for part in parts if len(part.trajectory))
+
+    def begin_s(part: SessionMap) -> float:
+        return (int(part.trajectory.stamps_ns[0]) - start_ns) * 1e-9
+
+    short = len(parts) - len(kept)
+    dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
+    named = ", ".join(
+        f"{part_name(session, k)} from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
+        for k, part in enumerate(kept)
+    )
+    changed_s = [begin_s(part) for part in parts if part.trajectory.stamps_ns[0] in walls_changed_ns]
+    if changed_s:
+        times = " and ".join(f"{seconds:.0f}" for seconds in changed_s)
+        return (
+            f"the recording falls into {len(parts)} parts whose places relative to each other are not known: "
+            f"{named}{dropped}; before {times} s after the first scan all walls changed while odometry stood "
+            "still, as in a lift: cut the recording there, with --start and --duration, and name each floor "
+            "with --floor"
+        )
+    advice = "come back to known places more often, to keep them together"
+    if not any(part.odometry and part.odometry.compared for part in parts):
+        advice = f"record with odometry, or {advice}"
+    return (
+        f"the recording falls into {len(parts)} parts whose places relative to each other are not known, "
+        f"because tracking was lost: {named}{dropped}; {advice}"
+    )
+
+
+def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
+    """The report of a recording, with what was assumed, and what is said of odometry and of heights."""
+    warnings, skipped = [*report.warnings], dict(report.scans_skipped)
+    if track.warning is not None:
+        warnings.append(track.warning)
+    if track.left_out:
+        skipped["before one that shows the floor"] = track.left_out
+    warnings += height_warnings(track.heights_m, track.trajectory)
+    warnings += odometry_warnings(track.trajectory, track.readings)
+    return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))
+
+
+def height_warnings(heights_m: F64, trajectory: Trajectory) -> list[str]:
+    """At most one sentence: that scans are as high (N,) above others as another floor is, and what to do."""
+    known = np.flatnonzero(np.isfinite(heights_m))
+    rise_m = heights_m[known] - heights_m[known[:1]]
+    away = known[np.abs(rise_m) > _STOREY_M]
+    if not len(away):
+        return []
+    begin_s = (trajectory.stamps_ns[away[0]] - trajectory.stamps_ns[0]) * 1e-9
+    return [
+        f"the height changes by {np.ptp(rise_m):.1f} m, and from {begin_s:.0f} s after the first scan on by "
+        f"more than {_STOREY_M:.1f} m: a map is one floor, and this one shows several as one; cut the "
+        "recording there, with --start and --duration, and name each floor with --floor"
+    ]

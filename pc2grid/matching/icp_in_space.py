@@ -18,12 +18,13 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64, I64, freeze
+from pc2grid.clouds.cloud import VoxelCloud, random_subset
 from pc2grid.clouds.ground import find_ground
-from pc2grid.clouds.sampling import random_subset
-from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.geometry import (
+    F64,
+    I64,
     SE2,
+    freeze,
     invert_pose,
     pose_from_rotation_vector,
     rotation_vector,

@@ -4,11 +4,16 @@ The building is a procedural office, a given floor plan, or a real building as a
 Nothing here is fitted to recordings of real sensors; numbers whose origin is not named are chosen by hand.
 """
 
-from pc2grid.simulate.building import Building, load_building
 from pc2grid.simulate.config import SimulationConfig
-from pc2grid.simulate.floorplan import office_floorplan
-from pc2grid.simulate.record import SimulatedSession, simulate_session
-from pc2grid.simulate.session import Session, iter_session, prepare_session
+from pc2grid.simulate.plan import office_floorplan
+from pc2grid.simulate.scene import Building, load_building
+from pc2grid.simulate.session import (
+    Session,
+    SimulatedSession,
+    iter_session,
+    prepare_session,
+    simulate_session,
+)
 
 __all__ = [
     "Building",

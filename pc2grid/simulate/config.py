@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from pc2grid.config import Section
+from pc2grid.settings import Section
 
 
 class DriveConfig(Section):

@@ -1,16 +1,44 @@
-"""A floor plan as a mesh of walls, floor and ceiling, and casting rays into it."""
+"""A floor plan as a mesh of walls, floor and ceiling, and casting rays into it.
+
+A building to drive through: a floor plan, or a real one as a point cloud or a mesh.
+
+A plan is extruded to walls of one height. Of a cloud the faces of its occupied voxels are what rays hit;
+of a mesh, its triangles. For both the floor is found and levelled, and the robot drives where it was seen
+and nothing stands on it (`pc2grid.mapping.drawn`).
+
+The three sensors: directions and times of their rays, and noise and losses of their readings.
+
+Objects that are in other places in each session: chairs, boxes, tables, people.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import math
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 
-from pc2grid.arrays import F32, F64, BoolGrid, freeze
-from pc2grid.model import OccupancyGrid
+from pc2grid.errors import MapFileError
+from pc2grid.geometry import F32, F64, SE2, BoolGrid, freeze, transform_points
+from pc2grid.io.building_file import (
+    building_points,
+    is_building_file,
+    kind_of,
+    load_mesh,
+    neighbour_distances_m,
+    sampled,
+)
+from pc2grid.io.maps import is_map_file, load_map
+from pc2grid.mapping.drawn import check_plausible, drivable_plan, level_cloud, voxel_cloud
+from pc2grid.model import OccupancyGrid, SensorKind
+from pc2grid.settings import ReadConfig
+from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
+from pc2grid.simulate.plan import Passages, outline_mask
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,3 +144,348 @@ class Scene:
         first hit, inf without one."""
         hits: F32 = self._scene.cast_rays(self._tensor.from_numpy(rays))["t_hit"].numpy()
         return hits
+
+
+_VOXEL_M = 0.05  # smallest voxel of a cloud that rays hit
+# A voxel is at least this many median distances between neighbours wide, so that walls have few holes: if n
+# random points lie on a square metre, this distance is 0.47 / sqrt(n) and 3 % of such voxels stay empty.
+_SPACINGS = 4.0
+_LATTICE = 1.01  # the points of a lattice are equally far from their neighbours, within 1 %
+
+
+@dataclass(frozen=True, slots=True)
+class Building:
+    """A real building.
+
+    plan : where the robot may drive, in the map frame. shell : what rays hit, in the same frame, with the
+    floor at z = 0. T_map_file : (4, 4), the frame of the file in the map frame.
+    """
+
+    plan: OccupancyGrid
+    shell: Mesh
+    T_map_file: F64
+
+    @staticmethod
+    def of_cloud(points_m: NDArray[np.floating]) -> Building:
+        """Of a cloud (N, 3) whose z axis points up. Raises MapFileError if it shows no floor."""
+        points = np.asarray(points_m, np.float64)
+        T_map_cloud = level_cloud(points)
+        # The voxels follow the axes of the cloud, in which they may have been a lattice before.
+        shell = _moved(voxel_faces(points, voxel_m(points)), T_map_cloud)
+        return Building(drivable_plan(transform_points(T_map_cloud, points)), shell, T_map_cloud)
+
+    @staticmethod
+    def of_mesh(mesh: Mesh) -> Building:
+        """Of a mesh whose z axis points up. Raises MapFileError if it shows no floor."""
+        points = voxel_cloud(sampled(mesh.vertices_m.astype(np.float64), mesh.triangles.astype(np.int64)))
+        T_map_mesh = level_cloud(points)
+        plan = drivable_plan(transform_points(T_map_mesh, points))
+        return Building(plan, _moved(mesh, T_map_mesh), T_map_mesh)
+
+
+def load_building(path: str | Path) -> OccupancyGrid | Building:
+    """Read a nav2 map, a cloud or a mesh. A .ply with triangles is a mesh.
+
+    Raises MapFileError if the file cannot be read, or shows no floor.
+    """
+    path = Path(path)
+    if is_map_file(path):
+        return load_map(path)
+    try:
+        if is_building_file(path) and kind_of(path) == "mesh":
+            vertices, triangles = load_mesh(path)
+            check_plausible(vertices)
+            return Building.of_mesh(Mesh(vertices.astype(np.float32), triangles.astype(np.uint32)))
+        return Building.of_cloud(np.concatenate([np.empty((0, 3)), *building_points(path, ReadConfig())]))
+    except MapFileError as error:
+        if str(path) in error.message:
+            raise
+        raise MapFileError(f"{path}: {error.message}", hint=error.hint) from error
+
+
+def voxel_m(points_m: F64) -> float:
+    """Edge of the voxels in which a cloud (N, 3) is dense: 5 cm or more.
+
+    The points of a lattice, such as the centres of the voxels of an octree, keep its spacing.
+    """
+    low, median, high = np.quantile(neighbour_distances_m(points_m), (0.1, 0.5, 0.9))
+    lattice = low > 0.0 and high < _LATTICE * low
+    return max(float(median) * (1.0 if lattice else _SPACINGS), _VOXEL_M)
+
+
+def voxel_faces(points_m: F64, edge_m: float) -> Mesh:
+    """The faces between an occupied voxel and an empty one. The first point's corner is on the lattice."""
+    first = points_m.min(axis=0)
+    voxels = np.rint((points_m - first) / edge_m).astype(np.int64) + 1
+    occupied = np.zeros(voxels.max(axis=0) + 2, bool)
+    occupied[tuple(voxels.T)] = True
+    corners = []
+    for axis in range(3):
+        u, v = (k for k in range(3) if k != axis)
+        for side in (1, -1):
+            faces = np.argwhere(occupied & ~np.roll(occupied, -side, axis=axis))
+            corner = np.repeat(faces[:, None].astype(np.float64), 4, axis=1)
+            corner[..., axis] += 0.5 * side
+            corner[..., u] += (-0.5, 0.5, 0.5, -0.5)
+            corner[..., v] += (-0.5, -0.5, 0.5, 0.5)
+            corners.append(corner)
+    return quads((np.concatenate(corners) - 1) * edge_m + first)
+
+
+def _moved(mesh: Mesh, T: F64) -> Mesh:
+    return Mesh(transform_points(T, mesh.vertices_m).astype(np.float32), mesh.triangles)
+
+
+OPTICAL = np.array([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
+"""R_body_optical (REP-103): z forward, x right, y down, in body axes."""
+
+
+# A neighbour whose depth differs by more than this share of the depth and this distance is a depth jump.
+_JUMP_SHARE, _JUMP_M = 0.1, 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Sensor:
+    """A sensor as the rays that it casts in each scan.
+
+    kind : of the sensor. frame : name of its frame.
+    T_base_sensor : (4, 4) mounting.
+    rate_hz : scans per second.
+    directions : (R, 3) in the sensor frame; a reading times its direction is the point. Unit vectors for
+        ranges; z = 1 for depths.
+    offsets_s : (R,) when each ray is cast, relative to the scan's stamp; all zero for a camera.
+    """
+
+    kind: SensorKind
+    frame: str
+    T_base_sensor: F64
+    rate_hz: float
+    directions: F64
+    offsets_s: F64
+    config: LidarConfig | LaserConfig | DepthConfig
+
+    def __post_init__(self) -> None:
+        freeze(self, "T_base_sensor", np.float64, (4, 4))
+        freeze(self, "directions", np.float64, (None, 3))
+        freeze(self, "offsets_s", np.float64, (len(self.directions),))
+
+    def measure(self, true_m: F32, rng: np.random.Generator) -> F32:
+        """True distances (R,), inf for none, to readings (R,) float32, NaN without a return."""
+        if isinstance(self.config, DepthConfig):
+            return _measure_depth(true_m, self.config, rng)
+        noise = rng.standard_normal(len(true_m), dtype=np.float32) * np.float32(self.config.noise_m)
+        kept = rng.random(len(true_m), dtype=np.float32) >= self.config.dropout
+        reading = true_m + noise
+        kept &= (reading >= self.config.min_range_m) & (reading <= self.config.max_range_m)
+        return np.where(kept, reading, np.float32(np.nan))
+
+
+def _measure_depth(true_m: F32, config: DepthConfig, rng: np.random.Generator) -> F32:
+    """Noise that grows with the square of the depth, losses at depth jumps, rounding to millimetres."""
+    depth = np.where(np.isfinite(true_m), true_m, 0).astype(np.float32)
+    spread = config.noise_m + config.noise_per_m * depth**2
+    lost = np.full(len(depth), config.dropout, np.float32)
+    image = depth.reshape(config.height, config.width)
+    near, far = ndimage.minimum_filter(image, 3), ndimage.maximum_filter(image, 3)
+    lost[((far - near) > _JUMP_SHARE * image + _JUMP_M).ravel()] = config.edge_dropout
+    noise = rng.standard_normal(len(depth), dtype=np.float32) * spread
+    reading = np.round((depth + noise) * 1000) / np.float32(1000)
+    kept = rng.random(len(depth), dtype=np.float32) >= lost
+    kept &= (reading >= config.min_range_m) & (reading <= config.max_range_m) & (depth > 0)
+    return np.where(kept, reading, np.float32(np.nan)).astype(np.float32)
+
+
+def _mount(xyz_m: tuple[float, float, float]) -> F64:
+    pose = np.eye(4)
+    pose[:3, 3] = xyz_m
+    return pose
+
+
+def lidar(config: LidarConfig) -> Sensor:
+    """Columns of beams, fired one after another during one turn; the stamp is that of the first column."""
+    azimuth = np.arange(config.columns) * (2 * math.pi / config.columns) - math.pi
+    top = math.radians(config.elevation_deg) if config.beams > 1 else 0.0
+    elevation = np.linspace(-top, top, config.beams)
+    a, e = (v.ravel() for v in np.meshgrid(azimuth, elevation, indexing="ij"))
+    directions = np.column_stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)))
+    offsets = np.repeat(np.arange(config.columns) / (config.columns * config.rate_hz), config.beams)
+    return Sensor("lidar", "lidar_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
+
+
+def laser(config: LaserConfig) -> Sensor:
+    """One horizontal row of rays from right to left, one after another; the stamp is that of the first."""
+    count = round(config.field_deg / config.step_deg) + 1
+    angle = laser_angle_min(config) + np.arange(count) * math.radians(config.step_deg)
+    directions = np.column_stack((np.cos(angle), np.sin(angle), np.zeros(count)))
+    offsets = np.arange(count, dtype=np.float64) * laser_time_increment(config)
+    return Sensor("laser", "laser_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
+
+
+def laser_angle_min(config: LaserConfig) -> float:
+    """Bearing of the first ray, radians."""
+    return -math.radians(round(config.field_deg / config.step_deg) * config.step_deg) / 2
+
+
+def laser_time_increment(config: LaserConfig) -> float:
+    """Seconds between two rays."""
+    return config.step_deg / 360.0 / config.rate_hz
+
+
+def depth(config: DepthConfig) -> Sensor:
+    """A pinhole camera with a global shutter."""
+    K = depth_intrinsics(config)
+    u, v = (p.ravel() for p in np.meshgrid(np.arange(config.width), np.arange(config.height)))
+    directions = np.column_stack(((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.size)))
+    pose = _mount(config.mount_m)
+    pose[:3, :3] = OPTICAL
+    frame, at_once = "camera_depth_optical_frame", np.zeros(u.size)
+    return Sensor("depth", frame, pose, config.rate_hz, directions, at_once, config)
+
+
+def depth_intrinsics(config: DepthConfig) -> F64:
+    """K (3, 3) in pixels, pixel centres at whole numbers."""
+    fx = config.width / 2 / math.tan(math.radians(config.horizontal_deg) / 2)
+    fy = config.height / 2 / math.tan(math.radians(config.vertical_deg) / 2)
+    return np.array([(fx, 0, (config.width - 1) / 2), (0, fy, (config.height - 1) / 2), (0, 0, 1)])
+
+
+def make_sensor(kind: SensorKind, config: SimulationConfig) -> Sensor:
+    """The sensor of that kind as configured."""
+    if kind == "lidar":
+        return lidar(config.lidar)
+    if kind == "laser":
+        return laser(config.laser)
+    return depth(config.depth)
+
+
+_TRIES_PER_OBJECT = 40
+_SQUARE_SHARE = 0.5  # of the objects are aligned with the axes of the map
+_KEPT_FREE_M = 1.0  # around the start of the drive
+
+
+@dataclass(frozen=True, slots=True)
+class Prism:
+    """One part of an object: a convex outline (N, 2) in the object's frame, between two heights, metres."""
+
+    outline_m: F64
+    bottom_m: float
+    top_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Furniture:
+    """One movable object; people who stand still count as such.
+
+    kind : a key of `KINDS`. pose : T_map_object. outline_m : (N, 2) convex hull on the floor, in its frame.
+    """
+
+    kind: str
+    pose: SE2
+    outline_m: F64
+    parts: tuple[Prism, ...]
+
+    def mesh(self) -> Mesh:
+        """Its triangles in the map frame."""
+        return Mesh.join(prism(self.pose.apply(p.outline_m), p.bottom_m, p.top_m) for p in self.parts)
+
+
+def _rectangle(x0: float, y0: float, x1: float, y1: float) -> F64:
+    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+
+
+def _disc(radius_m: float) -> F64:
+    angles = np.arange(16) * (2 * math.pi / 16)
+    return radius_m * np.column_stack((np.cos(angles), np.sin(angles)))
+
+
+def _legs(width: float, depth: float, thickness: float, top: float) -> list[Prism]:
+    x, y, t = width / 2, depth / 2, thickness
+    corners = ((-x, -y), (x - t, -y), (x - t, y - t), (-x, y - t))
+    return [Prism(_rectangle(a, b, a + t, b + t), 0.0, top) for a, b in corners]
+
+
+def _box(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
+    width, depth, height = rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.6), rng.uniform(0.3, 1.2)
+    outline = _rectangle(-width / 2, -depth / 2, width / 2, depth / 2)
+    return outline, [Prism(outline, 0.0, height)]
+
+
+def _person(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
+    outline = _disc(rng.uniform(0.18, 0.26))
+    return outline, [Prism(outline, 0.0, rng.uniform(1.55, 1.9))]
+
+
+def _bin(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
+    outline = _disc(rng.uniform(0.14, 0.22))
+    return outline, [Prism(outline, 0.0, rng.uniform(0.3, 0.75))]
+
+
+def _chair(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
+    size, seat, back = rng.uniform(0.42, 0.5), rng.uniform(0.42, 0.48), rng.uniform(0.8, 1.0)
+    half = size / 2
+    outline = _rectangle(-half, -half, half, half)
+    rest = Prism(_rectangle(-half, -half, -half + 0.04, half), seat, back)
+    return outline, [Prism(outline, seat - 0.05, seat), rest, *_legs(size, size, 0.04, seat)]
+
+
+def _table(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
+    width, depth, height = rng.uniform(1.0, 1.6), rng.uniform(0.6, 0.8), rng.uniform(0.7, 0.76)
+    outline = _rectangle(-width / 2, -depth / 2, width / 2, depth / 2)
+    return outline, [Prism(outline, height - 0.03, height), *_legs(width, depth, 0.06, height)]
+
+
+KINDS: dict[str, tuple[Callable[[np.random.Generator], tuple[F64, list[Prism]]], float]] = {
+    "chair": (_chair, 0.35),
+    "box": (_box, 0.25),
+    "table": (_table, 0.15),
+    "person": (_person, 0.15),
+    "bin": (_bin, 0.10),
+}
+"""For each kind the function that makes one, and its share of all objects (chosen by hand)."""
+
+
+def place_clutter(
+    grid: OccupancyGrid,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    robot_m: float,
+    keep_free_m: tuple[tuple[float, float], ...] = (),
+) -> tuple[Furniture, ...]:
+    """Put up to `count` objects on free cells so that a robot of radius `robot_m` still gets everywhere.
+
+    keep_free_m : points of the map frame; objects stay `_KEPT_FREE_M` away from them.
+    Returns fewer objects if there is no room for all.
+    """
+    passages = Passages(grid.free, grid.resolution_m, robot_m)
+    places = np.flatnonzero(grid.free)
+    names = list(KINDS)
+    shares = np.array([KINDS[name][1] for name in names])
+    placed: list[Furniture] = []
+    for _ in range(_TRIES_PER_OBJECT * count if len(places) else 0):
+        if len(placed) == count:
+            break
+        name = names[rng.choice(len(names), p=shares / shares.sum())]
+        outline, parts = KINDS[name][0](rng)
+        cell = np.array([np.unravel_index(places[rng.integers(len(places))], grid.cells.shape)])
+        x, y = (float(v) for v in grid.to_point(cell)[0])
+        square = rng.random() < _SQUARE_SHARE
+        yaw = rng.choice(4) * math.pi / 2 if square else rng.uniform(-math.pi, math.pi)
+        candidate = Furniture(name, SE2(x, y, float(yaw)), outline, tuple(parts))
+        reach = float(np.linalg.norm(outline, axis=1).max())
+        if any(math.hypot(x - px, y - py) < _KEPT_FREE_M + reach for px, py in keep_free_m):
+            continue
+        footprint = (candidate.pose.apply(outline) - grid.origin_m) / grid.resolution_m
+        if passages.put(footprint):
+            placed.append(candidate)
+    return tuple(placed)
+
+
+def covered(grid: OccupancyGrid, clutter: tuple[Furniture, ...]) -> BoolGrid:
+    """Cells (H, W) below any of the objects."""
+    shape = (grid.cells.shape[0], grid.cells.shape[1])
+    mask: BoolGrid = np.zeros(shape, bool)
+    for furniture in clutter:
+        footprint = (furniture.pose.apply(furniture.outline_m) - grid.origin_m) / grid.resolution_m
+        mask |= outline_mask(footprint, shape)
+    return mask

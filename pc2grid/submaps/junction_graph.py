@@ -9,24 +9,35 @@ The graph is a `networkx.Graph`. Nodes are numbered from 0 and carry
 Edges carry `length_m`, along the skeleton, and `path_m` (K, 2) float32, the pixels of the way in the map
 frame, from the node with the lower number to the other one. Of several ways between the same two places the
 shortest is kept; ways that lead back to the same place are left out.
+
+From an area to its 1-pixel wide skeleton (paper III-A, III-B 2, III-C 1).
+
+The paper names a thinning algorithm for each use but not which one; both classical parallel algorithms are
+here. scikit-image's were compared on the five maps of Table I and not taken: `skeletonize` keeps up to twice
+as many junction pixels as the rules that Zhang and Suen print (killian: 269 against 137, so more submaps
+than Table I has) and needs 4 to 25 times as long; `thin` (Guo and Hall) needs 80 to 300 times as long.
+
+Thinning out points evenly (paper III-B 3, III-C 1).
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal, TypeVar
 
+import cv2
+import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64, BoolGrid, freeze
-from pc2grid.config import PartitionConfig
-from pc2grid.model import OccupancyGrid
-from pc2grid.submaps.skeleton import junctions_and_ends, pixel_steps, skeleton_of
+from pc2grid.geometry import F32, F64, I64, BoolGrid, freeze
+from pc2grid.model import OCCUPIED_FROM, OccupancyGrid
+from pc2grid.settings import PartitionConfig
 
 if TYPE_CHECKING:
     import networkx as nx
+
 
 KINDS = ("junction", "end")
 """What a node may be; `GraphArrays.kind` counts from 0 in this order."""
@@ -245,3 +256,276 @@ def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
     for k, ((a, b), length_m) in enumerate(zip(edges, arrays.length_m.tolist(), strict=True)):
         graph.add_edge(a, b, length_m=length_m, path_m=arrays.path_m[starts[k] : starts[k + 1]])
     return graph
+
+
+Thinning = Literal["guo_hall", "zhang_suen"]
+
+# Neighbours clockwise from north: bit k of a code is neighbour k.
+_NEIGHBOURS = [tuple((code >> k) & 1 for k in range(8)) for code in range(256)]
+
+
+def _guo_hall(p: tuple[int, ...], half: int) -> bool:
+    """Guo and Hall 1989: whether a pixel with neighbours p is deleted in this half of an iteration."""
+    n, ne, e, se, s, sw, w, nw = p
+    # Number of groups of connected neighbours.
+    groups = ((1 - n) & (ne | e)) + ((1 - e) & (se | s)) + ((1 - s) & (sw | w)) + ((1 - w) & (nw | n))
+    pairs = min((nw | n) + (ne | e) + (se | s) + (sw | w), (n | ne) + (e | se) + (s | sw) + (w | nw))
+    side = (s | sw | (1 - nw)) & w if half == 0 else (n | ne | (1 - se)) & e
+    return groups == 1 and 2 <= pairs <= 3 and not side
+
+
+def _zhang_suen(p: tuple[int, ...], half: int) -> bool:
+    """Zhang and Suen 1984: whether a pixel with neighbours p is deleted in this half of an iteration."""
+    n, _, e, _, s, _, w, _ = p
+    rises = _crossings(p)
+    if half == 0:
+        return rises == 1 and 2 <= sum(p) <= 6 and not n & e & s and not e & s & w
+    return rises == 1 and 2 <= sum(p) <= 6 and not n & e & w and not n & s & w
+
+
+def _crossings(p: tuple[int, ...]) -> int:
+    """Number of changes from 0 to 1 around the ring of neighbours."""
+    return sum(1 - p[k] and p[(k + 1) % 8] for k in range(8))
+
+
+_DELETABLE: dict[str, NDArray[np.bool_]] = {
+    name: np.array([[rule(p, half) for p in _NEIGHBOURS] for half in (0, 1)])
+    for name, rule in (("guo_hall", _guo_hall), ("zhang_suen", _zhang_suen))
+}
+_JUNCTION = np.array([_crossings(p) >= 3 or sum(p[::2]) >= 3 for p in _NEIGHBOURS])
+_END = np.array([sum(p) == 1 for p in _NEIGHBOURS])
+
+
+def _neighbour_steps(width: int) -> I64:
+    """From a pixel of an image, row by row, to its neighbours, in the order of the codes; (8,)."""
+    return np.array([-width, 1 - width, 1, width + 1, width, width - 1, -1, -width - 1], np.int64)
+
+
+def _codes(flat: NDArray[np.uint8], width: int, at: I64) -> NDArray[np.uint8]:
+    """The eight neighbours of the pixels `at` (N,) as bits; the 0/1 image has a border of zeros."""
+    neighbours = flat[at[:, None] + _neighbour_steps(width)]
+    return np.packbits(neighbours, axis=1, bitorder="little").reshape(-1)
+
+
+def thin(mask: BoolGrid, thinning: Thinning = "guo_hall") -> BoolGrid:
+    """Reduce an area (H, W) to lines one pixel wide, with the same connections.
+
+    guo_hall (default) leaves neither 2x2 blocks nor stairs on slanted lines, so that a line's pixels have
+    two neighbours whatever its direction; zhang_suen leaves both, and erases slanted lines two pixels wide.
+    """
+
+    image, border = _padded(mask)
+    thin_in_place(image.reshape(-1), image.shape[1], border, _DELETABLE[thinning])
+    return image[1:-1, 1:-1].view(np.bool_)
+
+
+def _padded(mask: BoolGrid) -> tuple[NDArray[np.uint8], I64]:
+    """The mask as a 0/1 image with a border of zeros, and the set pixels that have a zero neighbour."""
+    image = np.zeros((mask.shape[0] + 2, mask.shape[1] + 2), np.uint8)
+    image[1:-1, 1:-1] = mask
+    inner = cv2.erode(image, np.ones((3, 3), np.uint8))
+    return image, np.flatnonzero(image != inner)
+
+
+def clearance_of(free: BoolGrid, resolution_m: float) -> NDArray[np.float32]:
+    """Distance (H, W) in metres from every free cell's centre to the nearest cell that is not free.
+
+    What lies outside the array is not free. Precise to about 2 % (5x5 chamfer distance).
+    """
+    padded = np.zeros((free.shape[0] + 2, free.shape[1] + 2), np.uint8)
+    padded[1:-1, 1:-1] = free
+    distance_m = np.asarray(cv2.distanceTransform(padded, cv2.DIST_L2, 5), np.float32)
+    distance_m *= np.float32(resolution_m)
+    return distance_m[1:-1, 1:-1]
+
+
+def skeleton_of(
+    free: BoolGrid, resolution_m: float, clearance_m: float, thinning: Thinning = "guo_hall"
+) -> BoolGrid:
+    """The middle lines of free space: distance transform, erosion by `clearance_m`, thinning (III-A).
+
+    free : (H, W) cells known to be free. Returns (H, W).
+    """
+    if not free.any():
+        return np.zeros(free.shape, np.bool_)
+    return thin(clearance_of(free, resolution_m) > clearance_m, thinning)
+
+
+def junctions_and_ends(skeleton: BoolGrid, pixels: I64) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Which of the skeleton's pixels (N, 2) are junctions, and which are ends of a branch; (N,) each.
+
+    A junction (III-A) is a pixel where three or more branches meet; an end has one neighbour.
+    """
+    image = np.pad(skeleton, 1).view(np.uint8)
+    codes = _codes(image.reshape(-1), image.shape[1], (pixels + 1) @ np.array([image.shape[1], 1]))
+    return _JUNCTION[codes], _END[codes]
+
+
+def pixel_steps(skeleton: BoolGrid) -> tuple[I64, I64, F64]:
+    """The pixels of a skeleton and the steps between 8-neighbours.
+
+    Returns the pixels (P, 2) as (row, column), row by row; the steps (S, 2) as pairs of pixel numbers; and
+    the length (S,) of each step in cells, 1 or sqrt(2). A diagonal step is left out where two straight steps
+    lead the same way, so that a corner does not become a triangle.
+    """
+    image = np.pad(skeleton, 1)
+    width = image.shape[1]
+    flat = image.reshape(-1)
+    at = np.flatnonzero(flat)
+    firsts, seconds, lengths = [], [], []
+    for step, length in ((1, 1.0), (width, 1.0), (width - 1, 2**0.5), (width + 1, 2**0.5)):
+        joined = flat[at + step]
+        if length > 1.0:
+            joined &= ~(flat[at + width] | flat[at + step - width])
+        firsts.append(np.flatnonzero(joined))
+        seconds.append(np.searchsorted(at, at[joined] + step))
+        lengths.append(np.full(len(firsts[-1]), length))
+    steps = np.column_stack((np.concatenate(firsts), np.concatenate(seconds)))
+    return np.column_stack(np.divmod(at, width)) - 1, steps, np.concatenate(lengths)
+
+
+Number = TypeVar("Number", np.int64, np.float64)
+
+_TOLERANCE = 1e-9
+"""Relative: points exactly one spacing apart are both kept, whatever the rounding of their distance."""
+_CROWDED = 20.0
+"""Points within the spacing of a point, from which on a search around each kept point is faster than all
+pairs at once (measured on boundaries and skeletons of the maps of Table I)."""
+
+
+def sample_evenly(points: NDArray[Number], spacing: float) -> NDArray[Number]:
+    """Thin out points (N, 2) until no two are closer than `spacing`; returns (M, 2), M <= N.
+
+    Greedy in the given order: a point is kept unless it lies closer than the spacing to one that was kept
+    before it. The unit is that of the points (cells, metres).
+
+    >>> sample_evenly(np.array([[0, 0], [0, 1], [0, 2], [0, 3]]), 2.0).tolist()
+    [[0, 0], [0, 2]]
+    """
+    from scipy.spatial import cKDTree
+
+    # An unbalanced tree gives the same neighbours; balancing it takes longer than it saves here.
+    tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
+    reach = spacing * (1.0 - _TOLERANCE)
+    kept = [True] * len(points)
+    some = points[:: 1 + len(points) // 32]
+    if len(points) and tree.query_ball_point(some, reach, return_length=True).mean() > _CROWDED:
+        for first in range(len(points)):
+            if kept[first]:
+                for second in tree.query_ball_point(points[first], reach):
+                    kept[second] = second <= first and kept[second]
+        return points[np.array(kept, np.bool_)]
+    # Pairs (first, second), first < second, sorted by the first: when a point is reached, every earlier point
+    # that could exclude it is decided.
+    pairs = tree.query_pairs(reach, output_type="ndarray")
+    pairs = pairs[np.argsort(pairs[:, 0], kind="stable")]
+    for first, second in zip(pairs[:, 0].tolist(), pairs[:, 1].tolist(), strict=True):
+        if kept[first]:
+            kept[second] = False
+    return points[np.array(kept, np.bool_)]
+
+
+@numba.njit(cache=True)
+def thin_in_place(flat: NDArray[np.uint8], width: int, border: I64, deletable: NDArray[np.bool_]) -> None:
+    """Thin a 0/1 image in place.
+
+    In each half of an iteration all pixels are tested on the same image, and those that may go are deleted
+    together. A pixel is tested again only if a neighbour of it has gone.
+
+    flat : the image row by row, `width` pixels a row, with a border of zeros. border : indices of the set
+    pixels that have a zero neighbour. deletable : (2, 256), by half of an iteration and neighbour code.
+
+    Measured: 20 times as fast as the numpy form on a whole map (killian, 20 million cells: 0.12 against 2.6
+    s) and 20 to 30 times on one submap (0.2 against 4 ms for its boundary, 0.16 against 5 ms for its free
+    space), both of which every description needs.
+    """
+    steps = np.array([-width, 1 - width, 1, width + 1, width, width - 1, -1, -width - 1])
+    # In how many halves of an iteration a pixel still has to be tested: two after a neighbour has gone.
+    pending = np.zeros(len(flat), np.uint8)
+    # One entry more than there are pixels: what is written behind the last one is not read.
+    set_pixels = 0
+    for i in range(len(flat)):
+        set_pixels += flat[i]
+    waiting, gone = np.empty(set_pixels + 1, np.int64), np.empty(set_pixels, np.int64)
+    count = len(border)
+    for k in range(count):
+        waiting[k] = border[k]
+        pending[border[k]] = 2
+    half = 0
+    while count > 0:
+        left, losses = 0, 0
+        for k in range(count):
+            i = waiting[k]
+            code = 0
+            for n in range(8):
+                code |= int(flat[i + steps[n]]) << n
+            if deletable[half, code]:
+                pending[i] = 0
+                gone[losses] = i
+                losses += 1
+            else:
+                pending[i] -= 1
+                waiting[left] = i
+                left += pending[i]
+        count = left
+        for k in range(losses):
+            flat[gone[k]] = 0
+        for k in range(losses):
+            for n in range(8):
+                j = gone[k] + steps[n]
+                waiting[count] = j
+                count += int((flat[j] != 0) & (pending[j] == 0))
+                pending[j] = 2 * flat[j]
+        half = 1 - half
+
+
+@numba.njit(cache=True, nogil=True)
+def cast_rays(
+    cells: NDArray[np.int8], rows: F64, columns: F64, limit: float, bearings: int, patience: int
+) -> tuple[F32, NDArray[np.int8]]:
+    """Follow the rays of each place (N,) in steps of half a cell; all lengths in cells. Returns (N, B) each.
+
+    cells : (H, W). rows, columns : (N,) where the rays start, in cells from the grid's corner. limit : length
+    of a ray. patience : steps through unknown cells after which a ray is HIDDEN.
+
+    Returns how far each ray is known to be free (or its wall), and how it ends.
+
+    Measured: 20 times as fast as the numpy form at 78 places of fr079 (4 against 87 ms); every described view
+    and every query casts rays.
+    """
+    height, width = cells.shape
+    flat = np.ascontiguousarray(cells).reshape(-1)
+    ranges = np.empty((len(rows), bearings), dtype=np.float32)
+    ends = np.empty((len(rows), bearings), dtype=np.int8)
+    step = 0.5
+    for b in range(bearings):
+        angle = 2.0 * np.pi * b / bearings
+        dc, dr = np.cos(angle) * step, np.sin(angle) * step
+        for n in range(len(rows)):
+            r, c, length = rows[n], columns[n], 0.0
+            end = 0
+            known = 0.0
+            unknown_run = 0
+            while length < limit:
+                r += dr
+                c += dc
+                length += step
+                if not (0.0 <= r < height and 0.0 <= c < width):
+                    end = -1
+                    break
+                value = flat[np.uint64(r) * np.uint64(width) + np.uint64(c)]
+                if value >= OCCUPIED_FROM:
+                    end = 1
+                    known = length
+                    break
+                if value < 0:
+                    unknown_run += 1
+                    if unknown_run > patience:
+                        end = -1
+                        break
+                else:
+                    unknown_run = 0
+                    known = length
+            ranges[n, b] = known
+            ends[n, b] = end
+    return ranges, ends

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from pc2grid.errors import OutputError
 from signature.database.database import SubmapDatabase
-from signature.database.postgres.rows import PostgresRows
-from signature.database.postgres.server import is_url, location
+from signature.database.postgres import PostgresRows, is_url, location
 from signature.database.protocol import Label, Place, Problem, Provenance, SessionInfo
 from signature.database.rows import Rows
-from signature.database.sqlite.rows import SqliteRows
+from signature.database.sqlite import SqliteRows
 
 __all__ = [
     "Label",

@@ -13,21 +13,28 @@ from pc2grid.display import html_table, short
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
 from pc2grid.model import Loop, OccupancyGrid, PointMap, SessionMap, Submap, Trajectory
 from pc2grid.submaps.junction_graph import graph_from_arrays
-from pc2grid.submaps.partition import view_at
+from pc2grid.submaps.submaps import view_at
 from signature.config import Config
-from signature.database import document, validation
-from signature.database.arrays import DatabaseDamage, explained
-from signature.database.document import PARTS, StoredSession, SubmapArrays, stored_session
+from signature.database import document
+from signature.database import document as validation
+from signature.database.document import (
+    PARTS,
+    DatabaseDamage,
+    StoredSession,
+    SubmapArrays,
+    explained,
+    stored_session,
+)
 from signature.database.protocol import BuildingFrame, Label, Problem, Provenance, SessionInfo
 from signature.database.rows import Rows, SessionRow, no_session
-from signature.similarity import SignatureTable
+from signature.paper import SignatureTable
 
 if TYPE_CHECKING:
     import networkx as nx
     from typing_extensions import Self
 
-    from signature.describe import Signature
-    from signature.seen_places import SeenPlaces
+    from signature.paper import Signature
+    from signature.visible import SeenPlaces
 
 
 class SubmapDatabase:

@@ -16,9 +16,9 @@ from pydantic import ValidationError
 
 from pc2grid.errors import DatabaseError, DatabaseVersion
 from pc2grid.model import is_part_of
-from signature.database import document, validation
-from signature.database.arrays import DatabaseDamage, explained, row_crc
-from signature.database.document import PARTS, StoredSession
+from signature.database import document
+from signature.database import document as validation
+from signature.database.document import PARTS, DatabaseDamage, StoredSession, explained, row_crc
 from signature.database.protocol import BuildingFrame, Place, Problem, SessionInfo
 
 if TYPE_CHECKING:

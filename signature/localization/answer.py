@@ -1,10 +1,22 @@
-"""The answer to "where was this?", and how it reads as a document."""
+"""The answer to "where was this?", and how it reads as a document.
+
+The line on which the likely places of an ambiguous answer lie.
+
+The walls of a corridor hold a query across it, and with its heading; along it the query fits again and again.
+Then there are many places, and yet much is known: a line, and a heading.
+
+Answers in the frame of a building: poses in the maps of joined sessions, moved into one frame.
+
+The path of a query, corrected by where it was located on the way.
+"""
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import compress
 from pathlib import Path
@@ -12,24 +24,23 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pc2grid.arrays import F64, freeze
 from pc2grid.display import html_picture, html_table, map_png, probability, short
 from pc2grid.errors import ConfigError, OutputError
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F64, I64, SE2, freeze, wrap_angle
 from pc2grid.io.atomic import replace_file, require_writable
-from pc2grid.model import OccupancyGrid, Trajectory
+from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database import open_database
-from signature.database.protocol import Label
-from signature.localization.ambiguous_line import AmbiguousLine, ambiguous_line
+from signature.database.protocol import BuildingFrame, Label
 from signature.localization.answer_json import AnswerDocument, document
 from signature.localization.answer_json import Status as Status
-from signature.localization.hypotheses import Hypothesis
-from signature.localization.posterior import POSTERIOR, Evidence
+from signature.localization.hypotheses import HYPOTHESES, Hypothesis
+from signature.localization.posterior import POSTERIOR, PRIOR, Evidence
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from signature.localization.answer_json import QueryRecording
+
 
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]
 
@@ -155,7 +166,7 @@ class Answer:
     the time that it is about; "ahead", its time lies after the last scan. excluded : the best place that the
     prior excludes, if nothing that it allows is certain and this fits better.
     frames : for each session the frame of its building that poses are in, None: in its map frame; empty: all
-    are in the map frames of their sessions (`signature.localization.in_building`).
+    are in the map frames of their sessions (`signature.localization.answer`).
     in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
     none. Of a place that was turned down because they contradict it, the pose there.
     off_map : places beside the map, the likeliest first, see `Verdict`.
@@ -252,7 +263,7 @@ class Answer:
         Raises ConfigError unless `pc2grid.relocalize` has answered, OutputError if the page cannot be
         written, and the errors of `pc2grid.open_database`.
         """
-        from signature.localization.shown.report import Found, write_report
+        from signature.localization.shown.page import Found, write_report
 
         if self.asked is None:
             raise ConfigError(
@@ -325,3 +336,193 @@ _SHOWN = 6
 
 def _pose(pose: SE2) -> str:
     return f"x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AmbiguousLine:
+    """A line on which likely places lie, all with one heading.
+
+    begin_m, end_m : (x, y) of its ends, in the frame of the best hypothesis. yaw_rad : the heading there.
+    probability : that the base is at one of these places.
+    """
+
+    begin_m: tuple[float, float]
+    end_m: tuple[float, float]
+    yaw_rad: float
+    probability: float
+
+    @property
+    def length_m(self) -> float:
+        """From one end to the other."""
+        return math.dist(self.begin_m, self.end_m)
+
+
+def ambiguous_line(bases: Sequence[SE2], masses: Sequence[float]) -> AmbiguousLine | None:
+    """The line through the best place that most of the mass lies on, with the heading of that place.
+
+    bases : the base at each place of one frame, best first. masses : of each. None if no other place has this
+    heading, or if it is not likely that the base is at one of them.
+    """
+    lines = (_through(bases, masses, other) for other in range(1, len(bases)))
+    likely = [line for line in lines if line is not None and line.probability >= POSTERIOR.likely]
+    return max(likely, key=lambda line: line.probability, default=None)
+
+
+def _through(bases: Sequence[SE2], masses: Sequence[float], other: int) -> AmbiguousLine | None:
+    """The line through the best place and another one; None if their headings differ."""
+    poses = np.array([(base.x, base.y, base.yaw) for base in bases])
+    away_m, turned = poses[:, :2] - poses[0, :2], np.abs(wrap_angle(poses[:, 2] - poses[0, 2]))
+    length_m = math.hypot(*away_m[other])
+    if turned[other] >= HYPOTHESES.same_rad or not length_m:
+        return None
+    along = away_m[other] / length_m
+    across_m = np.abs(away_m @ np.array((-along[1], along[0])))
+    on_line = np.flatnonzero((turned < HYPOTHESES.same_rad) & (across_m < HYPOTHESES.same_m))
+    at_m = away_m[on_line] @ along
+    ends = on_line[[at_m.argmin(), at_m.argmax()]]
+    (x, y), (to_x, to_y) = poses[ends, :2].tolist()
+    mass = float(np.asarray(masses)[on_line].sum())
+    return AmbiguousLine(begin_m=(x, y), end_m=(to_x, to_y), yaw_rad=bases[0].yaw, probability=mass)
+
+
+_APART = BuildingFrame(name="", T_building_session=SE2(), covariance=((0.0,) * 3,) * 3)
+"""Of a session that is not joined: its poses stay as they are."""
+
+
+def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> Answer:
+    """An answer with all poses in the frames of the buildings, where their sessions have one.
+
+    frames : of sessions that were joined, by name (`SubmapDatabase.frames`). Covariances contain how exactly
+    the session is known to lie in its building.
+    """
+    frame_of = [frames.get(name, _APART) for name in answer.sessions]
+    hypotheses = tuple(
+        _hypothesis(h, frame_of[h.session_index], answer.T_odom_base) for h in answer.hypotheses
+    )
+    stated = replace(
+        answer,
+        hypotheses=hypotheses,
+        off_map=tuple(
+            replace(
+                away,
+                hypothesis=_hypothesis(
+                    away.hypothesis, frame_of[away.hypothesis.session_index], answer.T_odom_base
+                ),
+            )
+            for away in answer.off_map
+        ),
+        history=tuple(_moment(moment, frames) for moment in answer.history),
+        excluded=answer.excluded and _moment(answer.excluded, frames),
+        frames=tuple(frame.name or None for frame in frame_of),
+    )
+    if answer.status != "located":
+        return stated
+    fit = hypotheses[0].fit
+    return replace(
+        stated,
+        T_map_base=fit.T_map_query @ answer.T_odom_base,
+        T_map_odom=fit.T_map_query,
+        covariance=fit.covariance,
+        in_space=answer.in_space and _in_space(answer.in_space, frame_of[hypotheses[0].session_index]),
+    )
+
+
+def covariance_in_building(covariance: F64, T_session_base: SE2, frame: BuildingFrame) -> F64:
+    """The covariance (3, 3) of a pose in a session's map as one in its building: turned, and with that of the
+    session's own place, whose heading moves the pose the more the farther it is from the session's origin."""
+    T = frame.T_building_session
+    there = frame.placed(T_session_base)
+    turn = SE2(0.0, 0.0, there.yaw - T_session_base.yaw).matrix()
+    J = np.eye(3)
+    J[:2, 2] = T.y - there.y, there.x - T.x
+    return np.asarray(turn @ covariance @ turn.T + J @ np.array(frame.covariance) @ J.T)
+
+
+def _hypothesis(hypothesis: Hypothesis, frame: BuildingFrame, T_odom_base: SE2) -> Hypothesis:
+    fit = hypothesis.fit
+    T_map_base = fit.T_map_query @ T_odom_base
+    T_building_query = frame.at(T_map_base.x, T_map_base.y) @ fit.T_map_query
+    covariance = covariance_in_building(fit.covariance, T_map_base, frame)
+    return replace(hypothesis, fit=replace(fit, T_map_query=T_building_query, covariance=covariance))
+
+
+def _moment(moment: Moment, frames: Mapping[str, BuildingFrame]) -> Moment:
+    frame = frames.get(moment.session or "", _APART)
+    return replace(moment, pose=moment.pose and frame.placed(moment.pose))
+
+
+def _in_space(pose: PoseInSpace, frame: BuildingFrame) -> PoseInSpace:
+    T_map_base = SE2.from_matrix(pose.T_map_base)
+    T = frame.at(T_map_base.x, T_map_base.y).lift()
+    turn = np.kron(np.eye(2), T[:3, :3])
+    covariance = turn @ pose.covariance @ turn.T
+    planar = np.ix_((0, 1, 5), (0, 1, 5))
+    nothing = np.zeros((3, 3))
+    covariance[planar] += covariance_in_building(nothing, T_map_base, frame)
+    return replace(pose, T_map_base=T @ pose.T_map_base, covariance=covariance)
+
+
+def followed(poses: Trajectory, answer: Answer) -> Trajectory:
+    """The query's poses (odometry frame of its last scan), corrected by where it was located on the way.
+
+    Between two located moments the correction is interpolated along the travel, in position and heading of
+    the base; before the first one it is that of the first. Where registration was lost the motion is not
+    known, so nothing is interpolated across. A moment counts if the one before or after it agrees with it, by
+    the motion between them.
+
+    Without an answer: as they are.
+    """
+
+    if answer.T_map_odom is None:
+        return poses
+    planar = poses.planar()
+    travel_m = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(planar[:, :2], axis=0).T))))
+    # Scans of a standing robot get increasing values, too.
+    travel_m += 1e-9 * np.arange(len(travel_m))
+    health = poses.health or (Health.FINE,) * len(poses)
+    part = np.cumsum([h is Health.LOST for h in health])
+    at, moments = _located_moments(poses, travel_m, part, answer)
+    T_odom_map = answer.T_map_odom.inverse()
+    corrections = [T_odom_map @ pose @ SE2(*planar[k]).inverse() for k, pose in zip(at, moments, strict=True)]
+    turns = np.unwrap([T.yaw for T in corrections])
+    moved = np.array([T.apply(planar[:, :2]) for T in corrections])
+    corrected = poses.T_session_base.copy()
+    for number in np.unique(part):
+        here = np.flatnonzero(part == number)
+        own = np.flatnonzero(part[at] == number)
+        if not len(own):
+            own = np.abs(at - here.mean()).argmin(keepdims=True)
+        # How much each of the moments counts at each of the scans: between two of them, both.
+        shares = [np.interp(travel_m[here], travel_m[at[own]], one) for one in np.eye(len(own))]
+        for k, share in zip(here, np.transpose(shares), strict=True):
+            height_m = corrected[k, 2, 3]
+            corrected[k] = SE2(0.0, 0.0, share @ turns[own]).lift() @ corrected[k]
+            corrected[k, :3, 3] = *(share @ moved[own, k]), height_m
+    return replace(poses, T_session_base=corrected)
+
+
+def _located_moments(poses: Trajectory, travel_m: F64, part: I64, answer: Answer) -> tuple[I64, list[SE2]]:
+    """The scans at which the query was located in the session of the answer, and the base in its map."""
+
+    planar = poses.planar()
+    found = [
+        (int(np.searchsorted(poses.stamps_ns, moment.stamp_ns)), moment.pose)
+        for moment in answer.history
+        if moment.status == "located" and moment.session == answer.session and moment.pose is not None
+    ]
+
+    def agree(a: tuple[int, SE2], b: tuple[int, SE2]) -> bool:
+        if part[a[0]] != part[b[0]]:
+            return False
+        expected = a[1] @ SE2(*planar[a[0]]).inverse() @ SE2(*planar[b[0]])
+        apart_m = math.hypot(expected.x - b[1].x, expected.y - b[1].y)
+        limit_m = HYPOTHESES.same_m + PRIOR.drift * (travel_m[b[0]] - travel_m[a[0]])
+        return apart_m <= limit_m and abs(wrap_angle(expected.yaw - b[1].yaw)) <= HYPOTHESES.same_rad
+
+    agrees = [agree(a, b) for a, b in itertools.pairwise(found)]
+    kept = [
+        here
+        for here, before, after in zip(found, [False, *agrees], [*agrees, True], strict=True)
+        if before or after  # the last one is the answer
+    ]
+    return np.array([k for k, _ in kept], np.int64), [pose for _, pose in kept]

@@ -33,14 +33,12 @@ from typing import Literal
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
-from pc2grid.matching.two_way_score import score_fit
+from pc2grid.geometry import F64, SE2
+from pc2grid.matching.score import score_fit
 from signature.localization.answer import Answer, OffMap, Verdict
 from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import POSTERIOR
-from signature.localization.prior import PRIOR, Prior
+from signature.localization.posterior import POSTERIOR, PRIOR, Prior
 from signature.localization.query import QueryMap
 
 State = Literal["searching", "located", "off_map", "doubtful", "lost", "recovered"]

@@ -15,17 +15,17 @@ from dataclasses import replace
 import numpy as np
 
 from pc2grid.geometry import wrap_angle
-from pc2grid.matching.two_way_score import Fit
+from pc2grid.matching.score import Fit
 from signature.localization.answer import OffMap, Status, Verdict
 from signature.localization.hypotheses import Hypothesis, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
     NO_EVIDENCE,
+    PRIOR,
     evidence_of,
     masses,
     tail_of,
 )
-from signature.localization.prior import PRIOR
 from signature.localization.query import QueryMap
 
 Place = tuple[Hypothesis, ...]

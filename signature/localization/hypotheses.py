@@ -8,19 +8,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64
-from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.matching.refinement import refine
-from pc2grid.matching.two_way_score import Fit, score_fit
-from pc2grid.matching.walls import thin_evenly
-from pc2grid.matching.window_search import (
+from pc2grid.geometry import F32, F64, SE2, wrap_angle
+from pc2grid.matching.score import Fit, refine, score_fit
+from pc2grid.matching.search import (
     SearchMap,
     SearchParameters,
     search_windows,
 )
+from pc2grid.matching.walls import thin_evenly
 from signature.config import RelocalizeConfig
 from signature.localization.query import QueryMap
-from signature.retrieval.viewpoints import SQUARE_M, Area, Places
+from signature.retrieval.places import SQUARE_M, Area, Places
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -29,8 +29,7 @@ from itertools import permutations
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F64, SE2
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, Unfit, register_in_space
 from signature.database import SubmapDatabase
 from signature.localization.answer import PoseInSpace, SpaceStatus, Status, Verdict

@@ -3,28 +3,48 @@
 Hypotheses are carried along the query's travel: after every metre the old ones are refined on what has been
 seen since, and the database is searched again, so that a wrong first hypothesis is replaced. What was seen
 before the last metres is in the masses that the belief holds (`signature.localization.belief`).
+
+From a query and the hypotheses for it to its answer.
+
+By what it has seen over the last metres, and by what was known before; refined and checked in space, where
+both sides have points.
+
+Searches of the database beside the tracking of a robot.
+
+A search takes up to seconds in a large building, and a robot sends 40 scans in one. So it is made in a thread
+of its own, while tracking goes on: its parts that cost most are compiled and run beside Python.
+
+When a robot is told its pose.
 """
 
 from __future__ import annotations
 
+import math
+import threading
 import time
 from collections import deque
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
 from functools import partial
+from types import TracebackType
+from typing import Generic, Literal, Protocol, TypeVar
+
+import numpy as np
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
-from pc2grid.model import Health, RegisteredScan
-from pc2grid.threads import one_blas_thread
-from signature.localization.answer import Answer, Moment
-from signature.localization.answering import Clock, answer_query
-from signature.localization.belief import Belief, State
-from signature.localization.decision import PriorOf
-from signature.localization.hypotheses import HYPOTHESES, Hypothesis
+from pc2grid.libraries import one_blas_thread
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan
+from signature.localization.answer import Answer, Moment, OffMap, Verdict
+from signature.localization.belief import Belief, Masses, State
+from signature.localization.decision import PriorOf, beside_map, decide, judge, with_slip
+from signature.localization.hypotheses import HYPOTHESES, Hypothesis, moved_to_origin
+from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR
-from signature.localization.query import Query
+from signature.localization.query import Query, QueryMap, ViewSpacing, map_as_query
 
 _MOMENTS = 10_000
 """The latest moments that `Answer.history` tells, some kilometres, so that memory is bounded; by hand."""
@@ -214,3 +234,314 @@ class Localizer:
             history=tuple(self._history),
             clock=self._clock,
         )
+
+
+class Clock:
+    """Adds up elapsed times by name, milliseconds. All time since the last lap belongs to the next one."""
+
+    def __init__(self) -> None:
+        self.total_ms: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        """Add the time since the last lap to `name`."""
+        now = time.perf_counter()
+        self.total_ms[name] = self.total_ms.get(name, 0.0) + 1000.0 * (now - self._last)
+        self._last = now
+
+
+def answer_query(
+    index: MapIndex,
+    query: Query,
+    seen: QueryMap,
+    known: tuple[Hypothesis, ...],
+    *,
+    prior_of: PriorOf,
+    off_map: Sequence[OffMap],
+    session_index: int | None,
+    history: tuple[Moment, ...],
+    clock: Clock,
+) -> Answer:
+    """Where a query is.
+
+    seen : `query` drawn. known : hypotheses that are compared, too. prior_of : what was known before it, of
+    each place. off_map : where it may be beside the map, see `signature.localization.belief.Belief.off_map`.
+    session_index : of the map that is preferred among several that show the place.
+    """
+    verdict, found = decide(index, seen, known, prior_of)
+    clock.lap("search")
+    prior, excluded = _with_prior(index, seen, verdict, found)
+    verdict = beside_map(verdict, seen, prior_of, off_map, index.config.accept)
+    verdict = _in_map(_with_slip(index, query, verdict), session_index)
+    clock.lap("decide")
+    in_space = None
+    if query.in_space is not None:
+        verdict, in_space = settle_in_space(verdict, query.in_space, index.surface, index.config.accept)
+        clock.lap("in_space")
+    answer = _answer(index, seen, verdict, history)
+    timing_ms = dict(clock.total_ms)
+    return replace(answer, prior=prior, excluded=excluded, in_space=in_space, timing_ms=timing_ms)
+
+
+def _with_prior(
+    index: MapIndex, query: QueryMap, verdict: Verdict, found: tuple[Hypothesis, ...]
+) -> tuple[Literal["used", "lapsed", "ahead"] | None, Moment | None]:
+    """What became of the prior, and the best place of those found that it excludes, where nothing is certain
+    that it allows."""
+    if index.whole is None or index.region is None:
+        return None, None
+    if not index.prior_applies(query):
+        return "ahead" if index.region.is_ahead(query) else "lapsed", None
+    if verdict.status == "located":
+        return "used", None
+    best = judge(index.whole, query, found)
+    excluded = best.hypotheses and not index.allows(query, best.hypotheses[0])
+    return "used", moment_of(index.whole, query, best) if excluded else None
+
+
+def _with_slip(index: MapIndex, query: Query, verdict: Verdict) -> Verdict:
+    """The verdict, by what the scans since the likeliest slip say alone."""
+    evidence = verdict.evidence
+    if not evidence.tail or min(evidence.tail) >= 0.0:
+        return verdict
+    since = query.since(evidence.scans_since).map()
+    alone, _ = decide(index, since)
+    here = Masses.of(since, alone).mass([verdict.hypotheses[0]])
+    found = alone.confidence and math.exp(alone.evidence.log_odds()) / alone.confidence
+    elsewhere = 1.0 + found * (sum(alone.masses) - here)
+    return with_slip(verdict, elsewhere, index.config.accept)
+
+
+def _in_map(verdict: Verdict, session_index: int | None) -> Verdict:
+    """The verdict in which, of each place, the hypothesis in the map of one session comes first."""
+    ordered = sorted(
+        zip(verdict.places, verdict.hypotheses, strict=True),
+        key=lambda each: (each[0], each[1].session_index != session_index),
+    )
+    return replace(verdict, hypotheses=tuple(h for _, h in ordered))
+
+
+@one_blas_thread
+def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
+    """Find where a drawn map, for example a nav2 map or a part of one, lies in the building.
+
+    grid : the query, in any frame of its own; cells that it does not know must be unknown, not free.
+
+    There is no robot in it, so the "base" of the answer is the map's own frame: `T_map_base` and
+    `T_map_odom` both are T_map_query, and the travelled path is 0 m long.
+
+    >>> import pc2grid, signature
+    >>> with signature.open_database("plan.submaps") as database:
+    ...     answer = locate_map(pc2grid.load_map("part.yaml"), MapIndex.of(database, database.config()))
+    >>> answer.status, round(answer.T_map_base.x, 1), round(answer.T_map_base.y, 1)
+    ('located', 4.0, 3.0)
+    """
+    clock = Clock()
+    query = map_as_query(grid, index.made_with, index.config, drawn=True)
+    clock.lap("describe")
+    verdict, _ = decide(index, query)
+    clock.lap("search")
+    at_origin = tuple(_at_origin(h, query.T_odom_base) for h in verdict.hypotheses)
+    verdict = replace(verdict, hypotheses=at_origin)
+    answer = _answer(index, replace(query, T_odom_base=SE2()), verdict, ())
+    return replace(answer, timing_ms=clock.total_ms)
+
+
+def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
+    """The hypothesis with its covariance, known for the point `at` of the query, at the query's origin."""
+    fit = hypothesis.fit
+    covariance = moved_to_origin(fit.covariance, fit.T_map_query, at)
+    return replace(hypothesis, fit=replace(fit, covariance=covariance))
+
+
+def moment_of(index: MapIndex, query: QueryMap, verdict: Verdict) -> Moment:
+    """The state of the answer now."""
+    best = verdict.hypotheses[0] if verdict.hypotheses else None
+    return Moment(
+        stamp_ns=query.stamp_ns,
+        path_m=query.path_m,
+        status=verdict.status,
+        session=index.sessions[best.session_index] if best else None,
+        pose=best.fit.T_map_query @ query.T_odom_base if best else None,
+        confidence=verdict.confidence,
+    )
+
+
+def _answer(index: MapIndex, query: QueryMap, verdict: Verdict, history: tuple[Moment, ...]) -> Answer:
+    located = verdict.hypotheses[0] if verdict.status == "located" else None
+    table = index.places.table
+    T_map_query = located.fit.T_map_query if located else None
+    return Answer(
+        status=verdict.status,
+        session=index.sessions[located.session_index] if located else None,
+        stamp_ns=query.stamp_ns,
+        T_map_base=T_map_query @ query.T_odom_base if T_map_query else None,
+        covariance=located.fit.covariance if located else None,
+        T_map_odom=T_map_query,
+        confidence=verdict.confidence,
+        hypotheses=verdict.hypotheses,
+        places=verdict.places,
+        masses=verdict.masses,
+        off_map=verdict.off_map,
+        history=(*history, moment_of(index, query, verdict)),
+        T_odom_base=query.T_odom_base,
+        path_m=query.path_m,
+        sessions=index.sessions,
+        labels=index.labels,
+        submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in verdict.hypotheses),
+        evidence=verdict.evidence,
+        local_map=query.grid,
+        map=index.grids[verdict.hypotheses[0].session_index] if verdict.hypotheses else None,
+        views_m=tuple(view.center_m for view in query.views),
+    )
+
+
+EstimateT = TypeVar("EstimateT")
+EstimateT_co = TypeVar("EstimateT_co", covariant=True)
+
+
+class Follows(Protocol[EstimateT_co]):
+    """What follows a robot: a `Localizer` or a `PoseWatch`.
+
+    uses_points : whether the scans that `ViewSpacing` takes are needed with their points.
+    """
+
+    @property
+    def uses_points(self) -> bool:
+        """See above."""
+        ...
+
+    def add(
+        self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True
+    ) -> EstimateT_co | None:
+        """Take in the next scan; returns an estimate if there is one after it."""
+        ...
+
+    def restart(self) -> None:
+        """The scans do not go on from those before."""
+        ...
+
+
+_MOST_WAITING = 2000
+"""Scans that wait for a search to end; beyond, the oldest are left out. Chosen by hand: some 20 MB,
+and the points of a scan every 0.2 m where they are used."""
+
+
+class Follower(Generic[EstimateT]):
+    """Feeds a `Localizer` or a `PoseWatch` with scans, here or in a thread. Use as a context manager.
+
+    lock : is held while the database is read; hold it to read the database in between.
+    """
+
+    def __init__(self, localizer: Follows[EstimateT], *, beside: bool, step_m: float = 1.0) -> None:
+        """beside : in a thread; otherwise each search is made before `add` returns, always after the same
+        scans.
+
+        step_m : travel after which a search is due. It is left out if so much travel waits behind it.
+        """
+        self.lock = threading.Lock()
+        self._localizer, self._step_m = localizer, step_m
+        self._path_m = 0.0
+        self._last: SE2 | None = None
+        self._spacing = ViewSpacing()
+        self._waiting: deque[tuple[RegisteredScan, PlanarScan, float] | None] = deque(maxlen=_MOST_WAITING)
+        self._estimates: deque[Future[EstimateT | None]] = deque()
+        self._thread = ThreadPoolExecutor(1, "searches") if beside else None
+
+    def __enter__(self) -> Follower[EstimateT]:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the thread, when it has finished its search."""
+        self._waiting.clear()
+        if self._thread is not None:
+            self._thread.shutdown(cancel_futures=True)
+
+    def add(self, registered: RegisteredScan, planar_scan: PlanarScan) -> None:
+        """Hand over the next scan."""
+        pose = SE2.from_matrix(registered.T_session_base)
+        if self._last is not None:
+            self._path_m += math.hypot(pose.x - self._last.x, pose.y - self._last.y)
+        self._last = pose
+        if self._thread is not None and not (self._localizer.uses_points and self._spacing.takes(registered)):
+            # Of most scans only the pose is used, and a lidar's points would fill the memory.
+            scan = replace(registered.scan, points_m=np.empty((0, 3), np.float32), offsets_s=None)
+            registered = replace(registered, scan=scan)
+        self._hand_over((registered, planar_scan, self._path_m))
+
+    def restart(self) -> None:
+        """The scans do not go on from those before."""
+        self._last, self._spacing = None, ViewSpacing()
+        self._hand_over(None)
+
+    def take(self) -> list[EstimateT]:
+        """The estimates that are done. Raises what the thread raised."""
+        taken = []
+        while self._estimates and self._estimates[0].done():
+            estimate = self._estimates.popleft().result()
+            taken += [] if estimate is None else [estimate]
+        return taken
+
+    def finish(self) -> None:
+        """Wait until the scans that were handed over are used."""
+        wait(self._estimates)
+
+    def _hand_over(self, item: tuple[RegisteredScan, PlanarScan, float] | None) -> None:
+        self._waiting.append(item)
+        if self._thread is not None:
+            self._estimates.append(self._thread.submit(self._use_next))
+            return
+        done: Future[EstimateT | None] = Future()
+        done.set_result(self._use_next())
+        self._estimates.append(done)
+
+    def _use_next(self) -> EstimateT | None:
+        try:
+            item = self._waiting.popleft()
+        except IndexError:  # left out
+            return None
+        if item is None:
+            self._localizer.restart()
+            return None
+        registered, planar_scan, path_m = item
+        with self.lock:
+            may_search = self._path_m - path_m < self._step_m
+            return self._localizer.add(registered, planar_scan, may_search=may_search)
+
+
+@dataclass(slots=True)
+class ResetPolicy:
+    """When `/initialpose` is sent: when the robot is located first, and when it was lost or carried away.
+
+    Limits how often: repeated resets would keep navigation from continuing.
+
+    pause_s : least time between two resets. most : resets until the robot has been located for `calm_s`.
+    """
+
+    pause_s: float = 10.0
+    most: int = 5
+    calm_s: float = 60.0
+    clock: Callable[[], float] = time.monotonic
+    _is_due: bool = True
+    _last_s: float | None = None
+    _count: int = 0
+
+    def allows(self, state: State) -> bool:
+        """Whether the pose of an estimate is to be sent; it then counts as sent.
+
+        state : of each estimate in turn.
+        """
+        self._is_due = self._is_due or state in ("lost", "recovered")
+        if state not in ("located", "recovered") or not self._is_due:
+            return False
+        now_s = self.clock()
+        if self._last_s is not None:
+            if now_s - self._last_s > self.calm_s:
+                self._count = 0
+            if now_s - self._last_s < self.pause_s or self._count >= self.most:
+                return False
+        self._is_due, self._last_s = False, now_s
+        self._count += 1
+        return True

@@ -13,22 +13,28 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pc2grid.errors import DatabaseCorrupt
+from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.icp_in_space import MapSurface
-from pc2grid.matching.window_search import SearchMap
+from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from pc2grid.observer import Observer
-from pc2grid.threads import one_blas_thread
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import Hypothesis, align, best_around, distinct, fitted
 from signature.localization.in_space import SurfaceOf, surface_reader
-from signature.localization.posterior import POSTERIOR
-from signature.localization.prior import Prior, Region
+from signature.localization.posterior import POSTERIOR, Prior, Region
 from signature.localization.query import QueryMap
-from signature.retrieval.lazy_maps import DatabaseGrids, LazySequence
-from signature.retrieval.viewpoints import AT_ONCE_M2, FIRST_PLACES, SQUARE_M, Area, Places
-from signature.seen_places import SeenPlaces
-from signature.similarity import SignatureTable
+from signature.paper import SignatureTable
+from signature.retrieval.places import (
+    AT_ONCE_M2,
+    FIRST_PLACES,
+    SQUARE_M,
+    Area,
+    DatabaseGrids,
+    LazySequence,
+    Places,
+)
+from signature.visible import SeenPlaces
 
 if TYPE_CHECKING:
     from signature.database import SubmapDatabase
@@ -107,7 +113,7 @@ class MapIndex:
     def of(database: SubmapDatabase, config: Config, observer: Observer = Observer()) -> MapIndex:
         """Everything that is in a database.
 
-        If that is more than `signature.retrieval.viewpoints.AT_ONCE_M2` of free floor, maps are read when
+        If that is more than `signature.retrieval.places.AT_ONCE_M2` of free floor, maps are read when
         they first matter, and points always are, so the database must stay open as long as the index is used.
 
         observer : gets the progress where places have to be selected, and a warning if what is seen from them

@@ -4,7 +4,7 @@ The session is its own database: each stretch of some metres of travel becomes a
 described places, and every new stretch is looked up among those before it with the parts of a `MapIndex`.
 Signatures propose, the alignment of walls in both directions verifies, and a calibrated
 probability says how sure it is that the two maps show the same place. Which of several such places is the
-right one is decided by loop closure (`pc2grid.mapping.loop_candidates`), which knows the travel between them.
+right one is decided by loop closure (`pc2grid.mapping.loops`), which knows the travel between them.
 """
 
 from __future__ import annotations
@@ -17,17 +17,16 @@ from functools import lru_cache
 
 import numpy as np
 
-from pc2grid.mapping.place_recognition import Recognition, Stretch
-from pc2grid.matching.two_way_score import Fit
-from pc2grid.matching.window_search import SearchMap
+from pc2grid.mapping.loops import Recognition, Stretch
+from pc2grid.matching.score import Fit
+from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
 from signature.localization.hypotheses import align, best_around, distinct
 from signature.localization.posterior import log_likelihood_ratio
 from signature.localization.query import QueryMap, query_of
-from signature.retrieval.lazy_maps import LazySequence
-from signature.retrieval.viewpoints import Places
-from signature.similarity import SignatureTable
+from signature.paper import SignatureTable
+from signature.retrieval.places import LazySequence, Places
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

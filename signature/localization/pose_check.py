@@ -27,16 +27,15 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.map_pose import MapPose
-from pc2grid.matching.two_way_score import score_fit
+from pc2grid.libraries import one_blas_thread
+from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, RegisteredScan
-from pc2grid.threads import one_blas_thread
 from signature.localization.answer import Answer
 from signature.localization.belief import kept
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import log_likelihood
-from signature.localization.prior import Prior
+from signature.localization.posterior import Prior, log_likelihood
 
 CheckStatus = Literal["fine", "lost", "unsure"]
 

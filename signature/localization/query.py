@@ -14,23 +14,19 @@ from functools import cached_property
 
 import numpy as np
 
-from pc2grid.arrays import F64, cells_of
+from pc2grid.clouds.cloud import VoxelCloud
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.errors import NoScans
-from pc2grid.geometry import SE2, transform_points
+from pc2grid.geometry import F64, SE2, cells_of, transform_points
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.matching.icp_in_space import SpatialView
-from pc2grid.matching.self_likeness import self_likeness
+from pc2grid.matching.score import self_likeness
 from pc2grid.matching.walls import Walls
-from pc2grid.model import Health, OccupancyGrid, RegisteredScan
-from pc2grid.sensor_model import SENSOR_MODELS
-from pc2grid.submaps.isovist import HIDDEN, isovist, look_around
-from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import skeleton_of
+from pc2grid.model import SENSOR_MODELS, Health, OccupancyGrid, RegisteredScan
+from pc2grid.submaps.junction_graph import sample_evenly, skeleton_of
+from pc2grid.submaps.submaps import HIDDEN, isovist, look_around
 from signature.config import Config, RelocalizeConfig
-from signature.retrieval.view import View
-from signature.seen_places import PROFILE_BEARINGS
+from signature.visible import PROFILE_BEARINGS, View
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,7 +90,7 @@ class QueryMap:
 
     @cached_property
     def likeness(self) -> float:
-        """`pc2grid.matching.self_likeness` of the walls."""
+        """`pc2grid.matching.score` of the walls."""
         return self_likeness(self.walls)
 
 

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import pose_from_rotation_vector, transform_points
+from pc2grid.geometry import F64, pose_from_rotation_vector, transform_points
 
 SPACING_M = 0.05
 ROOM_M = (8.0, 6.0, 2.5)

@@ -32,15 +32,15 @@ from pc2grid.model import (
     UncertainStretch,
 )
 from pc2grid.submaps.junction_graph import graph_to_arrays
-from pc2grid.submaps.partition import view_at
+from pc2grid.submaps.submaps import view_at
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database import Provenance, SubmapDatabase, open_database
-from signature.database.arrays import row_crc, unpack
+from signature.database.document import row_crc, unpack
 from signature.database.protocol import Entry
 from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
-from signature.describe import Signature
 from signature.freespace import freespace_bins
+from signature.paper import Signature
 from tests.helpers import postgresql
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.config import Config
 from signature.sessions import add_sessions, build_session

@@ -14,8 +14,8 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from pc2grid.arrays import F64
 from pc2grid.errors import Pc2GridError
+from pc2grid.geometry import F64
 from pc2grid_cli.main import app
 from signature.database import open_database
 from tests.helpers.recordings import Message, ros, write_mcap

@@ -8,11 +8,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import pose_from_rotation_vector
+from pc2grid.geometry import F64, pose_from_rotation_vector
 from pc2grid.model import Scan
-from pc2grid.simulate.scene import Mesh, Scene, prism
-from pc2grid.simulate.sensors import OPTICAL
+from pc2grid.simulate.scene import OPTICAL, Mesh, Scene, prism
 
 STEP_M, TURN_RAD = 0.25, 0.35  # between two images
 WIDTH, HEIGHT = 96, 72

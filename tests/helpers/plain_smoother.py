@@ -7,11 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.estimation.manifold import steps
-from pc2grid.estimation.smoother import Smoother
-from pc2grid.estimation.window import State
-from pc2grid.geometry import wrap_angle
+from pc2grid.estimation.line_map import steps
+from pc2grid.estimation.smoother import Smoother, State
+from pc2grid.geometry import F64, wrap_angle
 
 
 class Factor(NamedTuple):

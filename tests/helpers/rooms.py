@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, Submap
-from pc2grid.submaps.partition import submap_at
+from pc2grid.submaps.submaps import submap_at
 
 RESOLUTION_M = 0.05
 """Edge of a cell, as in the default settings. Bounds on positions are whole cells: a map shows no less, and

@@ -6,7 +6,7 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, Loop, OccupancyGrid, SessionMap, Trajectory
-from pc2grid.submaps.partition import partition
+from pc2grid.submaps.submaps import partition
 from signature.config import Config
 
 

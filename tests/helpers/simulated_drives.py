@@ -13,14 +13,12 @@ import numpy as np
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid, RegisteredScan, Scan
-from pc2grid.submaps.isovist import WALL, isovist
-from pc2grid.submaps.partition import partition
+from pc2grid.submaps.submaps import WALL, isovist, partition
 from signature.config import Config
 from signature.database import Label
 from signature.database.protocol import BuildingFrame
-from signature.describe import describe
 from signature.localization.map_index import MapIndex
-from signature.similarity import SignatureTable
+from signature.paper import SignatureTable, describe
 
 RESOLUTION_M = 0.05
 

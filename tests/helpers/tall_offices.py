@@ -7,8 +7,8 @@ from itertools import islice
 
 import numpy as np
 
+from pc2grid.clouds.cloud import VoxelCloud
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.clouds.voxel_cloud import VoxelCloud
 from pc2grid.geometry import SE2
 from pc2grid.io.building_file import sampled
 from pc2grid.model import PointMap, RegisteredScan

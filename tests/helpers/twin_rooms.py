@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, invert_pose, pose_from_rotation_vector, transform_points
+from pc2grid.geometry import F64, SE2, invert_pose, pose_from_rotation_vector, transform_points
 from pc2grid.model import Health, PointMap, RegisteredScan, Scan
 from tests.helpers.building_clouds import box_surface
 

@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.errors import ClusterError, ConfigError, DatabaseError, LiveError, Pc2GridError
-from pc2grid.extras import EXTRAS, of_addresses, require
-from pc2grid.io.live.targets import open_live
+from pc2grid.io.live.live_log import open_live
+from pc2grid.libraries import EXTRAS, of_addresses, require
 from pc2grid_cli.main import app
 from tests.helpers.rooms import cross, grid_of
 
@@ -87,7 +87,7 @@ def test_commands_say_all_that_is_missing_before_any_work(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Neither the recording nor the database exists: nothing was looked at before."""
-    from pc2grid.io.nav2_map import save_map
+    from pc2grid.io.maps import save_map
 
     save_map(grid_of(cross(6.0, 2.0)), tmp_path / "intel")
     before = sorted(tmp_path.iterdir())

@@ -10,20 +10,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import Config
 from pc2grid.errors import NoScans, TrackingLost
 from pc2grid.geometry import SE2, invert_pose
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.mapping.report import check_followed, lost_warnings
+from pc2grid.mapping.part_maps import check_followed, lost_warnings
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, Trajectory
-from pc2grid.observer import Observer
+from pc2grid.observer import Observer, TimeSpan
 from pc2grid.pipeline import build_map, build_maps, follow, map_scans
+from pc2grid.settings import Config
 from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
-from pc2grid.time_span import TimeSpan
-from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
+from pc2grid_lab.experiments.truth import read_relations, relation_error
 from tests.helpers.rooms import RESOLUTION_M
 
 Mapped = tuple[Session, list[tuple[Scan, SE2]], OccupancyGrid, Trajectory]

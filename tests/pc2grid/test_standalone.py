@@ -6,7 +6,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from tests.helpers.simulated_drives import office
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -18,7 +18,7 @@ def test_pc2grid_needs_no_signature(tmp_path: Path) -> None:
         "import sys\n"
         "sys.modules['signature'] = None\n"  # importing it raises ImportError
         "import pc2grid\n"
-        "from pc2grid.config import Config\n"
+        "from pc2grid.settings import Config\n"
         f"grid = pc2grid.load_map({str(tmp_path / 'map.yaml')!r})\n"
         "print(len(pc2grid.submaps_of(grid, Config().partition)) > 10, callable(pc2grid.build_map))\n"
         "try:\n"

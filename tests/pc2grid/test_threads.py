@@ -14,7 +14,7 @@ import scipy.linalg  # noqa: F401  its BLAS is loaded, as that of a user's progr
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import pc2grid
-from pc2grid import threads
+from pc2grid import libraries as threads
 from pc2grid.geometry import SE2
 from pc2grid.model import RegisteredScan
 from pc2grid.simulate import SimulationConfig, simulate_session

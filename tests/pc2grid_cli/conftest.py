@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from tests.helpers.simulated_drives import cut, office

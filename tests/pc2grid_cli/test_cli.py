@@ -17,7 +17,7 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.model import OccupancyGrid
 from pc2grid_cli.console import Console
 from pc2grid_cli.main import app
@@ -276,7 +276,7 @@ import contextlib, io, sys
 from typer.main import get_command
 from pc2grid_cli.main import app
 heavy = {"numpy", "scipy", "cv2", "open3d", "kiss_icp", "matplotlib", "numba", "networkx", "rosbags", "mcap",
-         "google", "apsw", "rich", "pc2grid.config", "signature.database"}
+         "google", "apsw", "rich", "pc2grid.settings", "signature.database"}
 def said(group, words):
     before = heavy & {*sys.modules}
     with contextlib.redirect_stdout(io.StringIO()) as out, contextlib.suppress(SystemExit):

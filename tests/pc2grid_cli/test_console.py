@@ -15,7 +15,7 @@ import pytest
 from rich.progress import Progress
 
 import pc2grid
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.observer import Observer, ProgressBars
 from pc2grid_cli import console, main
 from tests.helpers.interruptible import interruptible

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.model import MISSING_FILES, ReadReport
-from pc2grid_cli import data_loss
+from pc2grid_cli import output as data_loss
 from pc2grid_cli.main import app
 from tests.helpers.recordings import STEP, T0, ros, write_mcap
 

@@ -14,12 +14,12 @@ import pytest
 from mcap.reader import make_reader
 from typer.testing import CliRunner
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import OutputError, Pc2GridError
 from pc2grid.io.building_file import building_points
-from pc2grid.io.export.cloud import write_cloud
+from pc2grid.io.export import write_cloud
 from pc2grid.io.trajectory import read_tum, write_tum
 from pc2grid.model import Trajectory
+from pc2grid.settings import ReadConfig
 from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid_cli.main import app
 from signature.config import Config

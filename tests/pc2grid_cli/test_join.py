@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from pc2grid import load_map
 from pc2grid.errors import ConfigError, DatabaseError
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid_cli.main import app
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part

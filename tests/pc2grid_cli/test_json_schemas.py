@@ -19,7 +19,7 @@ from pc2grid.model import MapOf, SensorKind
 from pc2grid.settings import dump_settings
 from pc2grid_cli.commands import export_command, simulate_command
 from pc2grid_cli.console import print_result
-from pc2grid_cli.json_schemas import DOCUMENTS, schema
+from pc2grid_cli.documents import DOCUMENTS, schema
 from pc2grid_cli.main import app
 from pc2grid_lab.commands import compare_recordings_command
 from signature.config import Config, ShortlistBy

@@ -16,12 +16,12 @@ from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from pc2grid.geometry import SE2
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid_cli.check_pose import as_text
 from pc2grid_cli.console import Console
-from pc2grid_cli.json_schemas import schema
+from pc2grid_cli.documents import schema
+from pc2grid_cli.known_pose import initialpose, read_pose
 from pc2grid_cli.main import app
-from pc2grid_cli.nav2_pose import initialpose, read_pose
 from signature.localization.pose_check import CheckStatus, PoseCheck
 from tests.helpers.field import field_log
 from tests.helpers.json_schema import closed

@@ -15,7 +15,7 @@ import pytest
 from typer.testing import CliRunner
 
 import pc2grid.pipeline
-import signature.files
+import signature.sessions
 from pc2grid.geometry import SE2
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
@@ -60,7 +60,7 @@ follow = pc2grid.pipeline.follow
 def test_the_path_follows_where_the_robot_was_located(
     folder: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(signature.files, "follow", drifting)
+    monkeypatch.setattr(signature.sessions, "follow", drifting)
     words = ("--trajectory", tmp_path / "found.tum", "--json")
     document = json.loads(run("relocalize", folder / "drive.mcap", "-d", folder / "b.submaps", *words))
     truth, found = read_tum(folder / "drive.tum"), read_tum(tmp_path / "found.tum")

@@ -21,10 +21,9 @@ from pc2grid.errors import (
     OutputError,
     Pc2GridError,
 )
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid_cli import console
-from pc2grid_cli.main import app
-from pc2grid_cli.removed import REMOVED
+from pc2grid_cli.main import REMOVED, app
 from signature.database.maintenance import store
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import STEP, T0, drive, ros, write_mcap

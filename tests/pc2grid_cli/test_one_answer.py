@@ -18,8 +18,7 @@ import pc2grid
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
-from pc2grid_cli.view import Locator
-from pc2grid_cli.view_server import ViewServer
+from pc2grid_cli.view import Locator, ViewServer
 from pc2grid_lab.experiments.answers import localize
 from signature.config import Config
 from signature.database import open_database

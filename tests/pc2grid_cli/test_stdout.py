@@ -17,11 +17,11 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid_cli import demo, main
 from pc2grid_cli.console import Console
-from pc2grid_cli.view_server import ViewServer
-from pc2grid_lab.compare import sensors
+from pc2grid_cli.view import ViewServer
+from pc2grid_lab import compare as sensors
 from pc2grid_lab.experiments import sensor_matrix
 from pc2grid_lab.paper import scale
 from tests.helpers.rooms import grid_of, rectangle

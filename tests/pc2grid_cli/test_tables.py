@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pc2grid_cli.tables import show, table
+from pc2grid_cli.output import show, table
 
 
 def test_a_narrow_terminal_cuts_nothing_off(

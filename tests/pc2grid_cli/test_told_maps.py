@@ -13,8 +13,8 @@ from mcap_ros2.decoder import DecoderFactory
 from typer.testing import CliRunner
 
 from pc2grid.errors import ConfigError
-from pc2grid.io.export.cloud import write_cloud
-from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.export import write_cloud
+from pc2grid.io.maps import load_map, save_map
 from pc2grid.model import THING, OccupancyGrid
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app

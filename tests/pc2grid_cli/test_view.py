@@ -31,9 +31,7 @@ from pc2grid.errors import NoScans
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
-from pc2grid_cli.view import Locator, live_page
-from pc2grid_cli.view_events import Events
-from pc2grid_cli.view_server import Options, ViewServer, safe_name
+from pc2grid_cli.view import Events, Locator, Options, ViewServer, live_page, safe_name
 from signature.config import Config
 from signature.database import open_database
 from tests.helpers.browser import DESK, PHONE, Browser

@@ -16,13 +16,13 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.io import open_log
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
-from pc2grid_cli.json_schemas import schema
+from pc2grid_cli.documents import schema
 from pc2grid_cli.main import app, main
-from pc2grid_lab.experiments.recordings.carried_away import Part, write_joined
-from signature.localization.resets import ResetPolicy
+from pc2grid_lab.experiments.recordings.kidnaps import Part, write_joined
+from signature.localization.localizer import ResetPolicy
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
 from tests.helpers.nav2_map import as_mapped, valid_for_nav2

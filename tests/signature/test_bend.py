@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from signature.bend import Bend, drawn_at, largest_m, motions, rigid_motions, straightened
+from signature.database.protocol import Bend, drawn_at, largest_m, motions, rigid_motions, straightened
 
 ARC: Bend = tuple((x, 0.0, 0.0, -0.002 * x * x / 2, -0.002 * x) for x in np.arange(0.0, 41.0, 4.0).tolist())
 """A corridor of 40 m that was drawn as an arc: its heading was 0.002 rad off for each metre."""

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import ClusterError, ConfigError
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.model import OccupancyGrid, part_name
 from pc2grid_cli.main import app
 from signature import conversion_jobs

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import scipy.spatial
 
-from signature.describe import Signature, describe
 from signature.freespace import freespace_graph
+from signature.paper import Signature, describe
 from tests.helpers.rooms import random_rooms, submap_of
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid.matching.two_way_score import Fit
+from pc2grid.matching.score import Fit
 from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
 from signature.database.maintenance import store

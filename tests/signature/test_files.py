@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 
 import pc2grid
-from pc2grid.config import ReadConfig
 from pc2grid.display import CENTRE_GREEN
 from pc2grid.errors import ConfigError, DatabaseError, OutputError
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.observer import Observer
+from pc2grid.settings import ReadConfig
 from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.config import Config
 from signature.database import Label, open_database
-from signature.files import convert, query_config, relocalize
+from signature.sessions import convert, query_config, relocalize
 from tests.helpers.simulated_drives import cut, office
 
 

@@ -11,11 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pc2grid.arrays import I64, BoolGrid, cells_of
+from pc2grid.geometry import I64, BoolGrid, cells_of
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN
-from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import thin
-from signature import _kernels
+from pc2grid.submaps.junction_graph import sample_evenly, thin
+from signature import freespace as _kernels
 from signature.boundary import boundary_edges
 from signature.config import SignatureConfig
 from signature.freespace import (

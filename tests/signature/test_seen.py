@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32
-from pc2grid.submaps.isovist import HIDDEN, OPEN, WALL
+from pc2grid.geometry import F32
+from pc2grid.submaps.submaps import HIDDEN, OPEN, WALL
 from signature.boundary import PAIR_BINS, RANGE_BINS, RIMS, boundary_seen, rim_columns, within
 from signature.freespace import DETOUR_BINS, PATH_BINS, path_lengths, seen_graph
-from signature.seen import parts, seen_signatures
+from signature.visible import parts, seen_signatures
 
 SIGHT_M, BEARINGS = 5.0, 48
 Ends = NDArray[np.int8]

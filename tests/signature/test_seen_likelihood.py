@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F32
-from signature import seen_likelihood
-from signature.seen import parts
-from signature.seen_likelihood import (
+from pc2grid.geometry import F32
+from signature import weights as seen_likelihood
+from signature.visible import parts
+from signature.weights import (
     DIMENSIONS,
     Pairs,
     SeenStatistics,

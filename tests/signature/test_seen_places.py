@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.submaps.isovist import HIDDEN, look_around
-from signature.seen import seen_signatures
-from signature.seen_places import (
+from pc2grid.submaps.submaps import HIDDEN, look_around
+from signature.visible import (
     AROUND_M,
     LATTICE_M,
     PROFILE_BEARINGS,
     SIGNATURE_COLUMNS,
     SeenPlaces,
+    seen_signatures,
     viewpoints_of,
 )
 from tests.helpers.simulated_drives import office

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from signature.config import SignatureConfig
-from signature.describe import Signature, describe
-from signature.similarity import SignatureTable, distances, histogram_distance, similarity
+from signature.paper import Signature, SignatureTable, describe, distances, histogram_distance, similarity
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, rectangle, submap_of
 
 CONFIG = SignatureConfig()

@@ -11,12 +11,10 @@ from pc2grid.display import probability
 from pc2grid.errors import one_line
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
-from pc2grid.observer import Observer
-from pc2grid.time_span import TimeSpan
+from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console
-from pc2grid_cli.followed import Followed, Live, live
 from pc2grid_cli.known_pose import KnownPose, end_s
-from signature.files import about_log, query_config, tracked
+from pc2grid_cli.windows import Followed, Live, live
 from signature.localization.answer_json import (
     Labelled,
     Pose,
@@ -28,6 +26,7 @@ from signature.localization.answer_json import (
 )
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import CheckStatus, check_pose
+from signature.sessions import about_log, query_config, tracked
 
 if TYPE_CHECKING:
     from pc2grid.clouds.planar_scan import PlanarScan

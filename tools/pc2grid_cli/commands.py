@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from pc2grid import extras
+from pc2grid import libraries as extras
 from pc2grid.errors import ConfigError, OutputError, one_line
-from pc2grid.time_span import TimeSpan
+from pc2grid.observer import TimeSpan
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.options import DATABASE, OUTPUT_FOLDER
@@ -68,9 +68,9 @@ def simulate_command(
 
     Example: pc2grid simulate map.yaml drive.mcap --sensor depth --length 20
     """
-    from pc2grid_cli import simulate
+    from pc2grid_cli import demo as simulate
 
-    simulate.run(
+    simulate.run_simulate(
         files,
         sensor,
         console.of(context),
@@ -163,9 +163,9 @@ def convert_command(
             "--dask ADDRESS names the scheduler of a cluster", hint="--jobs N: processes of this machine"
         )
     extras.require(({} if dask is None else {"cluster": "--dask"}) | extras.of_addresses(output))
-    from pc2grid_cli import conversion
-    from pc2grid_cli.output_files import check_database
-    from pc2grid_cli.stored_sessions import stored_sessions
+    from pc2grid_cli import convert as conversion
+    from pc2grid_cli.convert import stored_sessions
+    from pc2grid_cli.output import check_database
     from signature.database import Label
 
     settings = options.make_config(
@@ -285,11 +285,10 @@ def relocalize_command(
     """
     from pc2grid_cli import relocalize
     from pc2grid_cli.check_pose import check_log, report_check
-    from pc2grid_cli.known_pose import KnownPose
-    from pc2grid_cli.locate import searched
-    from pc2grid_cli.output_files import files_of
+    from pc2grid_cli.known_pose import KnownPose, searched
+    from pc2grid_cli.output import files_of
     from pc2grid_cli.windows import find_all, windows_of
-    from signature.files import find
+    from signature.sessions import find
 
     wanted = files_of(
         trajectory=trajectory, csv=csv, initialpose=initialpose, output=output, plot=plot, report=report
@@ -381,10 +380,9 @@ def watch_command(
     Example: pc2grid watch ws://robot:8765 --database building.submaps --publish initialpose
     """
     from pc2grid_cli import watch
-    from pc2grid_cli.followed import followed
-    from pc2grid_cli.known_pose import KnownPose
-    from pc2grid_cli.locate import searched
-    from signature.files import query_config
+    from pc2grid_cli.known_pose import KnownPose, searched
+    from pc2grid_cli.windows import followed
+    from signature.sessions import query_config
 
     extras.require(extras.of_addresses(source, database))
     settings = options.make_config(
@@ -478,7 +476,7 @@ def export_command(
     Example: pc2grid export building.submaps --map building --trajectory building.tum
     """
     from pc2grid_cli import export
-    from pc2grid_cli.output_files import files_of, map_stem, written_files
+    from pc2grid_cli.output import files_of, map_stem, written_files
     from signature.database import open_database
     from signature.localization.answer_json import plain
 
@@ -544,8 +542,8 @@ def view_command(
     Example: pc2grid view building.submaps
     """
     from pc2grid_cli import view
-    from pc2grid_cli.locate import searched
-    from pc2grid_cli.view_server import ViewServer
+    from pc2grid_cli.known_pose import searched
+    from pc2grid_cli.view import ViewServer
 
     extras.require(extras.of_addresses(source, database))
     settings = options.make_config(
@@ -716,8 +714,8 @@ def db_join_command(
     Example: pc2grid db join building.submaps
     """
     from pc2grid.display import counted
-    from pc2grid_cli import join
-    from pc2grid_cli.output_files import check_file
+    from pc2grid_cli import db as join
+    from pc2grid_cli.output import check_file
     from signature.database import maintenance, open_database
     from signature.localization.answer_json import plain
     from signature.localization.joining.building import join_sessions
@@ -764,7 +762,7 @@ def config_schema_command(
 
     Example: pc2grid config schema relocalize
     """
-    from pc2grid_cli.json_schemas import DOCUMENTS, schema
+    from pc2grid_cli.documents import DOCUMENTS, schema
 
     names = ["settings", *DOCUMENTS]
     if name is None:

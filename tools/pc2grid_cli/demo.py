@@ -1,30 +1,36 @@
-"""`pc2grid demo`: everything with simulated robots: map, query, answer, picture."""
+"""`pc2grid demo`: everything with simulated robots: map, query, answer, picture.
+
+`pc2grid simulate`: a simulated recording with its ground truth.
+"""
 
 from __future__ import annotations
 
 import math
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import typer
+from pydantic import ValidationError
 
 from pc2grid.display import counted
+from pc2grid.errors import ConfigError
 from pc2grid.geometry import wrap_angle
 from pc2grid.io.atomic import require_writable
 from pc2grid.io.trajectory import read_tum
-from pc2grid.model import SensorKind
-from pc2grid.simulate import SimulationConfig, simulate_session
-from pc2grid.simulate.config import LidarConfig
+from pc2grid.model import OccupancyGrid, SensorKind
+from pc2grid.simulate import Building, SimulatedSession, SimulationConfig, load_building, simulate_session
+from pc2grid.simulate.config import LidarConfig, OdometryConfig
 from pc2grid_cli import console
-from pc2grid_cli.output_files import make_folder
+from pc2grid_cli.output import make_folder
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import open_database
-from signature.files import find
+from signature.localization.answer_json import plain
+from signature.localization.shown.page import write_report
 from signature.localization.shown.picture import draw_answer
-from signature.localization.shown.report import write_report
-from signature.sessions import add_sessions, build_session
+from signature.sessions import add_sessions, build_session, find
 
 BUILDING_SEED = 3
 MAP_LENGTH_M = 60.0
@@ -84,3 +90,50 @@ def run(out: Path, terminal: console.Console, *, force: bool) -> None:
     print(f"picture: {picture}, page to look into it: {page}   ({time.monotonic() - begin:.0f} s)")
     if answer.status != "located":
         raise typer.Exit(console.UNSURE)
+
+
+def run_simulate(
+    files: list[Path],
+    sensor: SensorKind,
+    terminal: console.Console,
+    *,
+    force: bool,
+    json: bool,
+    clutter: int,
+    odometry: bool,
+    **drive: Any,
+) -> None:
+    """Simulate, and print what was written. drive : the further fields of `SimulationConfig`."""
+    grid = _building(files, force)
+    config = _config(clutter=clutter, odometry=OdometryConfig(enabled=odometry), **drive)
+    with terminal.progress(f"simulate {sensor}") as update:
+        made = simulate_session(
+            files[-1], sensor=sensor, grid=grid, config=config, progress=update, overwrite=force
+        )
+    if made.clutter < clutter:
+        console.warn(f"only {made.clutter} of {clutter} pieces of clutter could be placed")
+    text = (
+        f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s\n"
+        f"{made.truth_path}: {made.scans} true poses of base_link in the map frame"
+    )
+    console.print_result(plain(SimulatedSession, made) if json else text)
+
+
+def _building(files: list[Path], force: bool) -> OccupancyGrid | Building | None:
+    """The building of `[BUILDING] OUT.mcap`, None for the office; what is written must be writable."""
+    if len(files) > 2:
+        raise typer.BadParameter(f"expected [BUILDING] OUT.mcap, got {len(files)} files")
+    if files[-1].suffix != ".mcap":
+        raise typer.BadParameter(f"the file to write must end in .mcap: {files[-1]}")
+    for path in (files[-1], files[-1].with_suffix(".tum")):
+        require_writable(path, force)
+    return load_building(files[0]) if len(files) == 2 else None
+
+
+def _config(**given: Any) -> SimulationConfig:
+    """Raises ConfigError for a value that does not fit."""
+    try:
+        return SimulationConfig(**given)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ConfigError(f"{first['loc'][0]}: {first['msg']}, got {first['input']}") from error

@@ -12,22 +12,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import typer
 
-from pc2grid import extras
+from pc2grid import libraries as extras
 from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io import open_log
 from pc2grid.io.building_file import is_building_file
-from pc2grid.io.containers.detect import is_submap_file
-from pc2grid.io.message_source import Choice, LogInfo
-from pc2grid.io.nav2_map import is_map_file
+from pc2grid.io.maps import is_map_file
+from pc2grid.io.recording import is_submap_file
 from pc2grid.io.robots import Namespaces, camera_info_topic
-from pc2grid.sensor_model import SENSOR_MODELS
+from pc2grid.io.source import Choice, LogInfo
+from pc2grid.model import SENSOR_MODELS
 from pc2grid_cli.console import LOSSY, print_result, warn
 from pc2grid_cli.options import make_config
 from signature.localization.answer_json import TypedDict, plain
 
 if TYPE_CHECKING:
-    from pc2grid.mapping.drawn_map import DrawnMap
+    from pc2grid.mapping.drawn import DrawnMap
 
 _WIDEST = 1000
 """Characters of the widest table of topics."""
@@ -94,7 +94,7 @@ def run(log: str, topic: str | None, assignments: list[str] | None, *, recover: 
 
 def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
     """The document of a map. Raises MapFileError if it cannot be read."""
-    from pc2grid.mapping.drawn_map import load_drawn_map
+    from pc2grid.mapping.drawn import load_drawn_map
 
     drawn = load_drawn_map(path, make_config(None, assignments))
     grid, R = drawn.grid, drawn.T_map_file[:3, :3]

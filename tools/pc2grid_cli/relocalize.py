@@ -11,35 +11,33 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pc2grid import extras
+from pc2grid import libraries as extras
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, NotALog, one_line
-from pc2grid.io.nav2_map import is_map_file
+from pc2grid.io.maps import is_map_file
 from pc2grid.io.trajectory import write_trajectory
-from pc2grid.mapping.drawn_map import is_drawn_map
-from pc2grid.mapping.precision import PRECISION
-from pc2grid.sensor_model import SENSOR_MODELS
-from pc2grid_cli import console, data_loss
+from pc2grid.mapping.drawn import is_drawn_map
+from pc2grid.mapping.quality import PRECISION
+from pc2grid.model import SENSOR_MODELS
+from pc2grid_cli import console
 from pc2grid_cli import options as options
-from pc2grid_cli.foxglove import write_answer, write_located_map
-from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import in_map
-from pc2grid_cli.nav2_pose import write_initialpose
-from pc2grid_cli.output_files import check_file
+from pc2grid_cli import output as data_loss
+from pc2grid_cli.export import write_answer, write_located_map
+from pc2grid_cli.known_pose import KnownPose, in_map, write_initialpose
+from pc2grid_cli.output import check_file
 from pc2grid_cli.windows import Window, show, write_csv, write_places
 from signature.database.maintenance import is_database
+from signature.localization.answer import answer_in_building
 from signature.localization.answer_json import QueryRecording, Result, Sessions
-from signature.localization.in_building import answer_in_building
+from signature.localization.shown.page import Found, write_report
 from signature.localization.shown.picture import draw_answer, draw_answers
-from signature.localization.shown.report import Found, write_report
 
 if TYPE_CHECKING:
     from pc2grid.model import Trajectory
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame
-    from signature.localization.ambiguous_line import AmbiguousLine
-    from signature.localization.answer import Answer
+    from signature.localization.answer import AmbiguousLine, Answer
     from signature.localization.hypotheses import Hypothesis
 
 

@@ -15,14 +15,14 @@ import numpy as np
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, one_line
 from pc2grid.geometry import SE2
-from pc2grid.io.live.live_log import LiveLog
+from pc2grid.io.live.live_log import LiveLog, is_robot
 from pc2grid.io.live.nav2 import Nav2Publisher
-from pc2grid.io.live.targets import is_robot
 from pc2grid_cli import console
 from pc2grid_cli import options as options
 from pc2grid_cli.check_pose import as_text as check_as_text
 from pc2grid_cli.check_pose import live_document
-from pc2grid_cli.followed import Followed, Live, live, run
+from pc2grid_cli.windows import Followed, Live, live, run
+from signature.localization.answer import answer_in_building
 from signature.localization.answer_json import (
     Labelled,
     OffMap,
@@ -35,13 +35,10 @@ from signature.localization.answer_json import (
     stamped_pose,
 )
 from signature.localization.belief import State
-from signature.localization.follower import Follower
-from signature.localization.in_building import answer_in_building
-from signature.localization.joining.building_map import map_of
-from signature.localization.localizer import Localizer
+from signature.localization.joining.building import map_of
+from signature.localization.localizer import Follower, Localizer, ResetPolicy
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch
-from signature.localization.resets import ResetPolicy
 
 if TYPE_CHECKING:
     from pc2grid.io.live.nav2 import Outlet
@@ -49,7 +46,7 @@ if TYPE_CHECKING:
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame, SessionInfo
     from signature.localization.localizer import Estimate
-    from signature.localization.prior import Prior
+    from signature.localization.posterior import Prior
 
 
 class WatchedMap(Labelled):

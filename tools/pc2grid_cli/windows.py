@@ -1,38 +1,52 @@
-"""Several queries at once: recordings, or windows along them, each with a line of its own."""
+"""Several queries at once: recordings, or windows along them, each with a line of its own.
+
+What `watch` follows: a robot, or a finished recording, of which every scan is used.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import math
 from collections import Counter, defaultdict
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pc2grid.display import probability
-from pc2grid.errors import ConfigError, LogError, one_line
+from pc2grid.errors import ConfigError, LogError, TrackingLost, one_line
 from pc2grid.io import open_log
 from pc2grid.io.atomic import replace_file
+from pc2grid.io.live.feed import FeedCounts, News
+from pc2grid.io.live.live_log import LiveLog, is_robot, open_live
+from pc2grid.io.map_pose import BelievedPose
 from pc2grid.io.trajectory import stamp_text, write_trajectory
-from pc2grid.mapping.drawn_map import is_drawn_map
+from pc2grid.mapping.drawn import is_drawn_map
 from pc2grid.model import Trajectory
-from pc2grid.observer import Observer
-from pc2grid.time_span import TimeSpan
+from pc2grid.observer import Observer, TimeSpan
+from pc2grid.pipeline import follow
 from pc2grid_cli import console
-from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.locate import in_map
-from signature.files import find, query_config
+from pc2grid_cli.known_pose import KnownPose, in_map
+from signature.localization.answer_json import TypedDict
 from signature.localization.map_index import MapIndex
-from signature.localization.shown.report import Found
+from signature.localization.shown.page import Found
+from signature.sessions import find, query_config
 
 if TYPE_CHECKING:
-    from pc2grid.arrays import F64
+    from pc2grid.geometry import F64
+    from pc2grid.io import Log
+    from pc2grid.io.map_pose import MapPose
+    from pc2grid.io.source import Choice, RawMessage
+    from pc2grid.model import ReadReport, RegisteredScan, Scan
+    from pc2grid.settings import ReadConfig
     from signature.config import Config
     from signature.database import SubmapDatabase
     from signature.localization.answer import Answer
+    from signature.localization.localizer import Follower
+
 
 _COLUMNS = (
     "recording", "start_s", "time_s", "status", "session", "frame", "x_m", "y_m", "yaw_rad", "confidence",
@@ -122,7 +136,7 @@ def find_all(
 
 def show(answers: Sequence[tuple[Window, Answer | None]]) -> None:
     """Print a table with a line for each query."""
-    from pc2grid_cli import tables
+    from pc2grid_cli import output as tables
 
     counts = Counter("failed" if answer is None else answer.status for _, answer in answers)
     title = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.most_common())
@@ -178,3 +192,123 @@ def write_places(path: Path, found: Sequence[tuple[Trajectory, Answer]]) -> None
     stamps_ns = sorted(located[frame])
     T = np.array([located[frame][stamp_ns] for stamp_ns in stamps_ns])
     write_trajectory(path, Trajectory(stamps_ns=np.array(stamps_ns), T_session_base=T))
+
+
+class Live(TypedDict):
+    """How a running robot is followed. scans: used so far. dropped: left out because the computer is too
+    slow. reconnected: lost connections made again. lag_s, elapsed_s: seconds from a scan's arrival to its
+    use, and for this estimate."""
+
+    scans: int
+    dropped: int
+    reconnected: int
+    lag_s: float
+    elapsed_s: float
+
+
+@contextlib.contextmanager
+def followed(source: str, config: ReadConfig, *, real_time: bool = False) -> Iterator[Followed]:
+    """A robot by its address, or a recording by its path.
+
+    real_time : a recording is replayed at its own pace. Raises what `open_live` and `open_log` do.
+    """
+    if real_time or is_robot(source):
+        with open_live(source, config) as live:
+            yield live
+    else:
+        with open_log(Path(source), config) as log:
+            yield WholeRecording(log)
+
+
+class WholeRecording:
+    """A finished recording, read as by all other commands: each scan once, as fast as it can be used."""
+
+    realtime = False
+    lag_s = 0.0
+
+    def __init__(self, log: Log) -> None:
+        self.on_poll: Callable[[], bool] = lambda: False
+        self.name = str(log.info.path)
+        self.counts, self.news = FeedCounts(), News()
+        self._log = log
+        self._pose: BelievedPose | None = None
+        self._messages: Iterator[RawMessage] = iter(())
+        self._next: RawMessage | None = None
+
+    def choose(self) -> Choice:
+        """See LiveLog."""
+        return self._log.choose()
+
+    def parts(self) -> Iterator[Iterator[Scan]]:
+        """See LiveLog."""
+        yield self._log.scans()
+        if self._pose is not None and self._pose.problem is not None:
+            self.news.tell(str(self._pose.problem))
+
+    def report(self) -> ReadReport:
+        """See LiveLog."""
+        return self._log.report()
+
+    def listen_to_pose(self, topic: str) -> None:
+        """See LiveLog."""
+        self._pose = BelievedPose(topic)
+        self._pose.find(self._log.info.topics, self.choose().base_frame)
+        self._messages = self._log.messages(self._pose.topics)
+        self._next = next(self._messages, None)
+
+    @property
+    def believed(self) -> MapPose | None:
+        """The newest pose that was recorded before the last scan."""
+        if self._pose is None:
+            return None
+        while self._next is not None and self._next.log_time_ns <= self._log.last_scan_ns:
+            self._pose.take(self._next)
+            self._next = next(self._messages, None)
+        return self._pose.newest
+
+
+Followed = LiveLog | WholeRecording
+"""Scans, part after part, and what is known of how they come."""
+
+
+def run(
+    drive: Followed,
+    follower: Follower[Any],
+    config: Config,
+    poll: Callable[[], bool],
+    *,
+    see: Callable[[RegisteredScan | None], None] = lambda registered: None,
+    observer: Observer = Observer(),
+) -> None:
+    """Feed a follower with all scans of a robot or a recording.
+
+    poll : called after each scan, and while none comes; true if that was enough.
+    see : called with each registered scan; None: what follows does not go on from what was before.
+    """
+    drive.on_poll = poll
+    for scans in drive.parts():
+        try:
+            for registered, planar_scan in follow(scans, config, observer):
+                see(registered)
+                follower.add(registered, planar_scan)
+                if poll():
+                    return
+        except TrackingLost as error:
+            console.warn(error.in_short)
+        if poll():
+            return
+        follower.restart()
+        see(None)
+    follower.finish()
+    poll()
+
+
+def live(drive: Followed, elapsed_s: float) -> Live:
+    """How it is followed so far. elapsed_s : time that the estimate took."""
+    return {
+        "scans": drive.report().scans_read,
+        "dropped": drive.counts.dropped,
+        "reconnected": drive.counts.reconnected,
+        "lag_s": drive.lag_s,
+        "elapsed_s": elapsed_s,
+    }

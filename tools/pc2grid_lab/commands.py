@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from pc2grid import extras
+from pc2grid import libraries as extras
 from pc2grid_cli import console
 from pc2grid_cli.options import OUTPUT_FOLDER
 
@@ -68,9 +68,9 @@ def compare_recordings_command(
 
     Example: pc2grid compare recordings data --output real-recordings --quick
     """
-    from pc2grid_lab.compare import recordings
+    from pc2grid_lab import compare as recordings
 
-    recordings.run(
+    recordings.compare_recordings(
         data,
         out,
         table,
@@ -106,9 +106,9 @@ def compare_sensors_command(
 
     Example: pc2grid compare sensors maps/fr079.yaml maps/intel.yaml --queries 40 --out matrix
     """
-    from pc2grid_lab.compare import sensors
+    from pc2grid_lab import compare as sensors
 
-    sensors.run(
+    sensors.compare_sensors(
         plans,
         out,
         console.of(context),
@@ -150,9 +150,9 @@ def compare_peers_command(
 
     Example: pc2grid compare peers intel.mcap fr079.mcap hall.mcap --mapped intel=900 --mapped fr079=600
     """
-    from pc2grid_lab.compare import peers
+    from pc2grid_lab import compare as peers
 
-    peers.run(
+    peers.compare_peers(
         recordings,
         out,
         console.of(context),
@@ -208,7 +208,7 @@ def compare_paper_command(
     Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
     """
     extras.require({"paper": "compare paper"})
-    from pc2grid_lab.paper import command
+    from pc2grid_lab.paper import report as command
 
     command.run(
         maps,

@@ -13,14 +13,13 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from pc2grid import simulate
-from pc2grid.arrays import F32, F64, I64, BoolGrid
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F32, F64, I64, SE2, BoolGrid
 from pc2grid.model import FREE, OccupancyGrid, SensorKind
 from pc2grid.simulate import SimulationConfig
-from pc2grid.simulate.clutter import KINDS, Furniture, Prism, covered
-from pc2grid.simulate.passage import clearance_m
+from pc2grid.simulate.plan import clearance_m
+from pc2grid.simulate.scene import KINDS, Furniture, Prism, covered
 from pc2grid.simulate.session import Session
-from pc2grid.submaps.skeleton import clearance_of, skeleton_of
+from pc2grid.submaps.junction_graph import clearance_of, skeleton_of
 
 _CHANGE = 6  # stream of random numbers beside those of `pc2grid.simulate.session`
 

@@ -14,13 +14,12 @@ from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, TrajectoryFileError
-from pc2grid.io.error_translation import LFS_HINT, is_lfs_pointer
-from pc2grid.io.message_source import LogInfo, RawMessage, Tally, TopicInfo
-from pc2grid.io.messages.cloud_messages import pack_cloud, pack_pose
+from pc2grid.io.messages.clouds import pack_cloud, pack_pose
+from pc2grid.io.source import LFS_HINT, LogInfo, RawMessage, Tally, TopicInfo, is_lfs_pointer
 from pc2grid.io.trajectory import lines_of, read_tum, stamp_ns_from_text
 from pc2grid.model import Trajectory
+from pc2grid.settings import ReadConfig
 
 SUFFIXES = (".pcd", ".ply", ".bin")
 CLOUDS, POSES = "clouds", "poses"

@@ -10,9 +10,9 @@ from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-from pc2grid.config import ReadConfig
 from pc2grid.io import topics
-from pc2grid.io.message_source import RawMessage, TopicInfo
+from pc2grid.io.source import RawMessage, TopicInfo
+from pc2grid.settings import ReadConfig
 
 
 class Arrived(NamedTuple):

@@ -20,11 +20,11 @@ from websockets.exceptions import ConnectionClosed, InvalidHandshake, InvalidURI
 from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import LiveError
 from pc2grid.io.live.feed import INBOX, Feed, InboxParameters
-from pc2grid.io.message_source import RawMessage, TopicInfo
-from pc2grid.io.messages.ros_definitions import short_name
+from pc2grid.io.messages.ros import short_name
+from pc2grid.io.source import RawMessage, TopicInfo
+from pc2grid.settings import ReadConfig
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
 """What the bridge speaks since version 3.2, and before; the messages used here are the same in both."""

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
-from pc2grid.io.export import ros_messages as ros
+from pc2grid.geometry import F64, SE2
+from pc2grid.io import export as ros
 from pc2grid.model import OccupancyGrid
 
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"

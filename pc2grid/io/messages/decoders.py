@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from pc2grid.io.message_source import TopicInfo
-from pc2grid.io.messages import cloud_messages, foxglove, ros
+from pc2grid.io.messages import clouds as cloud_messages
+from pc2grid.io.messages import foxglove, ros
+from pc2grid.io.source import TopicInfo
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:

@@ -18,7 +18,6 @@ from mcap.exceptions import McapError
 from mcap.records import Schema
 
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
-from pc2grid.io.message_source import TopicInfo
 from pc2grid.io.messages.types import (
     MOST_BEAMS,
     CameraInfo,
@@ -31,6 +30,7 @@ from pc2grid.io.messages.types import (
     Seven,
     Transform,
 )
+from pc2grid.io.source import TopicInfo
 
 # PackedElementField.NumericType to the codes of sensor_msgs/PointField.
 _NUMERIC = {

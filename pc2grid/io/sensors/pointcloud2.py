@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64
 from pc2grid.errors import LimitExceeded, PointCloudError
+from pc2grid.geometry import F32, F64
 from pc2grid.io.messages.types import PointCloud2
 
 # sensor_msgs/PointField; 9 to 11 are PCL's, absent from the definition (ros2/common_interfaces#300).

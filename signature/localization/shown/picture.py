@@ -15,25 +15,24 @@ import numpy as np
 
 from pc2grid.display import counted, probability
 from pc2grid.io.atomic import replace_file
-from pc2grid.matching.agreement import Agreement, Support, agreement
+from pc2grid.matching.score import Agreement, Support, agreement
 from pc2grid.matching.walls import Walls
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from pc2grid.arrays import F64, U8
-    from pc2grid.geometry import SE2
+    from pc2grid.geometry import F64, SE2, U8
     from pc2grid.model import OccupancyGrid, Trajectory
     from signature.database import SubmapDatabase
     from signature.database.protocol import BuildingFrame
     from signature.localization.answer import Answer
     from signature.localization.hypotheses import Hypothesis
-    from signature.localization.shown.report import Found
+    from signature.localization.shown.page import Found
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 GREY = "#777777"
 SUPPORT_COLOURS = {"FITS": GREEN, "CONTRADICTED": VERMILLION, "UNKNOWN": BLUE}
-"""Of the query's wall points, by the name of their `pc2grid.matching.agreement.Support`."""
+"""Of the query's wall points, by the name of their `pc2grid.matching.score.Support`."""
 MISSED_COLOUR = ORANGE
 """Of the map's wall points where the query saw free ground."""
 SUPPORT_LABELS = {

@@ -7,11 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.clouds.column_map import ColumnMap
+from pc2grid.clouds.columns import ColumnMap
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import ProjectionConfig
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F64, SE2
+from pc2grid.settings import ProjectionConfig
 from pc2grid.simulate.scene import Mesh, Scene, prism
 
 EYE = np.array((1.0, 2.0, 1.5))

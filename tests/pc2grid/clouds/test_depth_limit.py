@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.clouds.depth_limit import DepthLimit
 from pc2grid.clouds.ground import Ground
-from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
-from pc2grid.config import ProjectionConfig, RegistrationConfig
+from pc2grid.clouds.planar_scan import DepthLimit, PlanarScan, project_to_plane
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.model import Scan, SensorKind
+from pc2grid.settings import ProjectionConfig, RegistrationConfig
 
 LIMIT_M = 6.0
 NOISE_PER_M2 = 0.0015

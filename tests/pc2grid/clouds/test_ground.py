@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
 from pc2grid.clouds.ground import Ground, assumed_ground, find_ground
-from pc2grid.geometry import pose_from_rotation_vector, transform_points
+from pc2grid.geometry import F64, pose_from_rotation_vector, transform_points
 
 
 def room(rng: np.random.Generator, *, table: bool = True, ceiling_m: float = 2.5) -> F64:

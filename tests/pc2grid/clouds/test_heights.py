@@ -7,13 +7,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, U8
-from pc2grid.clouds._kernels import heights_seen as compiled
 from pc2grid.clouds.ground import Ground
-from pc2grid.clouds.heights import heights_seen
-from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
-from pc2grid.config import ProjectionConfig
+from pc2grid.clouds.planar_scan import PlanarScan, heights_seen, project_to_plane
+from pc2grid.clouds.planar_scan import _compiled_heights as compiled
+from pc2grid.geometry import F32, F64, U8
 from pc2grid.model import SLICE_BORDERS_M, SLICES
+from pc2grid.settings import ProjectionConfig
 
 SENSOR_M = np.array([0.0, 0.0, 0.9])
 FLOOR = np.array([0.0, 0.0, 1.0, 0.0])

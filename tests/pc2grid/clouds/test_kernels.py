@@ -7,13 +7,10 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F32, F64
-from pc2grid.clouds._kernels import scan_bearings
-from pc2grid.clouds.ground import Ground
-from pc2grid.clouds.normals import planar_normals
-from pc2grid.clouds.parameters import CLOUD_PARAMETERS, CloudParameters
-from pc2grid.clouds.planar_scan import PlanarScan, project_to_plane
-from pc2grid.config import ProjectionConfig
+from pc2grid.clouds.ground import CLOUD_PARAMETERS, CloudParameters, Ground
+from pc2grid.clouds.planar_scan import PlanarScan, planar_normals, project_to_plane, scan_bearings
+from pc2grid.geometry import F32, F64
+from pc2grid.settings import ProjectionConfig
 
 
 def planar_normals_plain(hits_m: F32, origin_m: F64, parameters: CloudParameters = CLOUD_PARAMETERS) -> F32:

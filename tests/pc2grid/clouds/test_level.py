@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.clouds.level import LEVEL, FloorBelow, floor_height
-from pc2grid.config import RegistrationConfig
+from pc2grid.clouds.ground import LEVEL, FloorBelow, floor_height
 from pc2grid.estimation.surface_map import SurfaceMap
+from pc2grid.geometry import F64
+from pc2grid.settings import RegistrationConfig
 
 EDGE_M = 0.15
 SENSOR = np.array((0.0, 0.0, 1.5))

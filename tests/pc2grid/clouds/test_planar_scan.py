@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
 from pc2grid.clouds.ground import Ground
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan, project_to_plane
-from pc2grid.config import ProjectionConfig
+from pc2grid.geometry import F64
+from pc2grid.settings import ProjectionConfig
 
 CONFIG = ProjectionConfig()
 GROUND = Ground(np.array([0.0, 0.0, 1.0]), 0.0, 2.5)

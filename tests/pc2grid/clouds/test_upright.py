@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.clouds.upright import CAMERA_UPRIGHT, vertical_of
+from pc2grid.clouds.ground import CAMERA_UPRIGHT, vertical_of
 
 UP = np.array([0.0, 0.0, 1.0])
 

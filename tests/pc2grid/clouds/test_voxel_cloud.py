@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.clouds import voxel_cloud
-from pc2grid.clouds.voxel_cloud import VoxelCloud
+from pc2grid.clouds import cloud as voxel_cloud
+from pc2grid.clouds.cloud import VoxelCloud
 from pc2grid.errors import LimitExceeded
 
 

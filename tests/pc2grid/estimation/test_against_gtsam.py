@@ -12,11 +12,8 @@ import itertools
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.estimation.belief import PLANAR, Belief
-from pc2grid.estimation.smoother import Evidence, Smoother
-from pc2grid.estimation.window import SMOOTHER
-from pc2grid.geometry import SE2
+from pc2grid.estimation.smoother import PLANAR, SMOOTHER, Belief, Evidence, Smoother
+from pc2grid.geometry import F64, SE2
 
 gtsam = pytest.importorskip("gtsam")
 

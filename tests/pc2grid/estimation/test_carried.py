@@ -14,23 +14,20 @@ import numpy as np
 import pytest
 
 from pc2grid import pipeline
-from pc2grid.arrays import F64
-from pc2grid.clouds.upright import level_floor
-from pc2grid.config import Config, RegistrationConfig
-from pc2grid.estimation.carried import CARRIED, begin, first_pose
+from pc2grid.clouds.ground import level_floor
 from pc2grid.estimation.ground_model import is_rolling
+from pc2grid.estimation.spatial import CARRIED, begin, first_pose
 from pc2grid.estimation.tracker import Tracked, Tracker
-from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector
+from pc2grid.geometry import F64, invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.mapping.loop_closure import LoopCloser
-from pc2grid.mapping.loop_parameters import EXACT_TRACKING, LoopParameters
+from pc2grid.mapping.loops import EXACT_TRACKING, LoopCloser, LoopParameters
 from pc2grid.model import Health, OccupancyGrid, Scan
 from pc2grid.observer import Observer
 from pc2grid.pipeline import follow, map_scans
+from pc2grid.settings import Config, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, prepare_session
-from pc2grid.simulate.scene import Mesh, Scene, prism
-from pc2grid.simulate.sensors import OPTICAL
+from pc2grid.simulate.scene import OPTICAL, Mesh, Scene, prism
 
 ROOMS = Path(os.environ.get("PC2GRID_DATA", "../shared/data")) / "depth/room"
 T_BASE_CAMERA = np.eye(4)

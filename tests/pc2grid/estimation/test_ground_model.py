@@ -9,10 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.estimation.carried import Beginning, begin
 from pc2grid.estimation.ground_model import GroundModel, is_rolling
-from pc2grid.geometry import pose_from_rotation_vector
+from pc2grid.estimation.spatial import Beginning, begin
+from pc2grid.geometry import F64, pose_from_rotation_vector
 from pc2grid.model import Scan
 from pc2grid.simulate import SimulationConfig, iter_session
 from pc2grid.simulate.config import LidarConfig

@@ -7,11 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pc2grid.config import Config
-from pc2grid.estimation.overruled import Disagreement, check_odometry
-from pc2grid.estimation.tracker import Tracker
+from pc2grid.estimation.tracker import Disagreement, Tracker, check_odometry
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, OdometryCheck, Overruled, Scan
+from pc2grid.settings import Config
 from pc2grid.simulate import SimulationConfig, prepare_session
 
 SLIGHT, LARGE, LARGER = (

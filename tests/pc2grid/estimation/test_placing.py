@@ -8,10 +8,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.estimation.belief import PLANAR, Belief
 from pc2grid.estimation.placing import Fit, Placed, Placer
-from pc2grid.geometry import SE2
+from pc2grid.estimation.smoother import PLANAR, Belief
+from pc2grid.geometry import F64, SE2
 from pc2grid.model import Scan
 
 SCAN = Scan(stamp_ns=0, points_m=np.zeros((0, 3), np.float32), T_base_sensor=np.eye(4), sensor="laser")

@@ -8,15 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64
-from pc2grid.estimation._kernels import aligned, normal_equations, placement_scores
-from pc2grid.estimation.parameters import CAMERA_MATCHING, MATCHING_PARAMETERS
-from pc2grid.estimation.point_to_line import (
+from pc2grid.estimation.line_map import (
+    CAMERA_MATCHING,
+    MATCHING_PARAMETERS,
     PointGrid,
+    aligned,
     best_placements,
+    normal_equations,
+    placement_scores,
     sector_of,
 )
-from pc2grid.geometry import SE2, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, wrap_angle
 
 
 def normal_equations_plain(
@@ -82,7 +84,7 @@ def aligned_plain(
 ) -> tuple[F64, F64, F64, int]:
     """Gauss-Newton of the point-to-line distances, held to a prior, one radius an iteration, in numpy.
 
-    Parameters and results are those of `pc2grid.estimation._kernels.aligned`.
+    Parameters and results are those of `pc2grid.estimation.line_map.aligned`.
     """
     unit, damping, pose = cell_m**-2, 1e-6 * np.eye(3), guess
     for radius in radii:

@@ -11,12 +11,12 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from pc2grid.config import Config, RegistrationConfig
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.geometry import pose_from_rotation_vector
 from pc2grid.io import open_log
 from pc2grid.model import Health
 from pc2grid.pipeline import follow
+from pc2grid.settings import Config, RegistrationConfig
 
 ICP = Literal["kiss-icp", "none"]
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))

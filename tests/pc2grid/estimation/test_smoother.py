@@ -8,13 +8,19 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.estimation._smoother_kernels import normal_equations
-from pc2grid.estimation.belief import PLANAR, SPATIAL, Belief
-from pc2grid.estimation.manifold import Steps, _skew, moved, steps
-from pc2grid.estimation.smoother import Evidence, Smoother, _without
-from pc2grid.estimation.window import IN_THE_HAND, SMOOTHER
-from pc2grid.geometry import SE2, invert_pose, motion_size, pose_from_rotation_vector
+from pc2grid.estimation.line_map import Steps, _skew, moved, steps
+from pc2grid.estimation.smoother import (
+    IN_THE_HAND,
+    PLANAR,
+    SMOOTHER,
+    SPATIAL,
+    Belief,
+    Evidence,
+    Smoother,
+    _without,
+    normal_equations,
+)
+from pc2grid.geometry import F64, SE2, invert_pose, motion_size, pose_from_rotation_vector
 from tests.helpers.plain_smoother import plain_equations
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.clouds.level import FloorBelow
-from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.estimation.space_map import SpaceMap
-from pc2grid.geometry import SE2
+from pc2grid.clouds.ground import FloorBelow
+from pc2grid.estimation.spatial import SpaceMap
+from pc2grid.geometry import F64, SE2
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import OccupancyGrid
+from pc2grid.settings import ProjectionConfig, RegistrationConfig
 from tests.helpers.flat_by_hand import CORRIDOR, carried, images, rising
 
 RISE = 0.02

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.estimation.health import Standstill
+from pc2grid.estimation.tracker import Standstill
 from pc2grid.model import Scan
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.config import RegistrationConfig
-from pc2grid.estimation import _surface_kernels as kernels
-from pc2grid.estimation.belief import SPATIAL, Belief
-from pc2grid.estimation.manifold import weakest
+from pc2grid.estimation import surface_map as kernels
+from pc2grid.estimation.line_map import weakest
+from pc2grid.estimation.smoother import SPATIAL, Belief
 from pc2grid.estimation.surface_map import SurfaceMap
-from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector, transform_points
+from pc2grid.geometry import F64, invert_pose, motion_size, pose_from_rotation_vector, transform_points
+from pc2grid.settings import RegistrationConfig
 
 EDGE_M = 0.15
 

@@ -8,17 +8,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.clouds.deskew import deskew
-from pc2grid.clouds.sampling import random_subset
-from pc2grid.config import ProjectionConfig, RegistrationConfig
-from pc2grid.estimation.carried import begin
-from pc2grid.estimation.matching_maps import MatchingMaps
+from pc2grid.clouds.cloud import deskew, random_subset
+from pc2grid.estimation.planar import MatchingMaps
 from pc2grid.estimation.registration import KissRegistration
+from pc2grid.estimation.spatial import begin
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2, invert_pose, motion_size, transform_points, wrap_angle
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, Scan
+from pc2grid.settings import ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, iter_session
 from pc2grid.simulate.config import LidarConfig, OdometryConfig
 

@@ -14,7 +14,6 @@ import cv2
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     FrameError,
     LimitExceeded,
@@ -25,15 +24,16 @@ from pc2grid.errors import (
     UnsupportedSchema,
 )
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.message_source import TopicInfo
-from pc2grid.io.messages import cloud_files
+from pc2grid.io.maps import load_map, save_map
+from pc2grid.io.messages import clouds as cloud_files
 from pc2grid.io.messages.foxglove import decoder_for as foxglove_decoder
 from pc2grid.io.messages.ros import decoder_for
 from pc2grid.io.messages.types import Header, Transform
-from pc2grid.io.nav2_map import load_map, save_map
-from pc2grid.io.sensors.png_header import MAGIC
+from pc2grid.io.sensors.depth import MAGIC
+from pc2grid.io.source import TopicInfo
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid
+from pc2grid.settings import ReadConfig
 from tests.helpers import foxglove_messages as foxglove
 from tests.helpers.memory import peak_memory
 from tests.helpers.recordings import (

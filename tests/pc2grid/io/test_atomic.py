@@ -34,7 +34,7 @@ STORE = """
 import os, sys
 os.getpid = lambda: 1
 from pathlib import Path
-from pc2grid_cli.output_files import check_database
+from pc2grid_cli.output import check_database
 from signature.database.maintenance import store
 from tests.helpers.databases import make_entry
 

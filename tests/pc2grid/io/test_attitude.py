@@ -9,13 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.config import ReadConfig
 from pc2grid.errors import FrameError, TopicError
-from pc2grid.geometry import invert_pose, motion_size, pose_from_rotation_vector, quat_xyzw_from_pose
+from pc2grid.geometry import F64, invert_pose, motion_size, pose_from_rotation_vector, quat_xyzw_from_pose
 from pc2grid.io import open_log
-from pc2grid.io.attitude import Attitude
+from pc2grid.io.frames import Attitude
 from pc2grid.io.messages.types import Header, Imu
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Dialect, Message, read, ros, write_mcap
 
 G = 9.81

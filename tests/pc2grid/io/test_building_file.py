@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.config import ReadConfig
 from pc2grid.errors import MapFileError
+from pc2grid.geometry import F64
 from pc2grid.io import building_file
 from pc2grid.io.building_file import (
     axis_of_file,
@@ -19,9 +18,10 @@ from pc2grid.io.building_file import (
     is_building_file,
     kind_of,
 )
-from pc2grid.io.export.cloud import write_cloud
-from pc2grid.mapping.drawn_map import load_drawn_map
-from pc2grid.simulate.building import load_building
+from pc2grid.io.export import write_cloud
+from pc2grid.mapping.drawn import load_drawn_map
+from pc2grid.settings import ReadConfig
+from pc2grid.simulate.scene import load_building
 from tests.helpers.memory import bounded_memory
 
 PCD = (

@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     ConfigError,
     FrameError,
@@ -27,11 +26,12 @@ from pc2grid.errors import (
 )
 from pc2grid.io import open_log
 from pc2grid.io.frames import PoseTrack
+from pc2grid.io.maps import load_map, save_map
 from pc2grid.io.messages.types import Header, LaserScan
-from pc2grid.io.nav2_map import load_map, save_map
-from pc2grid.io.sensors import laserscan
+from pc2grid.io.sensors import decode as laserscan
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
 from pc2grid.model import OccupancyGrid
+from pc2grid.settings import ReadConfig
 from tests.helpers.cloud_folders import folder_of
 from tests.helpers.recordings import STEP, T0, Message, check_drive, drive, read, ros, write_mcap
 

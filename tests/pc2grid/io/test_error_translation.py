@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pc2grid.errors import LogCorrupt
-from pc2grid.io.error_translation import guarded, guarded_stream
+from pc2grid.io.source import guarded, guarded_stream
 
 
 class Content:

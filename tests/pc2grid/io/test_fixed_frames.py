@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import FrameError
 from pc2grid.io import open_log
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Message, read, ros, write_mcap
 
 SEEN = np.float32([[2.0, 1.0, 0.4], [3.0, -1.0, 0.1], [2.5, 0.5, -0.7], [1.0, 0.0, -0.7]])

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import FrameError, LogCorrupt, PointCloudError
 from pc2grid.io import open_log
 from pc2grid.io.frames import PoseTrack
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Message, read, ros, write_mcap
 
 POINT = [[1.0, 2.0, 3.0]]

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import FrameError, TopicError
 from pc2grid.io import open_log
-from pc2grid.io.live.targets import open_live
+from pc2grid.io.live.live_log import open_live
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Message, read, ros, write_mcap
 
 BOTH = ReadConfig(topic="/front,/rear")

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pc2grid.errors import MapFileError, TrajectoryFileError
-from pc2grid.io.nav2_map import is_map_file, load_map, save_map
+from pc2grid.io.maps import is_map_file, load_map, save_map
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text, stamp_text, write_tum
 from pc2grid.model import THING, OccupancyGrid, Trajectory
 from tests.helpers.nav2_map import nav2_map, oracle

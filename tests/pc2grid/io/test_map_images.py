@@ -22,7 +22,7 @@ from hypothesis.extra import numpy as hnp
 from PIL import Image
 
 from pc2grid.errors import MapFileError
-from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.maps import load_map, save_map
 from pc2grid.simulate import office_floorplan
 from tests.helpers.field import DATA
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     DatabaseError,
     LogCorrupt,
@@ -19,12 +18,12 @@ from pc2grid.errors import (
     UnsupportedSchema,
 )
 from pc2grid.io import open_log
-from pc2grid.io.error_translation import guarded, guarded_stream
-from pc2grid.io.message_source import TopicInfo
 from pc2grid.io.messages import foxglove
 from pc2grid.io.messages import ros as ros_messages
-from pc2grid.io.messages.cloud_files import parser
+from pc2grid.io.messages.clouds import parser
 from pc2grid.io.messages.types import Header, PointCloud2
+from pc2grid.io.source import TopicInfo, guarded, guarded_stream
+from pc2grid.settings import ReadConfig
 from tests.helpers.cloud_folders import folder_of
 from tests.helpers.recordings import T0
 
@@ -239,7 +238,7 @@ def test_what_others_raise_becomes_ours_but_for_memory() -> None:
 
 
 def test_an_origin_that_is_nowhere() -> None:
-    from pc2grid.io.sensors.scan_decoder import ScanDecoder
+    from pc2grid.io.sensors.decode import ScanDecoder
 
     cloud = parser("bin")(struct.pack("<8f", 1, 2, 3, 0, 2, 3, 4, 0), HEADER)
     decoder = ScanDecoder("/points", "lidar", ReadConfig())

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import LogError, NoScans, TopicError
 from pc2grid.io import open_log
-from pc2grid.io.live.targets import open_live
-from pc2grid.io.message_source import Choice
+from pc2grid.io.live.live_log import open_live
+from pc2grid.io.source import Choice
 from pc2grid.model import Scan
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Message, read, ros, write_mcap
 
 Name = Callable[[str], str]

@@ -7,9 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import NoScans
-from pc2grid.io import open_log, scan_stream
+from pc2grid.io import open_log
+from pc2grid.io import stream as scan_stream
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import (
     STEP,
     T0,

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.io import open_log
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import T0, Message, laser_drive, ros, write_mcap, write_rosbag2
 
 S = 10**9

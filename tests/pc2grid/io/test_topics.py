@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import TopicError
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Message, read, ros, write_mcap
 
 

@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.mapping.building_axes import WallDirection
-from pc2grid.mapping.loop_parameters import LOOPS
-from pc2grid.mapping.pose_graph import Edge, optimise
-from pc2grid.mapping.precision import position_sigmas
+from pc2grid.mapping.graph import Edge, WallDirection, optimise
+from pc2grid.mapping.loops import LOOPS
+from pc2grid.mapping.quality import position_sigmas
 
 STEP_M = 4.0
 STEP_INFORMATION = LOOPS.tracked_information(STEP_M, restart=False)

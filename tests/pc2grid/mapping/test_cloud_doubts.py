@@ -8,14 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.config import Config, ReadConfig
 from pc2grid.errors import MapFileError
-from pc2grid.geometry import transform_points
-from pc2grid.io.export.cloud import write_cloud
-from pc2grid.mapping.cloud_doubts import is_upside_down, other_floors
-from pc2grid.mapping.cloud_map import level_cloud
-from pc2grid.mapping.drawn_map import DrawnMap, load_drawn_map
+from pc2grid.geometry import F64, transform_points
+from pc2grid.io.export import write_cloud
+from pc2grid.mapping.drawn import DrawnMap, is_upside_down, level_cloud, load_drawn_map, other_floors
+from pc2grid.settings import Config, ReadConfig
 from tests.helpers.building_clouds import hall_cloud, raised, room_cloud, rooms_cloud, turned
 from tests.helpers.field import field_file
 

@@ -8,21 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import Config, ReadConfig
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import transform_points
 from pc2grid.io.building_file import UPRIGHT
-from pc2grid.io.export.cloud import write_cloud
-from pc2grid.mapping.cloud_map import (
+from pc2grid.io.export import write_cloud
+from pc2grid.mapping.drawn import (
     CLOUD_MAP,
     CloudMapParameters,
     drivable_plan,
     level_cloud,
+    load_drawn_map,
     map_cloud,
     voxel_cloud,
 )
-from pc2grid.mapping.drawn_map import load_drawn_map
 from pc2grid.model import OccupancyGrid
+from pc2grid.settings import Config, ReadConfig
 from tests.helpers.building_clouds import (
     ROOM_M,
     box_surface,

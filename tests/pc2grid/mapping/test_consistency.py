@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
-from pc2grid.mapping.consistency import consistency_warning, measure_consistency
 from pc2grid.mapping.keyframes import Keyframe, grid_of
+from pc2grid.mapping.quality import consistency_warning, measure_consistency
 from pc2grid.model import Consistency, Trajectory
+from pc2grid.settings import ProjectionConfig
 
 LENGTH_M, WIDTH_M = 20.0, 2.0
 IN_PLACE = SE2()

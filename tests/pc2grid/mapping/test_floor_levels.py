@@ -7,22 +7,19 @@ import dataclasses
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
-from pc2grid.config import ProjectionConfig
-from pc2grid.geometry import SE2
-from pc2grid.mapping.floor_levels import (
+from pc2grid.geometry import F64, SE2
+from pc2grid.mapping.graph import (
     HeightStep,
     floor_warning,
     floors_apart_m,
     rise_between,
     settled_heights,
 )
-from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.mapping.part_maps import draw_parts
-from pc2grid.mapping.settled import SettledKeyframes
-from pc2grid.mapping.track import Track
+from pc2grid.mapping.keyframes import Keyframe, Keyframes, Track
+from pc2grid.mapping.part_maps import SettledKeyframes, draw_parts
 from pc2grid.model import Health, SessionMap, Trajectory
+from pc2grid.settings import ProjectionConfig
 
 COUNT, STEP_M, HAND_M = 200, 0.2, 1.4
 """Keyframes of a way of 40 m that goes up a corridor and back; the sensor is so high above the floor."""

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.config import Config, ProjectionConfig
 from pc2grid.geometry import SE2, transform_points
-from pc2grid.mapping.keyframe_points import KeyframePoints
+from pc2grid.mapping.keyframes import KeyframePoints
 from pc2grid.model import POINT_STEPS, PointMap, Scan, SensorKind
 from pc2grid.pipeline import build_map
+from pc2grid.settings import Config, ProjectionConfig
 from pc2grid.simulate import SimulationConfig, simulate_session
 from tests.helpers.simulated_drives import office
 

@@ -11,7 +11,7 @@ import pytest
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2
-from pc2grid.mapping import spool
+from pc2grid.mapping import keyframes as spool
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 
 

@@ -6,10 +6,8 @@ import math
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
-from pc2grid.mapping.loop_candidates import LoopCandidates
-from pc2grid.mapping.place_recognition import Recognition
+from pc2grid.geometry import F64, SE2
+from pc2grid.mapping.loops import LoopCandidates, Recognition
 
 STEP_M = 4.0
 

@@ -8,17 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F64, SE2
+from pc2grid.mapping.graph import Edge, optimise
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import LocalMap, Overlap
-from pc2grid.mapping.loop_candidates import CandidateParameters
-from pc2grid.mapping.loop_closure import LoopCloser
-from pc2grid.mapping.loop_parameters import LoopParameters
-from pc2grid.mapping.place_recognition import Recognition, Stretch
-from pc2grid.mapping.pose_graph import Edge, optimise
-from pc2grid.mapping.settled import SettledKeyframes, interpolate_corrections
+from pc2grid.mapping.loops import CandidateParameters, LoopCloser, LoopParameters, Recognition, Stretch
+from pc2grid.mapping.part_maps import SettledKeyframes, interpolate_corrections
 from tests.helpers.rooms import RESOLUTION_M
 
 Wall = tuple[tuple[float, float], tuple[float, float]]

@@ -9,11 +9,11 @@ import pytest
 from numpy.typing import NDArray
 
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
-from pc2grid.config import ProjectionConfig
 from pc2grid.errors import LimitExceeded
 from pc2grid.geometry import SE2
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import THING, OccupancyGrid
+from pc2grid.settings import ProjectionConfig
 from tests.helpers.rooms import RESOLUTION_M
 
 

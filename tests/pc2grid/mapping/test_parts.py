@@ -9,18 +9,21 @@ import numpy as np
 import pytest
 
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import ProjectionConfig
 from pc2grid.geometry import SE2
-from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.mapping.loop_closure import LoopCloser
-from pc2grid.mapping.loop_parameters import LoopParameters
-from pc2grid.mapping.part_maps import draw_parts, long_enough
+from pc2grid.mapping.graph import Edge
+from pc2grid.mapping.keyframes import Keyframe, Keyframes, Track
+from pc2grid.mapping.loops import LoopCloser, LoopParameters
+from pc2grid.mapping.part_maps import (
+    SettledKeyframes,
+    draw_parts,
+    height_warnings,
+    long_enough,
+    part_reports,
+    with_track_warnings,
+)
 from pc2grid.mapping.parts import connected
-from pc2grid.mapping.pose_graph import Edge
-from pc2grid.mapping.report import height_warnings, part_reports, with_track_warnings
-from pc2grid.mapping.settled import SettledKeyframes
-from pc2grid.mapping.track import Track
 from pc2grid.model import Health, ReadReport, RegisteredScan, SessionMap, Trajectory
+from pc2grid.settings import ProjectionConfig
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import drive, office
 

@@ -8,9 +8,8 @@ from statistics import median
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
-from pc2grid.mapping.pose_graph import Edge, optimise
+from pc2grid.geometry import F64, SE2
+from pc2grid.mapping.graph import Edge, optimise
 
 POSES, TRUE_LOOPS, FALSE_LOOPS = 400, 90, 60
 STEP_M, HALF_WIDTH_M = 2.0, 20.0

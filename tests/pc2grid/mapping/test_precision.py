@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
-from pc2grid.mapping.pose_graph import Edge, optimise
-from pc2grid.mapping.precision import (
+from pc2grid.geometry import F64, SE2
+from pc2grid.mapping.graph import Edge, optimise
+from pc2grid.mapping.quality import (
     position_sigmas,
     precision_of,
     precision_warning,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid.matching.agreement import Support, agreement
+from pc2grid.matching.score import Support, agreement
 from pc2grid.matching.walls import Walls
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part

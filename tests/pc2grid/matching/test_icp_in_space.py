@@ -7,8 +7,14 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, invert_pose, pose_from_rotation_vector, rotation_vector, transform_points
+from pc2grid.geometry import (
+    F64,
+    SE2,
+    invert_pose,
+    pose_from_rotation_vector,
+    rotation_vector,
+    transform_points,
+)
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, SpatialView, register_in_space
 from pc2grid.model import PointMap
 from signature.localization.query import QueryInSpace

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField, LikelihoodParameters
+from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField, LikelihoodParameters
 from pc2grid.model import OccupancyGrid
 
 

@@ -7,18 +7,16 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64, U8
-from pc2grid.geometry import SE2
-from pc2grid.matching._kernels import normal_equations
-from pc2grid.matching.refinement import (
+from pc2grid.geometry import F64, SE2, U8
+from pc2grid.matching.score import (
     LEAST_LIKELIHOOD,
     REFINEMENT,
     RefinementParameters,
     gauss_newton,
     refine,
 )
+from pc2grid.matching.search import SearchMap, normal_equations
 from pc2grid.matching.walls import Walls
-from pc2grid.matching.window_search import SearchMap
 from pc2grid.model import OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part, plan
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pc2grid.matching.self_likeness import self_likeness
+from pc2grid.matching.score import self_likeness
 from pc2grid.matching.walls import Walls
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 

@@ -7,13 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
-from pc2grid.matching.likelihood_field import LIKELIHOOD, LikelihoodField
-from pc2grid.matching.refinement import refine
-from pc2grid.matching.two_way_score import Fit, _sums, score_fit
-from pc2grid.matching.walls import Walls
-from pc2grid.matching.window_search import SearchMap, search_windows
+from pc2grid.geometry import F64, SE2
+from pc2grid.matching.score import Fit, _sums, refine, score_fit
+from pc2grid.matching.search import SearchMap, search_windows
+from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField, Walls
 from pc2grid.model import THING, UNKNOWN, OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pc2grid.matching.likelihood_field import LIKELIHOOD
-from pc2grid.matching.walls import WALLS, WallParameters, Walls, thin_evenly
+from pc2grid.matching.walls import LIKELIHOOD, WALLS, WallParameters, Walls, thin_evenly
 from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
 
 

@@ -10,21 +10,22 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pc2grid.arrays import F64, I64, U8
-from pc2grid.geometry import SE2
-from pc2grid.matching._kernels import best_in_tiles, tile_bounds
-from pc2grid.matching.lattice import BLOCK, SQUARE, TILE
-from pc2grid.matching.refinement import refine
-from pc2grid.matching.two_way_score import score_fit
-from pc2grid.matching.walls import Walls
-from pc2grid.matching.window_search import (
+from pc2grid.geometry import F64, I64, SE2, U8
+from pc2grid.matching.score import refine, score_fit
+from pc2grid.matching.search import (
+    BLOCK,
     MOST_POINTS,
+    SQUARE,
+    TILE,
     SearchMap,
     SearchParameters,
     Tiles,
+    best_in_tiles,
     headings,
     search_windows,
+    tile_bounds,
 )
+from pc2grid.matching.walls import Walls
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from pc2grid.simulate.clutter import covered, place_clutter
-from pc2grid.simulate.floorplan import office_floorplan
-from pc2grid.simulate.passage import clearance_m
+from pc2grid.simulate.plan import clearance_m, office_floorplan
+from pc2grid.simulate.scene import covered, place_clutter
 
 
 def largest_share(grid: OccupancyGrid, free: np.ndarray, robot_m: float = 0.35) -> float:

@@ -10,11 +10,10 @@ import pytest
 from pc2grid.errors import ConfigError
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
 from pc2grid.simulate import SimulationConfig, office_floorplan, prepare_session
-from pc2grid.simulate.clutter import covered
 from pc2grid.simulate.config import DriveConfig, OdometryConfig
-from pc2grid.simulate.drive import RATE_HZ, Drive
-from pc2grid.simulate.odometry import odometry_of
-from pc2grid.simulate.passage import clearance_m
+from pc2grid.simulate.drive import RATE_HZ, Drive, odometry_of
+from pc2grid.simulate.plan import clearance_m
+from pc2grid.simulate.scene import covered
 
 
 def room(*free: tuple[float, float, float, float], size_m: float = 12.0) -> OccupancyGrid:

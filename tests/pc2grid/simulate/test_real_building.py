@@ -7,11 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
 from pc2grid.errors import MapFileError
+from pc2grid.geometry import F64
 from pc2grid.simulate import Building, SimulationConfig, load_building, prepare_session
-from pc2grid.simulate.building import voxel_faces, voxel_m
-from pc2grid.simulate.scene import Mesh, Scene, prism
+from pc2grid.simulate.scene import Mesh, Scene, prism, voxel_faces, voxel_m
 from tests.helpers.building_clouds import ROOM_M, room_cloud
 
 

@@ -9,14 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
 from pc2grid.errors import OutputError
-from pc2grid.geometry import transform_points
+from pc2grid.geometry import F64, transform_points
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Scan, SensorKind
 from pc2grid.simulate import Session, SimulationConfig, iter_session, prepare_session, simulate_session
 from pc2grid.simulate.config import DepthConfig, DriveConfig, LaserConfig, LidarConfig
-from pc2grid.simulate.sensors import depth, laser, lidar
+from pc2grid.simulate.scene import depth, laser, lidar
 from pc2grid.simulate.session import EPOCH_NS
 from tests.helpers.rooms import small_house
 
@@ -219,7 +218,7 @@ def test_command_line(tmp_path: Path) -> None:
     import typer
     from typer.testing import CliRunner
 
-    from pc2grid.io.nav2_map import save_map
+    from pc2grid.io.maps import save_map
     from pc2grid_cli.commands import simulate_command
 
     yaml, _ = save_map(small_house(), tmp_path / "house")
@@ -243,7 +242,7 @@ def test_command_line(tmp_path: Path) -> None:
 @pytest.mark.skipif(not (DATA / "maps").is_dir(), reason="no real maps: set PC2GRID_DATA")
 @pytest.mark.parametrize("name", ["fr079", "aces"])
 def test_real_floor_plans_can_be_driven_through(name: str) -> None:
-    from pc2grid.io.nav2_map import load_map
+    from pc2grid.io.maps import load_map
 
     grid = load_map(DATA / "maps" / f"{name}.yaml")
     session = prepare_session(sensor="laser", grid=grid, config=brief(length_m=40.0, clutter=30))

@@ -10,10 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64
+from pc2grid.geometry import F32, F64
 from pc2grid.model import OCCUPIED_FROM, UNKNOWN, OccupancyGrid
-from pc2grid.submaps._kernels import cast_rays
-from pc2grid.submaps.isovist import (
+from pc2grid.submaps.junction_graph import cast_rays
+from pc2grid.submaps.submaps import (
     _STEP_CELLS,
     HIDDEN,
     OPEN,

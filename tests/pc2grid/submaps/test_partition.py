@@ -15,18 +15,19 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 from sklearn.cluster import DBSCAN
 
-from pc2grid.config import PartitionConfig
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.junction_graph import (
     GraphArrays,
     clusters,
     graph_from_arrays,
     graph_to_arrays,
     junction_graph,
+    junctions_and_ends,
     map_skeleton,
+    pixel_steps,
 )
-from pc2grid.submaps.partition import partition, submap_at
-from pc2grid.submaps.skeleton import junctions_and_ends, pixel_steps
+from pc2grid.submaps.submaps import partition, submap_at
 from tests.helpers.rooms import canvas, cross, grid_of
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
@@ -103,8 +104,7 @@ def test_junction_graph_of_a_cross_is_a_star_with_four_arms() -> None:
 
 @pytest.mark.skipif(not (DATA / "maps").is_dir(), reason="no real maps: set PC2GRID_DATA")
 def test_number_of_submaps_is_near_table_1_with_one_set_of_parameters() -> None:
-    from pc2grid_lab.paper.cells import read_map
-    from pc2grid_lab.paper.published import SUBMAPS
+    from pc2grid_lab.paper.cells import SUBMAPS, read_map
 
     for name, published in SUBMAPS.items():
         found = len(partition(read_map(DATA / "maps" / f"{name}.yaml"), PAPER))

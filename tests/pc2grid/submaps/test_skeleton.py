@@ -9,12 +9,12 @@ from hypothesis import strategies as st
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from pc2grid.submaps.sampling import sample_evenly
-from pc2grid.submaps.skeleton import (
+from pc2grid.submaps.junction_graph import (
     _DELETABLE,
     Thinning,
     clearance_of,
     junctions_and_ends,
+    sample_evenly,
     thin,
 )
 

@@ -12,7 +12,7 @@ import open3d
 import pytest
 from typer.testing import CliRunner
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.scene import extrude

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid_cli.main import app
-from pc2grid_lab.compare import sensors
+from pc2grid_lab import compare as sensors
 from pc2grid_lab.experiments import sensor_matrix
 from pc2grid_lab.experiments.trial import matrix
 from tests.helpers.simulated_drives import office, plan

@@ -6,7 +6,7 @@ import pytest
 from pc2grid.errors import TrajectoryFileError
 from pc2grid.geometry import SE2
 from pc2grid.model import Trajectory
-from pc2grid_lab.experiments.slam_relations import read_relations, relation_error
+from pc2grid_lab.experiments.truth import read_relations, relation_error
 
 
 def trajectory(poses):

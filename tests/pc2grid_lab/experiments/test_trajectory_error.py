@@ -5,7 +5,7 @@ import pytest
 
 from pc2grid.geometry import SE2, pose_from_rotation_vector
 from pc2grid.model import Health, Trajectory
-from pc2grid_lab.experiments.trajectory_error import trajectory_error
+from pc2grid_lab.experiments.truth import trajectory_error
 
 
 def trajectory(poses, health=()):

@@ -2,10 +2,10 @@
 
 import math
 
-from pc2grid.time_span import TimeSpan
+from pc2grid.observer import TimeSpan
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue
 from pc2grid_lab.fit.posterior import known_of
-from pc2grid_lab.fit.recorded_queries import Window, rows
+from pc2grid_lab.fit.queries import Window, rows
 from signature.config import Config
 from signature.localization.query import Query
 from tests.helpers.simulated_drives import building, drive, office, plan

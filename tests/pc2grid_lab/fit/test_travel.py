@@ -11,7 +11,7 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import Trajectory
-from pc2grid_lab.experiments.recordings.drive import RecordedDrive
+from pc2grid_lab.experiments.recordings.run import RecordedDrive
 from pc2grid_lab.fit import travel
 from signature.localization.localizer import Localizer
 from tests.helpers.simulated_drives import building, drive, office

@@ -13,21 +13,33 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from pc2grid.config import PartitionConfig
 from pc2grid.errors import ConfigError, MapFileError
-from pc2grid.io.nav2_map import save_map
-from pc2grid.submaps.partition import partition
+from pc2grid.io.maps import save_map
+from pc2grid.settings import PartitionConfig
+from pc2grid.submaps.submaps import partition
 from pc2grid_cli import console
 from pc2grid_lab.commands import compare_paper_command
 from pc2grid_lab.paper import experiment
-from pc2grid_lab.paper.cells import cells_of, paper_tasks, read_map, that_share_submaps
-from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES
-from pc2grid_lab.paper.experiment import BestMatches, Experiment, MatchMeasures, draw_queries, evaluate
-from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods
-from pc2grid_lab.paper.noise import NOISE_LEVELS
-from pc2grid_lab.paper.published import MAPS, TABLE_3, TABLE_4
+from pc2grid_lab.paper.cells import (
+    MAPS,
+    TABLE_3,
+    TABLE_4,
+    cells_of,
+    paper_tasks,
+    read_map,
+    that_share_submaps,
+)
+from pc2grid_lab.paper.experiment import (
+    NOISE_LEVELS,
+    BestMatches,
+    Experiment,
+    MatchMeasures,
+    draw_queries,
+    evaluate,
+)
+from pc2grid_lab.paper.methods import ABLATION, EXTRA_METHOD_NAMES, METHOD_NAMES, OPEN_CHOICES, make_methods
 from pc2grid_lab.paper.report import _cell
-from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
+from pc2grid_lab.paper.rivals import DistanceFeatures
 from signature.config import SignatureConfig
 from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
 

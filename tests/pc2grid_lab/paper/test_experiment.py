@@ -6,15 +6,17 @@ import numpy as np
 import pytest
 
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
-from pc2grid.submaps.partition import submap_at
+from pc2grid.submaps.submaps import submap_at
 from pc2grid_lab.paper.experiment import (
+    NOISE_LEVELS,
     Experiment,
+    Noise,
+    add_noise,
     draw_queries,
     evaluate,
     precision_recall,
 )
 from pc2grid_lab.paper.methods import make_methods
-from pc2grid_lab.paper.noise import NOISE_LEVELS, Noise, add_noise
 from tests.helpers.rooms import canvas, cross, disc, grid_of, l_shape, rectangle, submap_of
 
 SILENT = NOISE_LEVELS[0]

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64
-from pc2grid_lab.paper.rivals import _kernels, sdf
+from pc2grid.geometry import F32, F64, I64
+from pc2grid_lab.paper import rivals as _kernels
+from pc2grid_lab.paper import rivals as sdf
 
 SEEDS = pytest.mark.parametrize("seed", range(4))
 

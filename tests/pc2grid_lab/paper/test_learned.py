@@ -9,15 +9,15 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist, pdist, squareform
 
-from pc2grid.config import PartitionConfig
 from pc2grid.errors import MapFileError
-from pc2grid.io.nav2_map import save_map
-from pc2grid.submaps.partition import partition
+from pc2grid.io.maps import save_map
+from pc2grid.settings import PartitionConfig
+from pc2grid.submaps.submaps import partition
 from pc2grid_lab.paper import learned
 from pc2grid_lab.paper.cells import cells_of, paper_tasks, read_map
 from pc2grid_lab.paper.learned import COLUMNS, CONFIG, Learned, Unlearned, Vectors, vector, weight
 from signature.boundary import boundary_edges, boundary_points
-from signature.describe import describe
+from signature.paper import describe
 from tests.helpers.field import DATA
 from tests.helpers.rooms import (
     RESOLUTION_M,

@@ -7,16 +7,20 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
+from pc2grid.geometry import F64
 from pc2grid.model import Submap
-from pc2grid_lab.paper.experiment import rotated_submap
+from pc2grid_lab.paper.experiment import Matcher, Method, rotated_submap
 from pc2grid_lab.paper.learned import vector
-from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods
+from pc2grid_lab.paper.methods import (
+    EXTRA_METHOD_NAMES,
+    METHOD_NAMES,
+    SeveralCentres,
+    lattice,
+    make_methods,
+    smaller_disc,
+)
 from pc2grid_lab.paper.proposed import Proposed
-from pc2grid_lab.paper.protocol import Matcher, Method
-from pc2grid_lab.paper.rivals.sdf import DistanceFeatures
-from pc2grid_lab.paper.rivals.shape_context import ShapeContext
-from pc2grid_lab.paper.several_centres import SeveralCentres, lattice, smaller_disc
+from pc2grid_lab.paper.rivals import DistanceFeatures, ShapeContext
 from signature.config import SignatureConfig
 from signature.freespace import freespace_paths
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of

@@ -11,16 +11,15 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from pc2grid.config import PartitionConfig
-from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.maps import load_map, save_map
 from pc2grid.model import OccupancyGrid
-from pc2grid.submaps.partition import partition
+from pc2grid.settings import PartitionConfig
+from pc2grid.submaps.submaps import partition
 from pc2grid_lab.commands import compare_scale_command
 from pc2grid_lab.paper import learned, scale
 from pc2grid_lab.paper.cells import rescaled, within_others
-from pc2grid_lab.paper.experiment import Experiment, draw_queries
+from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, draw_queries
 from pc2grid_lab.paper.methods import make_methods
-from pc2grid_lab.paper.noise import NOISE_LEVELS
 from pc2grid_lab.paper.scale import Counted, count, mean_recall, sources_of
 from tests.helpers.rooms import cross, grid_of, l_shape, random_rooms, rectangle
 

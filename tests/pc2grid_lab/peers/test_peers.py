@@ -13,16 +13,24 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.geometry import SE2
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.model import Scan
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
-from pc2grid_lab.compare.peers import _tasks
+from pc2grid_lab.compare import _tasks
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.peers import programs
-from pc2grid_lab.peers.outcome import PeerAnswer, PeerTrial, best_threshold
 from pc2grid_lab.peers.particle_filter import carmen_log
-from pc2grid_lab.peers.programs import PEERS, PINS, PeerFailed, answers, missing
+from pc2grid_lab.peers.programs import (
+    PEERS,
+    PINS,
+    PeerAnswer,
+    PeerFailed,
+    PeerTrial,
+    answers,
+    best_threshold,
+    missing,
+)
 from pc2grid_lab.peers.site import Site, SiteQuery, save_beams
 from tests.helpers.simulated_drives import drive, office
 

@@ -15,8 +15,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from signature.database import arrays
-from signature.database.arrays import clean, pack, row_crc, to_json, unpack
+from signature.database import document as arrays
+from signature.database.document import clean, pack, row_crc, to_json, unpack
 from tests.helpers.memory import Peak
 
 VALUES = st.integers() | st.binary() | st.text()

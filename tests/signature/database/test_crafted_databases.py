@@ -16,7 +16,8 @@ from pc2grid.errors import DatabaseCorrupt, DatabaseVersion
 from pc2grid.model import Trajectory
 from signature.boundary import boundary_bins
 from signature.config import Config
-from signature.database import maintenance, open_database, validation
+from signature.database import document as validation
+from signature.database import maintenance, open_database
 from signature.database.rows import SESSION_COLUMNS
 from tests.helpers.databases import READ_PART, TUESDAY, Content, assert_holds, craft, make_entry, sql
 

@@ -28,8 +28,8 @@ from typer.testing import CliRunner
 
 from pc2grid.errors import LogNotFound, MapFileError, NotADatabase, OutputError
 from pc2grid.io import open_log
-from pc2grid.io.export.mcap import LogWriter
-from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.export import LogWriter
+from pc2grid.io.maps import load_map, save_map
 from pc2grid.io.trajectory import write_kitti, write_tum
 from pc2grid.model import Trajectory
 from pc2grid.simulate import SimulationConfig, simulate_session
@@ -66,11 +66,11 @@ SERVER.set_forkserver_preload(
         "pc2grid_cli.main",
         "pc2grid.pipeline",
         "pc2grid.estimation.tracker",
-        "pc2grid.submaps.partition",
+        "pc2grid.submaps.submaps",
         "pc2grid.io.containers.mcap",
         "signature.sessions",
-        "signature.describe",
-        "signature.database.sqlite.rows",
+        "signature.paper",
+        "signature.database.sqlite",
         "signature.database.maintenance",
         "pydantic",
         "kiss_icp.kiss_icp",

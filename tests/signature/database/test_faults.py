@@ -29,20 +29,20 @@ from pc2grid.errors import (
     OutputError,
     Pc2GridError,
 )
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.model import ReadReport, SessionMap, Trajectory
-from pc2grid.submaps.partition import divide
+from pc2grid.submaps.submaps import divide
 from pc2grid_cli.main import app
 from signature.config import Config
 from signature.database import Label, Provenance, maintenance, open_database
+from signature.database import postgres as server
+from signature.database import sqlite as atomic_update
 from signature.database.document import PARTS
 from signature.database.maintenance import check, copy, merge, store
-from signature.database.postgres import server
 from signature.database.protocol import APPLICATION_ID
 from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
-from signature.database.sqlite import atomic_update
-from signature.database.sqlite.atomic_update import hold
-from signature.describe import describe
+from signature.database.sqlite import hold
+from signature.paper import describe
 from signature.sessions import add_session, provenance
 from tests.helpers import postgresql
 from tests.helpers.databases import MONDAY, READ_PART, TUESDAY, assert_holds, everything, make_entry, sql

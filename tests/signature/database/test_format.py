@@ -11,10 +11,10 @@ import pytest
 
 from pc2grid.errors import DatabaseVersion
 from signature.database import open_database
-from signature.database.arrays import row_crc, unpack
+from signature.database import sqlite as schema
+from signature.database.document import row_crc, unpack
 from signature.database.maintenance import check, store
 from signature.database.protocol import FORMAT
-from signature.database.sqlite import schema
 from tests.helpers.databases import Content, craft, make_entry, sql
 
 

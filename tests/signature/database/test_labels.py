@@ -8,12 +8,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid_cli.main import app
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import Label, open_database
-from signature.localization.answering import locate_map
+from signature.localization.localizer import locate_map
 from signature.localization.map_index import MapIndex
 from tests.helpers.simulated_drives import plan
 

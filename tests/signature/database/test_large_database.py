@@ -11,17 +11,16 @@ import pytest
 from pc2grid.errors import DatabaseCorrupt
 from pc2grid.model import OccupancyGrid, SessionMap, Trajectory
 from pc2grid.observer import Observer
-from pc2grid.submaps.partition import partition
+from pc2grid.submaps.submaps import partition
 from signature.config import Config
 from signature.database import maintenance, open_database
 from signature.localization import map_index as building_file
-from signature.localization.answering import locate_map
+from signature.localization.localizer import locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.query import query_of
-from signature.retrieval import viewpoints
-from signature.retrieval.view import View
-from signature.seen_places import SeenPlaces
+from signature.retrieval import places as viewpoints
 from signature.sessions import add_session, provenance
+from signature.visible import SeenPlaces, View
 from tests.helpers.databases import sql
 from tests.helpers.simulated_drives import building, office, plan
 

@@ -25,8 +25,8 @@ from pc2grid.errors import (
 )
 from signature.config import Config
 from signature.database import create_database, maintenance, open_database
+from signature.database import postgres as server
 from signature.database.maintenance import store
-from signature.database.postgres import server
 from tests.helpers import postgresql
 from tests.helpers.databases import MONDAY, assert_holds, everything, make_entry, sql
 from tests.helpers.postgresql import with_user

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from pc2grid.geometry import SE2
-from signature.localization.ambiguous_line import ambiguous_line
+from signature.localization.answer import ambiguous_line
 
 ALONG = math.radians(30.0)
 

@@ -10,9 +10,8 @@ import pytest
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.model import RegisteredScan
-from signature.localization import follower as follower_module
-from signature.localization.follower import Follower
-from signature.localization.localizer import Estimate, Localizer
+from signature.localization import localizer as follower_module
+from signature.localization.localizer import Estimate, Follower, Localizer
 from tests.helpers.simulated_drives import building, drive, office
 
 OFFICE = building({"office": office()})

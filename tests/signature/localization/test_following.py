@@ -17,7 +17,7 @@ from signature.localization.answer import OffMap
 from signature.localization.belief import Belief, Masses
 from signature.localization.decision import anywhere, beside_map, decide
 from signature.localization.localizer import Estimate, Localizer
-from signature.localization.prior import Prior
+from signature.localization.posterior import Prior
 from signature.localization.query import query_of
 from tests.helpers.simulated_drives import building, drive, office, plan
 

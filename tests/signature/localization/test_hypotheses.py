@@ -7,10 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F32
-from pc2grid.geometry import SE2
-from pc2grid.matching.two_way_score import score_fit
-from pc2grid.matching.window_search import SearchMap
+from pc2grid.geometry import F32, SE2
+from pc2grid.matching.score import score_fit
+from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config, RelocalizeConfig, ShortlistBy
 from signature.localization import map_index

@@ -10,8 +10,8 @@ import pytest
 
 from pc2grid.geometry import SE2
 from signature.database.protocol import BuildingFrame
-from signature.localization.answering import locate_map
-from signature.localization.in_building import answer_in_building, covariance_in_building
+from signature.localization.answer import answer_in_building, covariance_in_building
+from signature.localization.localizer import locate_map
 from tests.helpers.simulated_drives import building, office, office_part
 
 FRAME = BuildingFrame(

@@ -10,7 +10,7 @@ import pytest
 
 from pc2grid.geometry import SE2, invert_pose
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_space
-from pc2grid.matching.two_way_score import Fit
+from pc2grid.matching.score import Fit
 from pc2grid.model import Health, PointMap
 from signature.localization.answer import Verdict
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis

@@ -9,7 +9,7 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid
-from signature.localization.answering import locate_map
+from signature.localization.localizer import locate_map
 from tests.helpers.simulated_drives import RESOLUTION_M, building, cut, office, plan
 
 OFFICE = building({"office": office()})

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.mapping.place_recognition import Stretch
-from pc2grid.matching.two_way_score import Fit
+from pc2grid.mapping.loops import Stretch
+from pc2grid.matching.score import Fit
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config
 from signature.localization.place_recognition import RECOGNITION, RecognitionParameters, SessionRecognizer

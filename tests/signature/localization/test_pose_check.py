@@ -17,12 +17,12 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.io.map_pose import MapPose
-from pc2grid.io.nav2_map import load_map
+from pc2grid.io.maps import load_map
 from pc2grid.model import UNKNOWN, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch, check_pose
-from signature.similarity import SignatureTable
+from signature.paper import SignatureTable
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]

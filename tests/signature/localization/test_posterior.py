@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 import pytest
 
-from pc2grid.matching.two_way_score import Fit
+from pc2grid.matching.score import Fit
 from signature.localization.posterior import (
     NO_EVIDENCE,
     POSTERIOR,

@@ -17,7 +17,7 @@ from signature.config import Config, RelocalizeConfig
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.prior import Prior
+from signature.localization.posterior import Prior
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]

@@ -8,11 +8,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F64, SE2
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.mapping.loop_closure import LoopCloser
+from pc2grid.mapping.loops import LoopCloser
 from signature.config import Config
 from signature.localization.place_recognition import SessionRecognizer
 

@@ -10,8 +10,7 @@ import pytest
 
 from pc2grid.matching.icp_in_space import MapSurface
 from signature.database import Label
-from signature.localization.follower import Follower
-from signature.localization.localizer import Estimate, Localizer
+from signature.localization.localizer import Estimate, Follower, Localizer
 from signature.localization.map_index import MapIndex
 from tests.helpers.simulated_drives import building, office
 from tests.helpers.tall_offices import lidar_drive, points

@@ -8,7 +8,7 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
-from signature.retrieval.explanation import compare_views
+from signature.localization.shown.page import compare_views
 from tests.helpers.simulated_drives import office
 
 SIGHT_M = 5.0

@@ -9,14 +9,12 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F32, F64, I64
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F32, F64, I64, SE2
 from pc2grid.simulate import office_floorplan
 from signature.config import RelocalizeConfig, ShortlistBy
 from signature.localization.query import Query, QueryMap
-from signature.retrieval._kernels import best_headings
-from signature.retrieval.place_index import POSES, PlaceBlock, PlaceIndex
-from signature.retrieval.viewpoints import FIRST_PLACES, ORDER, SQUARE_M, Places
+from signature.retrieval.index import POSES, PlaceBlock, PlaceIndex, best_headings
+from signature.retrieval.places import FIRST_PLACES, ORDER, SQUARE_M, Places
 from tests.helpers.simulated_drives import building, drive, office
 
 

@@ -15,14 +15,13 @@ import numpy as np
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid, RegisteredScan
-from pc2grid.submaps.partition import partition
+from pc2grid.submaps.submaps import partition
 from signature.config import Config
-from signature.describe import describe
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
-from signature.similarity import SignatureTable
+from signature.paper import SignatureTable, describe
 
 T = TypeVar("T")
 _WALL_M = 0.4

@@ -15,14 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.arrays import F64
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.config import Config
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F64, SE2
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Health, RegisteredScan, Scan, SensorKind
 from pc2grid.pipeline import follow
-from pc2grid_lab.experiments.frames import AHEAD_M, fit_frame
+from pc2grid.settings import Config
+from pc2grid_lab.experiments.truth import AHEAD_M, fit_frame
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

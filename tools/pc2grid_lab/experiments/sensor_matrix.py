@@ -16,15 +16,15 @@ from typing import Any
 import numpy as np
 
 from pc2grid.geometry import SE2
-from pc2grid.matching.two_way_score import score_fit
+from pc2grid.matching.score import score_fit
 from pc2grid.model import OccupancyGrid, Scan, SensorKind
 from pc2grid.pipeline import map_scans
 from pc2grid.simulate.drive import Drive
 from pc2grid_lab.experiments.answers import Answers, localize
-from pc2grid_lab.experiments.frames import apart
+from pc2grid_lab.experiments.program import once
 from pc2grid_lab.experiments.registered_session import RegisteredSession, register
-from pc2grid_lab.experiments.stored import once
 from pc2grid_lab.experiments.trial import JUDGEMENT, Trial
+from pc2grid_lab.experiments.truth import apart
 from pc2grid_lab.worlds import WorldConfig, prepare_session
 from signature.config import Config
 from signature.localization.map_index import MapIndex

@@ -23,7 +23,7 @@ import numpy as np
 import typer
 from scipy.optimize import minimize
 
-from pc2grid.arrays import F64
+from pc2grid.geometry import F64
 from pc2grid_lab.fit.posterior import LAPSE, PENALTY, is_right
 from signature.config import Config
 from signature.localization.in_space import SPACE, masses_in_space

@@ -27,8 +27,8 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 from sklearn.metrics import roc_auc_score
 
-from pc2grid.arrays import F64
-from pc2grid_lab.experiments.recordings.chance import clopper_pearson
+from pc2grid.geometry import F64
+from pc2grid_lab.experiments.recordings.page import clopper_pearson
 from signature.config import Config
 from signature.localization.posterior import POSTERIOR, Evidence, PosteriorParameters, masses
 

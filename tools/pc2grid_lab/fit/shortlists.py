@@ -26,13 +26,12 @@ from pc2grid_lab.experiments.answers import index_of as index_of_grid
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue
 from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.fit.posterior import RIGHT_M, RIGHT_RAD
-from pc2grid_lab.fit.queries import office_floor
-from pc2grid_lab.fit.recorded_queries import Only, Window, error_of, index_of, windows
+from pc2grid_lab.fit.queries import Only, Window, error_of, index_of, office_floor, windows
 from signature.config import Config, ShortlistBy
 from signature.localization.decision import decide
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
-from signature.similarity import SignatureTable
+from signature.paper import SignatureTable
 
 _FEW = 200
 """Of fewer places, half or more are searched at once."""

@@ -21,13 +21,23 @@ from typing import Annotated
 import typer
 
 from pc2grid.geometry import SE2
-from pc2grid.io.nav2_map import load_map
+from pc2grid.io.maps import load_map
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue
 from pc2grid_lab.experiments.recordings.run import Folder
-from pc2grid_lab.fit.queries import MAPPED_S, Asked, Drawn, office_floor, pairs_of, queries_of, read
-from pc2grid_lab.fit.recorded_queries import Window, index_of, windows
+from pc2grid_lab.fit.queries import (
+    MAPPED_S,
+    Asked,
+    Drawn,
+    Window,
+    index_of,
+    office_floor,
+    pairs_of,
+    queries_of,
+    read,
+    windows,
+)
 from signature.config import Config
-from signature.seen_likelihood import SeenStatistics
+from signature.weights import SeenStatistics
 
 _FIRST_FLOOR, _FLOORS = 30_010, 10
 """Office floors that are other places, besides the maps of other buildings."""

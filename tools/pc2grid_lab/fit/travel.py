@@ -27,11 +27,10 @@ from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.model import RegisteredScan, Trajectory
 from pc2grid.pipeline import follow
-from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair
-from pc2grid_lab.experiments.recordings.drive import RecordedDrive, config_of, drive_of
-from pc2grid_lab.experiments.recordings.run import Folder
-from pc2grid_lab.fit.recorded_queries import Only, index_of
+from pc2grid_lab.experiments.recordings.run import Folder, RecordedDrive, config_of, drive_of
+from pc2grid_lab.experiments.truth import Clue, Frame, agreed_frame, is_right
+from pc2grid_lab.fit.queries import Only, index_of
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 

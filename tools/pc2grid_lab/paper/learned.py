@@ -17,11 +17,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pc2grid.arrays import F64
+from pc2grid.geometry import F64
 from pc2grid.model import OccupancyGrid, Submap
-from pc2grid_lab.paper import _kernels
-from pc2grid_lab.paper.experiment import Experiment, draw_queries
-from pc2grid_lab.paper.noise import NOISE_LEVELS
+from pc2grid_lab.paper import experiment as _kernels
+from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, draw_queries
 from pc2grid_lab.paper.proposed import Signatures
 from signature.boundary import bins_of_squares, boundary_edges, boundary_points
 from signature.config import SignatureConfig

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from pc2grid.arrays import F64
+from pc2grid.geometry import F64
 from pc2grid.model import Submap
 from signature.config import SignatureConfig
-from signature.describe import Signature, described
 from signature.freespace import freespace_paths
-from signature.similarity import SignatureTable, distances, similarity
+from signature.paper import Signature, SignatureTable, described, distances, similarity
 
 _OF_COMPARING = {"weight_boundary", "symmetry_scale", "symmetry_sigma", "histogram_distance"}
 """Fields of a configuration that do not change a signature."""
@@ -24,7 +23,7 @@ class Signatures:
     _found: dict[str, Signature] = field(default_factory=dict)
 
     def of(self, submap: Submap, config: SignatureConfig) -> Signature:
-        """The signature that `signature.describe` gives, without a graph that would only be unpacked."""
+        """The signature that `signature.paper` gives, without a graph that would only be unpacked."""
         if self._read is not submap:
             self._read, self._found = submap, {}
         key = config.model_dump_json(exclude=_OF_COMPARING)

@@ -1,20 +1,47 @@
-"""The paper's tables as text and its Figure 9 as a picture, from the results of `compare paper`."""
+"""The paper's tables as text and its Figure 9 as a picture, from the results of `compare paper`.
+
+`pc2grid compare paper`: the paper's Tables III and IV on the paper's maps, published beside measured.
+"""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid_cli.tables import show, table
-from pc2grid_lab.compare.picture import picture
-from pc2grid_lab.paper.cells import RADII_M, PaperCell
-from pc2grid_lab.paper.choices import ABLATION, OPEN_CHOICES, SettingChoice
-from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, OURS
-from pc2grid_lab.paper.published import SUBMAPS
+from pc2grid.errors import ConfigError
+from pc2grid.geometry import F64
+from pc2grid_cli.console import Console, json_text
+from pc2grid_cli.output import make_folder, show, table
+from pc2grid_lab.compare import picture
+from pc2grid_lab.experiments.program import (
+    BACK,
+    FRONT,
+    LABORATORY,
+    digest_of_sources,
+    in_processes,
+    write_text,
+)
+from pc2grid_lab.paper.cells import (
+    RADII_M,
+    SUBMAPS,
+    PaperCell,
+    cells_of,
+    known_maps,
+    paper_tasks,
+    that_share_submaps,
+)
+from pc2grid_lab.paper.methods import (
+    ABLATION,
+    EXTRA_METHOD_NAMES,
+    METHOD_NAMES,
+    OPEN_CHOICES,
+    OURS,
+    SettingChoice,
+)
 
 _LEVELS = ("without noise", "noise level 1", "noise level 2")
 _MEASURES = ("auc", "rp9", "f1", "r_at_1")
@@ -152,3 +179,55 @@ def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Pat
         if axes[0, 0].lines:
             figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
     return path
+
+
+def run(
+    maps: Path,
+    out: Path,
+    terminal: Console,
+    *,
+    queries: int,
+    methods: Sequence[str] | None,
+    offset: Sequence[float] | None,
+    open_choices: bool,
+    ablation: bool,
+    speckles: float,
+    jobs: int | None,
+    seed: int,
+) -> None:
+    """Compute the cells that are not in `out` yet, and write the tables and figures."""
+    chosen, offsets_m = _chosen(methods), tuple(offset or (1.0, 0.5))
+    if min(offsets_m) <= 0:
+        raise ConfigError("--offset: expected a distance above 0 m")
+    found = known_maps(maps)
+    make_folder(out)
+    choices = (ABLATION if ablation else ()) + (OPEN_CHOICES if open_choices else ())
+    setting: dict[str, Any] = {"queries": queries, "seed": seed, "speckle_sigma_m": speckles}
+    tasks = list(paper_tasks(found, methods=chosen, offsets_m=offsets_m, choices=choices, **setting))
+    with terminal.progress(f"{len(tasks)} cells of the tables") as advance:
+        kept = kept_in(out, found)
+        groups = [(group, kept) for group in that_share_submaps(tasks)]
+        cells = itertools.chain.from_iterable(in_processes(cells_of, groups, jobs=jobs, advance=advance))
+    by_task = {cell.task: cell for cell in cells}
+    results = [by_task[task] for task in tasks]
+    document = {**setting, "cells": [cell.summary() for cell in results]}
+    write_text(out / "results.json", json_text(document) + "\n")
+    pictures = [draw_figure(results, offset_m, out) for offset_m in offsets_m]
+    print_tables(results, chosen)
+    print(f"written: {out / 'results.json'}, {', '.join(map(str, pictures))}")
+
+
+def kept_in(out: Path, maps: Sequence[Path]) -> Path:
+    """The folder of the results of these sources, these maps, and those beside them to learn from."""
+    beside = {path for folder in {path.parent for path in maps} for path in known_maps(folder)}
+    images = {file for path in {*maps, *beside} for file in path.parent.glob(f"{path.stem}.*")}
+    return out / "cells" / digest_of_sources((FRONT, BACK, LABORATORY, *sorted(images)))
+
+
+def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
+    """The methods that are compared. Raises ConfigError if one is not known."""
+    chosen, known = tuple(methods or METHOD_NAMES), METHOD_NAMES + EXTRA_METHOD_NAMES
+    for name in chosen:
+        if name not in known:
+            raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
+    return chosen

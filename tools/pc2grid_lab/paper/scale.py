@@ -20,25 +20,23 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from scipy.stats import hypergeom
 
-from pc2grid.arrays import F64, I64
-from pc2grid.config import PartitionConfig
-from pc2grid.io.nav2_map import load_map
+from pc2grid.geometry import F64, I64
+from pc2grid.io.maps import load_map
 from pc2grid.model import OccupancyGrid, Submap
-from pc2grid.simulate.floorplan import office_floorplan
-from pc2grid.submaps.partition import partition
+from pc2grid.settings import PartitionConfig
+from pc2grid.simulate.plan import office_floorplan
+from pc2grid.submaps.submaps import partition
 from pc2grid_cli.console import Console, json_text
-from pc2grid_cli.output_files import make_folder
-from pc2grid_cli.tables import show, table
-from pc2grid_lab.compare.picture import picture
-from pc2grid_lab.experiments.stored import in_processes, once, write_text
+from pc2grid_cli.output import make_folder, show, table
+from pc2grid_lab.compare import picture
+from pc2grid_lab.experiments.program import in_processes, once, write_text
 from pc2grid_lab.paper.cells import known_maps, read_map, rescaled, within_others
-from pc2grid_lab.paper.command import kept_in
-from pc2grid_lab.paper.experiment import Experiment, draw_queries
+from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, draw_queries
 from pc2grid_lab.paper.learned import BOUNDARY_PARTS, COLUMNS, boundary_vector, metric
-from pc2grid_lab.paper.noise import NOISE_LEVELS
 from pc2grid_lab.paper.proposed import Signatures
+from pc2grid_lab.paper.report import kept_in
 from signature.config import SignatureConfig
-from signature.similarity import SignatureTable, score_matrix
+from signature.paper import SignatureTable, score_matrix
 
 LETTER = SignatureConfig.paper()
 PLACES = PartitionConfig.paper().model_copy(update={"spacing_m": 1.0})

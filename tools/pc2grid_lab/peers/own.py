@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pc2grid.io.nav2_map import load_map
+from pc2grid.io.maps import load_map
 from pc2grid_lab.experiments.answers import index_of, localize
 from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.peers.serving import Found, serve

@@ -17,12 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pc2grid.arrays import F32, F64
 from pc2grid.errors import Pc2GridError
-from pc2grid.geometry import SE2
-from pc2grid.io.nav2_map import load_map
-from pc2grid_lab.experiments.frames import apart
+from pc2grid.geometry import F32, F64, SE2
+from pc2grid.io.maps import load_map
 from pc2grid_lab.experiments.registered_session import RegisteredSession
+from pc2grid_lab.experiments.truth import apart
 from pc2grid_lab.peers.serving import Found, serve
 
 PROGRAMS = ("pf-localization", "carmen2rawlog", "ros-map-yaml2mrpt")

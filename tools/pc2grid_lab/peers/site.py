@@ -20,23 +20,21 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from pc2grid.arrays import F32, F64
 from pc2grid.errors import ConfigError, LogNotFound
-from pc2grid.geometry import SE2, transform_points
+from pc2grid.geometry import F32, F64, SE2, transform_points
 from pc2grid.io import Log, open_log
-from pc2grid.io.nav2_map import load_map, save_map
+from pc2grid.io.maps import load_map, save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
-from pc2grid.model import OccupancyGrid, RegisteredScan, Scan, SensorKind
+from pc2grid.model import SENSOR_MODELS, OccupancyGrid, RegisteredScan, Scan, SensorKind
 from pc2grid.pipeline import follow
-from pc2grid.sensor_model import SENSOR_MODELS
 from pc2grid.simulate import Session, load_building, prepare_session
-from pc2grid_lab.experiments.frames import apart, nearest
-from pc2grid_lab.experiments.recordings.driven import drive_config
+from pc2grid_lab.experiments.program import write_arrays, write_text
+from pc2grid_lab.experiments.recordings.catalogue import drive_config
 from pc2grid_lab.experiments.registered_session import register
 from pc2grid_lab.experiments.sensor_matrix import MAP_SEED, start_on
-from pc2grid_lab.experiments.stored import write_arrays, write_text
 from pc2grid_lab.experiments.trial import JUDGEMENT
+from pc2grid_lab.experiments.truth import apart, nearest
 from signature.config import Config
 
 

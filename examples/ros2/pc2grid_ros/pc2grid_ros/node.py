@@ -19,16 +19,14 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 import pc2grid
-from pc2grid.config import ReadConfig
 from pc2grid.io.live.feed import Feed
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
-from pc2grid.io.message_source import RawMessage, TopicInfo
-from signature.localization.follower import Follower
-from signature.localization.in_building import answer_in_building
-from signature.localization.joining.building_map import map_of
-from signature.localization.localizer import Estimate
-from signature.localization.resets import ResetPolicy
+from pc2grid.io.source import RawMessage, TopicInfo
+from pc2grid.settings import ReadConfig
+from signature.localization.answer import answer_in_building
+from signature.localization.joining.building import map_of
+from signature.localization.localizer import Estimate, Follower, ResetPolicy
 
 PARAMETERS = {"database": "", "topic": "", "publish": "initialpose", "publish_map": False, "map_frame": "map"}
 """With their defaults; `config/pc2grid.yaml` explains them."""

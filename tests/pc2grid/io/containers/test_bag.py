@@ -10,7 +10,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     LimitExceeded,
     LogCorrupt,
@@ -18,6 +17,7 @@ from pc2grid.errors import (
     NotALog,
 )
 from pc2grid.io import open_log
+from pc2grid.settings import ReadConfig
 from tests.helpers.memory import bounded_memory
 from tests.helpers.recordings import (
     STEP,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated
-from pc2grid.io.containers.bounds import BoundedFile
+from pc2grid.io.containers.mcap import BoundedFile
 
 
 @pytest.fixture

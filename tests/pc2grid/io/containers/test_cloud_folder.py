@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import (
     LimitExceeded,
     LogNotFound,
@@ -22,6 +21,7 @@ from pc2grid.errors import (
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import write_tum
 from pc2grid.model import Trajectory
+from pc2grid.settings import ReadConfig
 from tests.helpers.cloud_folders import KINDS, POINTS, folder_of, trajectory, write_cloud
 from tests.helpers.recordings import STEP, T0, read
 

@@ -11,9 +11,9 @@ import numpy as np
 import psutil
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogTruncated, NotALog
 from pc2grid.io import open_log
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, check_drive, drive, read, ros, write_rosbag2
 
 PAGE = 4096

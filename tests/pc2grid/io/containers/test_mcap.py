@@ -13,9 +13,9 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import FrameError, LimitExceeded, LogError, LogTruncated
 from pc2grid.io import open_log
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, check_drive, drive, read, ros, write_mcap
 
 SCANS = 30

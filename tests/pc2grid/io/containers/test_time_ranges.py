@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid.config import ReadConfig
+from pc2grid.io.containers.bags import RosbagsFile
 from pc2grid.io.containers.mcap import McapSource
-from pc2grid.io.containers.rosbags_file import RosbagsFile
-from pc2grid.io.message_source import MessageSource
+from pc2grid.io.source import MessageSource
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import (
     STEP,
     T0,

@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2, pose_from_rotation_vector, pose_from_xyz_quat
-from pc2grid.io.export.mcap import LogWriter, Marker
+from pc2grid.io.export import LogWriter, Marker
 from pc2grid.model import OccupancyGrid, Trajectory
 
 STAMP = 1_700_000_000_123_456_789

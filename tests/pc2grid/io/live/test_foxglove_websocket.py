@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import LiveError, NoScans
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
@@ -23,6 +22,7 @@ from pc2grid.io.live.foxglove_websocket import ConnectionParameters, FoxgloveWeb
 from pc2grid.io.live.live_log import LiveLog, LiveParameters
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.model import OccupancyGrid, Scan
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import laser_drive, write_mcap
 from tests.helpers.robot import LONG_S, SUBPROTOCOLS, Channel, Frame, Proxy, Recorded, Robot
 

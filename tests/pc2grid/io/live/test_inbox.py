@@ -8,7 +8,7 @@ import time
 import pytest
 
 from pc2grid.io.live.feed import FeedCounts, Inbox, InboxParameters
-from pc2grid.io.message_source import RawMessage, TopicInfo
+from pc2grid.io.source import RawMessage, TopicInfo
 
 SCAN = TopicInfo(topic="/scan", type="sensor_msgs/LaserScan", encoding="cdr")
 TF = TopicInfo(topic="/tf", type="tf2_msgs/TFMessage", encoding="cdr")

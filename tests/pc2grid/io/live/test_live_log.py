@@ -7,11 +7,11 @@ from collections.abc import Collection, Sequence
 
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import NoScans
 from pc2grid.io.live.feed import Arrived, FeedCounts, News
 from pc2grid.io.live.live_log import LiveLog
-from pc2grid.io.message_source import RawMessage, TopicInfo
+from pc2grid.io.source import RawMessage, TopicInfo
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import T0, Message, laser_drive, ros
 
 

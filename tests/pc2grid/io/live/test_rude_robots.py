@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import Pc2GridError
 from pc2grid.io import open_log
 from pc2grid.io.live.feed import InboxParameters
 from pc2grid.io.live.foxglove_websocket import ConnectionParameters, FoxgloveWebsocket
 from pc2grid.io.live.live_log import LiveLog
 from pc2grid.model import Scan
+from pc2grid.settings import ReadConfig
 from tests.helpers.memory import bounded_memory
 from tests.helpers.recordings import STEP, T0, laser_drive, ros, write_mcap
 from tests.helpers.robot import LONG_S, Frame, Proxy, Recorded, Robot

@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import PointCloudError, TopicError, UnsupportedSchema
 from pc2grid.io import open_log
+from pc2grid.settings import ReadConfig
 from tests.helpers.foxglove_messages import (
     IDENTITY,
     Content,

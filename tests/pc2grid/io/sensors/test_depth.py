@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from pc2grid.config import ReadConfig
 from pc2grid.errors import NoScans, PointCloudError, UnsupportedSchema
+from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import T0, Message, raw_log, read, ros, write_mcap
 
 INFO = "/camera/depth/camera_info"

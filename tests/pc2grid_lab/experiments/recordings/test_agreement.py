@@ -7,7 +7,7 @@ import math
 import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
+from pc2grid_lab.experiments.truth import Clue, Frame, agreed_frame, is_right
 
 TRUE = SE2(12.0, -3.0, 0.7)
 OTHER = SE2(-4.0, 9.0, -2.0)

@@ -8,11 +8,15 @@ from typing import Any
 
 import pytest
 
-from pc2grid_lab.experiments.recordings.chance import by_chance, clopper_pearson
-from pc2grid_lab.experiments.recordings.changes import RowChange, changes
-from pc2grid_lab.experiments.recordings.mapped import warned
-from pc2grid_lab.experiments.recordings.page import page, sensor_matrix
-from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow, QueryRow, Table
+from pc2grid_lab.experiments.recordings.page import (
+    RowChange,
+    by_chance,
+    changes,
+    clopper_pearson,
+    page,
+    sensor_matrix,
+)
+from pc2grid_lab.experiments.recordings.rows import MapRow, PairRow, QueryRow, Table, warned
 
 BENT = "the map contradicts itself along 6% of the travel and is probably bent: near x 1.0, y 2.0 m"
 HEIGHT = "the height changes by 3.0 m, and from 5 s after the first scan on it is more than 2.0 m"

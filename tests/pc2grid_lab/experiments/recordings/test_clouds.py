@@ -7,9 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2, transform_points
-from pc2grid_lab.experiments.recordings.clouds import registered_clouds
+from pc2grid.geometry import F64, SE2, transform_points
+from pc2grid_lab.experiments.truth import registered_clouds
 
 
 def room(*, closet: bool, seed: int) -> F64:

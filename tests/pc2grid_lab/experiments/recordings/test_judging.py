@@ -13,13 +13,11 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Trajectory
-from pc2grid.time_span import TimeSpan
+from pc2grid.observer import TimeSpan
 from pc2grid_lab.experiments.recordings import judging
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
-from pc2grid_lab.experiments.recordings.children import Finished
-from pc2grid_lab.experiments.recordings.drive import RecordedDrive, known_share, levelled
 from pc2grid_lab.experiments.recordings.judging import Judge, LocatedWindow
-from pc2grid_lab.experiments.recordings.run import Folder
+from pc2grid_lab.experiments.recordings.run import Finished, Folder, RecordedDrive, known_share, levelled
 
 T_A_B, T_PLAN_A = SE2(3.0, -1.0, 0.4), SE2(20.0, 8.0, -1.2)
 RECORDINGS = {

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pc2grid_lab.experiments.recordings.catalogue import RECORDINGS
-from pc2grid_lab.experiments.recordings.own import own_recordings, state_of
+from pc2grid_lab.experiments.recordings.catalogue import RECORDINGS, own_recordings, state_of
 from tests.helpers.recordings import STEP, T0, ros, write_mcap
 
 

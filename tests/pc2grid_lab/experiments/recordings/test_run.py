@@ -6,11 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid.time_span import TimeSpan
+from pc2grid.observer import TimeSpan
 from pc2grid_lab.experiments.recordings import run
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue
-from pc2grid_lab.experiments.recordings.children import Finished, kept
-from pc2grid_lab.experiments.recordings.run import Folder, Task, _locate, _run
+from pc2grid_lab.experiments.recordings.run import Finished, Folder, Task, _locate, _run, kept
 
 
 @pytest.mark.parametrize(("code", "is_kept"), [(0, True), (1, True), (-11, True), (130, False), (143, False)])

@@ -16,8 +16,7 @@ from pc2grid.model import UNKNOWN, OccupancyGrid, Precision, Trajectory
 from signature.config import Config
 from signature.database import Label, SubmapDatabase, maintenance, open_database
 from signature.database.protocol import BuildingFrame
-from signature.localization.joining.building import join_sessions
-from signature.localization.joining.building_map import map_of
+from signature.localization.joining.building import join_sessions, map_of
 from signature.sessions import add_sessions, provenance
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
 from tests.helpers.session_maps import session, way

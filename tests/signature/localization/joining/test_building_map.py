@@ -9,9 +9,8 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from signature.bend import Bend
-from signature.database.protocol import BuildingFrame
-from signature.localization.joining.building_map import building_map
+from signature.database.protocol import Bend, BuildingFrame
+from signature.localization.joining.building import building_map
 
 _ = UNKNOWN
 

@@ -10,8 +10,7 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
-from signature.localization.joining.join import JOIN, Join, join_maps
-from signature.localization.joining.proposals import Proposal, proposals
+from signature.localization.joining.join import JOIN, Join, Proposal, join_maps, proposals
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, joinable, part
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import office, plan, with_tables

@@ -7,13 +7,11 @@ import math
 import numpy as np
 import pytest
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F64, SE2
 from pc2grid.model import Health, Precision, Trajectory
-from signature.bend import Bend, largest_m
-from signature.database.protocol import BuildingFrame
-from signature.localization.joining.pieces import Link
-from signature.localization.joining.straightening import RIGID, body_of, straighten
+from signature.database.protocol import Bend, BuildingFrame, largest_m
+from signature.localization.joining.building import RIGID, body_of, straighten
+from signature.localization.joining.join import Link
 
 DRIFT = 0.002
 """Rad a metre: over a local map of 4 m as much as one standard deviation of tracking."""

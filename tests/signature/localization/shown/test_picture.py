@@ -11,12 +11,12 @@ import pytest
 from matplotlib.figure import Figure
 
 from pc2grid.geometry import SE2
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
 from signature.database.protocol import BuildingFrame
-from signature.files import find
+from signature.localization.shown.page import Found
 from signature.localization.shown.picture import (
     BLUE,
     FREE,
@@ -33,8 +33,7 @@ from signature.localization.shown.picture import (
     draw_session,
     drawn_as,
 )
-from signature.localization.shown.report import Found
-from signature.sessions import add_sessions, provenance
+from signature.sessions import add_sessions, find, provenance
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
 from tests.helpers.nav2_map import as_mapped, nav2_map
 from tests.helpers.session_maps import session, way

@@ -14,19 +14,17 @@ import networkx as nx
 import numpy as np
 import pytest
 
-from pc2grid.io.nav2_map import save_map
+from pc2grid.io.maps import save_map
 from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory
 from pc2grid_cli.relocalize import map_sigma_m
 from signature.boundary import boundary_histogram
 from signature.config import Config
 from signature.database import SubmapDatabase, open_database
-from signature.describe import Signature
-from signature.files import find
 from signature.freespace import freespace_histogram, shortest_paths
 from signature.localization.answer import PoseInSpace
-from signature.localization.shown.report import Found, contents, write_report
-from signature.sessions import add_sessions, provenance
-from signature.similarity import distances
+from signature.localization.shown.page import Found, contents, write_report
+from signature.paper import Signature, distances
+from signature.sessions import add_sessions, find, provenance
 from tests.helpers.browser import DESK, PHONE, Browser
 from tests.helpers.nav2_map import as_mapped
 from tests.helpers.session_maps import LOOPS, session, way

@@ -2,20 +2,36 @@
 
 The files are those of the data folder that the README there describes. A row here is all that is known of a
 recording: another recording is another row, and no other file changes.
+
+Recordings of a folder that the catalogue does not name: one's own, with true poses beside them.
+
+Later parts of each are located in the map of its beginning.
+
+Recordings that are made: simulated drives through the real 3D scan of a building, with their true poses.
+
+Nobody has recorded one building with a lidar, a depth camera and a laser. A scan of its walls and furniture
+lets the first two be driven through it; a laser has recorded it in another year.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
+from functools import cache
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
+from pc2grid import simulate
+from pc2grid.errors import ConfigError, MapFileError, Pc2GridError
+from pc2grid.io import open_log
 from pc2grid.model import SensorKind
-from pc2grid.time_span import TimeSpan
+from pc2grid.observer import TimeSpan
+from pc2grid.simulate import Building, SimulationConfig, load_building, simulate_session
+from pc2grid_lab.experiments.program import digest_of_sources
 
 Kind = Literal[
     "later part", "fewer scans", "same recording", "other day", "other sensor", "published map", "elsewhere"
@@ -522,3 +538,127 @@ class Catalogue:
         spans = evenly_spaced(first_s, last_s, pair.windows, pair.window_s)
         numbered = [(k, replace(span, start_s=round(span.start_s, 3))) for k, span in enumerate(spans)]
         return numbered[:: _QUICK_EVERY if self.quick else 1]
+
+
+_SUFFIXES = (".mcap", ".bag", ".db3")
+_MAPPED_S, _WINDOW_S, _WINDOWS = 600.0, 20.0, 10
+"""The beginning, and windows of what comes after it: at most so long, and so many. As in the catalogue."""
+
+
+def own_recordings(data: Path, *, without: Path, of_base: bool) -> tuple[list[Recording], list[Pair]]:
+    """The recordings of a folder that the catalogue does not name, and the pairs of each with its beginning.
+
+    without : a folder that is left out. of_base : whether the poses in `NAME.tum` are of the base, not of the
+        sensor. Raises ConfigError if the folder is not there.
+    """
+    if not data.is_dir():
+        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
+    rows, named = [], {recording.file for recording in RECORDINGS}
+    for file in _recordings(data, without.resolve()):
+        name = file.relative_to(data).as_posix()
+        if name not in named:
+            rows.append(_row(file, name, of_base))
+    return [recording for recording, _ in rows], [pair for _, pair in rows if pair is not None]
+
+
+def state_of(data: Path, recordings: Sequence[Recording]) -> str:
+    """Digits that change when a file of one of these recordings is written; empty without recordings."""
+    found = hashlib.sha256()
+    for recording in recordings:
+        path = data / recording.file
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            about = file.stat()
+            found.update(f"{file} {about.st_size} {about.st_mtime_ns}\n".encode())
+    return found.hexdigest()[:8] if recordings else ""
+
+
+def _recordings(folder: Path, without: Path) -> Iterator[Path]:
+    """The recordings in a folder and in those below it. One of rosbag2, which is a folder, is one."""
+    for path in sorted(folder.iterdir()):
+        if path.is_dir() and path.resolve() != without:
+            if (path / "metadata.yaml").exists():
+                yield path
+            else:
+                yield from _recordings(path, without)
+        elif path.suffix in _SUFFIXES:
+            yield path
+
+
+def _row(file: Path, name: str, of_base: bool) -> tuple[Recording, Pair | None]:
+    """A recording, and windows of its end in the map of its beginning; none if it cannot be read."""
+    beside = {suffix: Path(name).with_suffix(suffix).as_posix() for suffix in (".tum", ".relations")}
+    there = [beside[suffix] for suffix in beside if file.with_suffix(suffix).exists()]
+    sensor: Source = "unknown"  # if it cannot be read: `convert` says why, in the row of its map
+    pair = None
+    try:
+        with open_log(file) as log:
+            sensor = log.choose().sensor
+            pair = _later_parts(name, (log.info.end_ns - log.info.start_ns) * 1e-9)
+    except (Pc2GridError, OSError):
+        pass
+    recording = Recording(
+        name=name,
+        file=name,
+        building=file.resolve().parent.name,
+        sensor=sensor,
+        truth=there[-1] if there else None,
+        poses=beside[".tum"] if beside[".tum"] in there else None,
+        of_base=of_base,
+        quick=True,
+    )
+    return recording, pair
+
+
+def _later_parts(name: str, length_s: float) -> Pair:
+    until_s = round(min(_MAPPED_S, length_s / 2), 1)
+    left_s = length_s - until_s
+    window_s = round(min(_WINDOW_S, left_s / 2), 1)
+    return Pair(
+        query=name,
+        map=name,
+        kind="later part",
+        window_s=window_s,
+        windows=min(_WINDOWS, round(2 * left_s / max(window_s, 0.1))),
+        until_s=until_s,
+        quick=True,
+    )
+
+
+_CLUTTER, _RATE_HZ, _COLUMNS = 15, 5.0, 720
+"""Things that are in the way, others in each drive; scans a second; columns in a turn of the lidar, as one at
+10 Hz sends them: fewer scans save time, not detail. Chosen by hand."""
+
+
+def write_drive(scan: Path, target: Path, drive: Drive) -> None:
+    """Drive through a 3D scan: write the MCAP file `target`, and its true poses beside it as `.tum`.
+
+    Raises MapFileError if the scan cannot be read or is a plan, ConfigError if there is no room in it.
+    """
+    building = load_building(scan)
+    if not isinstance(building, Building):
+        raise MapFileError(f"{scan}: a plan, not a 3D scan", hint="a drive needs a cloud or a mesh")
+    config = drive_config(drive.length_m, drive.seed)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    simulate_session(target, sensor=drive.sensor, grid=building, config=config, overwrite=True)
+
+
+def drive_config(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> SimulationConfig:
+    """Of one drive."""
+    return SimulationConfig.model_validate(
+        {
+            "length_m": length_m,
+            "seed": seed,
+            "clutter": _CLUTTER,
+            "start_m": start_m,
+            "lidar": {"rate_hz": _RATE_HZ, "columns": _COLUMNS},
+            "depth": {"rate_hz": _RATE_HZ},
+        }
+    )
+
+
+@cache
+def digest_of_drive(scan: Path, drive: Drive) -> str:
+    """Twelve hexadecimal digits that change with the scan, the drive and the simulation."""
+    sources = digest_of_sources((Path(simulate.__file__).parent, Path(__file__)))
+    shown = hashlib.sha256(f"{sources} {drive}".encode() + scan.read_bytes())
+    return shown.hexdigest()[:12]

@@ -9,30 +9,44 @@ from typing import Any
 
 import numpy as np
 
-from pc2grid.arrays import F64
-from pc2grid.geometry import SE2
+from pc2grid.geometry import F64, SE2
 from pc2grid.io import open_log
 from pc2grid.model import OccupancyGrid, Trajectory
+from pc2grid.observer import TimeSpan
 from pc2grid.pipeline import follow
-from pc2grid.time_span import TimeSpan
-from pc2grid_lab.experiments.frames import nearest
-from pc2grid_lab.experiments.recordings.agreement import Clue, Frame, agreed_frame, is_right
 from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
-from pc2grid_lab.experiments.recordings.children import Finished, kept
-from pc2grid_lab.experiments.recordings.clouds import cloud_along, registered_clouds
-from pc2grid_lab.experiments.recordings.drive import (
+from pc2grid_lab.experiments.recordings.kidnaps import Followed, FollowedJudge
+from pc2grid_lab.experiments.recordings.rows import (
+    MISSING,
+    NOT_RUN,
+    PairRow,
+    QueryRow,
+    Table,
+    Truth,
+    map_row,
+    said,
+)
+from pc2grid_lab.experiments.recordings.run import (
+    Finished,
+    Folder,
     config_of,
     drive_of,
     grids,
     hits_at,
+    kept,
     known_share,
     sessions,
 )
-from pc2grid_lab.experiments.recordings.kidnaps import Followed, FollowedJudge
-from pc2grid_lab.experiments.recordings.mapped import MISSING, map_row, said
-from pc2grid_lab.experiments.recordings.rows import NOT_RUN, PairRow, QueryRow, Table, Truth
-from pc2grid_lab.experiments.recordings.run import Folder
 from pc2grid_lab.experiments.trial import JUDGEMENT
+from pc2grid_lab.experiments.truth import (
+    Clue,
+    Frame,
+    agreed_frame,
+    cloud_along,
+    is_right,
+    nearest,
+    registered_clouds,
+)
 from signature.database import open_database
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import check_pose

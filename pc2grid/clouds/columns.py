@@ -1,0 +1,528 @@
+"""The last metres in space as columns of cells, out of which planar scans are cut.
+
+Where a surface is measured a cell is hit, and along the ray to it cells are free. What a column is follows
+from its cells between the floor and 1.8 m: a wall is occupied over most of the height that was observed; a
+table, a chair or a lintel only in a part of it, while rays pass over it. The planar scan of a place is what
+is visible from there: the walls, and how far the floor before them is known. So one view of a tilted camera
+shows the wall above it and the floor below it that other views have seen.
+
+Hornung et al., "OctoMap" (2013) for the evidence; memory is that of the window, whatever the length.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan, mean_per_cell, planar_normals
+from pc2grid.geometry import F32, F64, I64, SE2, U8
+from pc2grid.model import SENSOR_MODELS, SLICE_BORDERS_M, SLICES, SensorKind
+from pc2grid.settings import ProjectionConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ColumnParameters:
+    """Numbers of the columns. Chosen by hand, unless noted.
+
+    layer_m : height of a cell. layers : of the window, most of them below the sensor.
+    below : share of the layers that lie below the sensor.
+    hit, miss : evidence of a scan for a surface in a cell, and against. limits : of the evidence, so that
+        what has gone is forgotten after a few scans.
+    margin_m, margin_sigmas : a ray ends so far before its point, and this many standard deviations of it.
+    wall_share, wall_layers : a wall is occupied in so large a share of the observed cells between
+        `band_min_m` and `band_max_m`, and in so many at least.
+    over : what rays pass over in so many layers is no wall but a thing. Walls reach up as far as they are
+        observed: of the columns of a real room, walls have 0 or 1 such layers, chairs and persons 2 to 6.
+    gap_m : unknown ground that free ground continues behind.
+    depth_m : thickness of a wall that becomes one line; the noise of the sensor comes on top.
+    """
+
+    layer_m: float = 0.1
+    layers: int = 48
+    below: float = 0.6
+    hit: int = 2
+    miss: int = 1
+    limits: tuple[int, int] = (-6, 12)
+    margin_m: float = 0.1
+    margin_sigmas: float = 2.0
+    wall_share: float = 0.5
+    wall_layers: int = 3
+    over: int = 2
+    gap_m: float = 0.3
+    depth_m: float = 0.1
+
+
+COLUMNS = ColumnParameters()
+_STAMPS = 250
+"""Scans after which the stamps of cells begin again; they are of one byte."""
+
+
+class ColumnMap:
+    """The columns around a sensor, in the session frame (z up).
+
+    reach_m : from the sensor; what lies beyond is forgotten.
+    """
+
+    def __init__(
+        self,
+        reach_m: float,
+        sensor: SensorKind,
+        config: ProjectionConfig,
+        parameters: ColumnParameters = COLUMNS,
+    ) -> None:
+        self._reach_m, self._config, self._parameters = reach_m, config, parameters
+        self._noise_per_m2 = SENSOR_MODELS[sensor].noise_per_m2
+        size = 2 * math.ceil(1.25 * reach_m / config.resolution_m)
+        self._evidence = np.zeros((size, size, parameters.layers), np.int8)
+        self._seen = np.zeros((size, size, parameters.layers), np.uint8)
+        self._touched = np.zeros((size, size), np.uint8)
+        self._columns = np.zeros((2, size, size), np.uint8)  # what each is, and its heights (`SLICES`)
+        self._sums = np.zeros((size, size, 3), np.float32)
+        self._low: I64 = np.zeros(3, np.int64)  # lowest cell of the window
+        self._stamp = 0
+        self._floor_m = math.nan  # z of the floor that the states are for
+
+    def add(self, points_m: F64, rays_m: F64, sensor_m: F64, floor_m: float, doubt_m: float = 0.0) -> None:
+        """Enter a scan at its place in the session frame.
+
+        points_m : (N, 3) returns. rays_m : (M, 3) of these, those whose rays clear what is before them.
+        sensor_m : (3,) origin of the rays. floor_m : z of the floor. doubt_m : the floor may lie higher or
+        lower by so much: what is there is no obstacle.
+        """
+        p, edge_m = self._parameters, self._config.resolution_m
+        self._center(sensor_m)
+        self._stamp += 1
+        if self._stamp > _STAMPS:
+            self._stamp = 1
+            self._seen[:] = 0
+            self._touched[:] = 0
+        cell, margin = (edge_m, p.layer_m), (p.margin_m, p.margin_sigmas * self._noise_per_m2)
+        observe_points(
+            self._evidence, self._seen, self._touched, self._sums, self._low, points_m, cell,
+            self._band_m(floor_m), self._stamp, p.hit, p.limits[1],
+        )  # fmt: skip
+        observe_rays(
+            self._evidence, self._seen, self._touched, self._low, rays_m, sensor_m, cell, margin,
+            self._stamp, p.miss, p.limits[0],
+        )  # fmt: skip
+        same_floor = abs(floor_m - self._floor_m) < 0.5 * p.layer_m
+        if not same_floor:
+            self._floor_m = floor_m
+        low, high = (round(z / p.layer_m) for z in self._band_m(self._floor_m))
+        floor, doubt = math.floor(self._floor_m / p.layer_m), round(doubt_m / p.layer_m)
+        first, second = (round((self._floor_m + border_m) / p.layer_m) for border_m in SLICE_BORDERS_M)
+        changed = self._stamp if same_floor else 0
+        classify(
+            self._evidence, self._columns[0], self._columns[1], self._touched, self._sums, self._low, changed,
+            (floor - 1 - doubt, floor + 2 + doubt), (low + doubt, high), (first, second), p.wall_share,
+            p.wall_layers, p.over,
+        )  # fmt: skip
+
+    def cut(self, T_session_base: SE2, sensor_m: F64, stamp_ns: int) -> PlanarScan:
+        """The planar scan at a place: what a sensor at (3,), session frame, sees of walls and floor.
+
+        T_session_base : planar pose of the base, in whose frame the planar scan is.
+        """
+        p, pose = self._parameters, T_session_base
+        to_base = pose.inverse()
+        origin = to_base.apply(sensor_m[None, :2])[0]
+        if not self._stamp:
+            nothing = np.empty((0, 2), np.float32)
+            return PlanarScan.of_hits(
+                stamp_ns=stamp_ns, hits_m=nothing, origin_m=origin, free_m=np.zeros(BEARINGS, np.float32)
+            )
+        edge_m = self._config.resolution_m
+        free_m, sums, low_m = view(
+            self._columns[0], self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m, edge_m, p.gap_m,
+            (p.depth_m, 4.0 * self._noise_per_m2), BEARINGS,
+        )  # fmt: skip
+        walls_m = mean_per_cell(sums, edge_m) if len(sums) else low_m[:0]
+        hits: F32 = to_base.apply(walls_m).astype(np.float32)
+        return PlanarScan(
+            stamp_ns=stamp_ns,
+            hits_m=hits,
+            normal_rad=planar_normals(hits, origin),
+            origin_m=origin,
+            free_m=free_m.astype(np.float32),
+            low_m=to_base.apply(low_m).astype(np.float32),
+            heights=self._heights_at(np.concatenate((walls_m, low_m))),
+        )
+
+    def agreement(self, points_m: F64) -> tuple[float, float]:
+        """How points (N, 3), session frame, agree with surfaces and observed free space, -1..1.
+
+        The share of points on surfaces less that in free space: of the points in observed cells, and of all
+        in the window.
+        """
+        if not self._stamp:
+            return 0.0, 0.0
+        cell = self._config.resolution_m, self._parameters.layer_m
+        met, against, inside = agreement(self._evidence, self._low, points_m, cell)
+        return (met - against) / max(met + against, 1), (met - against) / max(inside, 1)
+
+    def walls(self, sigma_m: float) -> tuple[F32, F64]:
+        """The likelihood field (H, W), 0..1, of what stands, rows along y, and the corner (2,) of it."""
+        edge_m = self._config.resolution_m
+        walls = np.roll(self._columns[0] >= LOW, (-self._low[:2] % self._columns.shape[1]).tolist(), (0, 1)).T
+        away_m = edge_m * cv2.distanceTransform((~walls).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
+        field: F32 = np.exp(np.float32(-0.5 / sigma_m**2) * away_m**2)
+        return field, edge_m * self._low[:2].astype(np.float64)
+
+    def _heights_at(self, points_m: F64) -> U8:
+        """The heights (N,) of the columns of points (N, 2), session frame; see `pc2grid.model.SLICES`."""
+        column, row = (
+            np.floor(points_m.T / self._config.resolution_m).astype(np.int64) % self._columns.shape[1]
+        )
+        return np.asarray(self._columns[1, column, row], np.uint8)
+
+    def _band_m(self, floor_m: float) -> tuple[float, float]:
+        return floor_m + self._config.band_min_m, floor_m + self._config.band_max_m
+
+    def _center(self, sensor_m: F64) -> None:
+        """Move the window if the sensor is no longer near its middle."""
+        p, edge_m = self._parameters, self._config.resolution_m
+        size = self._columns.shape[1]
+        cell = np.array([edge_m, edge_m, p.layer_m])
+        half = np.array([size // 2, size // 2, round(p.below * p.layers)])
+        low = np.floor(sensor_m / cell).astype(np.int64) - half
+        if not self._stamp:
+            self._low = low
+        slack = np.array([size // 10, size // 10, p.layers // 10])
+        if (np.abs(low - self._low) > slack).any():
+            clear(self._evidence, self._sums, self._low, low)
+            self._low = low
+            self._floor_m = math.nan  # states are made again
+
+
+UNKNOWN, FREE, LOW, WALL = 0, 1, 2, 3
+"""What a column is."""
+
+
+@njit(cache=True)
+def clear(evidence: NDArray[np.int8], sums: F32, low: I64, new: I64) -> None:
+    """Forget the cells that leave the window when its lowest indices (3,) change from `low` to `new`."""
+    size, layers = evidence.shape[0], evidence.shape[2]
+    for i in range(new[0], new[0] + size):
+        for j in range(new[1], new[1] + size):
+            if not (low[0] <= i < low[0] + size and low[1] <= j < low[1] + size):
+                evidence[i % size, j % size] = 0
+                sums[i % size, j % size] = 0.0
+    for k in range(new[2], new[2] + layers):
+        if not low[2] <= k < low[2] + layers:
+            evidence[:, :, k % layers] = 0
+
+
+@njit(cache=True)
+def observe_points(
+    evidence: NDArray[np.int8],
+    seen: NDArray[np.uint8],
+    touched: NDArray[np.uint8],
+    sums: F32,
+    low: I64,
+    points: F64,
+    cell: tuple[float, float],
+    band: tuple[float, float],
+    stamp: int,
+    hit: int,
+    most: int,
+) -> None:
+    """Enter a hit where the points (N, 3) of a scan lie, one a cell and scan.
+
+    evidence, seen : (W, W, L), `seen` is the stamp of the last scan that entered a cell. touched : (W, W) the
+    same of columns. sums : (W, W, 3) sums of x and y, relative to the column's corner, of the points in the
+    band, and their number. cell : edge and height of a cell. band : lowest and highest z of an obstacle.
+    """
+    size, layers = evidence.shape[0], evidence.shape[2]
+    edge, height = cell
+    for n in range(len(points)):
+        i, j = math.floor(points[n, 0] / edge), math.floor(points[n, 1] / edge)
+        k = math.floor(points[n, 2] / height)
+        if not (_within(low, size, i, j) and low[2] <= k < low[2] + layers):
+            continue
+        a, b, c = i % size, j % size, k % layers
+        if seen[a, b, c] != stamp:
+            seen[a, b, c] = stamp
+            evidence[a, b, c] = min(evidence[a, b, c] + hit, most)
+            touched[a, b] = stamp
+        if band[0] <= points[n, 2] <= band[1]:
+            if sums[a, b, 2] >= 200.0:
+                for m in range(3):
+                    sums[a, b, m] *= 0.5
+            sums[a, b, 0] += points[n, 0] - i * edge
+            sums[a, b, 1] += points[n, 1] - j * edge
+            sums[a, b, 2] += 1.0
+
+
+@njit(cache=True)
+def observe_rays(
+    evidence: NDArray[np.int8],
+    seen: NDArray[np.uint8],
+    touched: NDArray[np.uint8],
+    low: I64,
+    rays: F64,
+    sensor: F64,
+    cell: tuple[float, float],
+    margin: tuple[float, float],
+    stamp: int,
+    miss: int,
+    least: int,
+) -> None:
+    """Enter a miss along the rays of a scan to points (M, 3) where it has no hit, one a cell and scan.
+
+    The others as for `observe_points`. margin : (a, b), a ray ends a + b * range^2 before its point.
+    """
+    size, layers = evidence.shape[0], evidence.shape[2]
+    edge, height = cell
+    for n in range(len(rays)):
+        dx, dy, dz = rays[n, 0] - sensor[0], rays[n, 1] - sensor[1], rays[n, 2] - sensor[2]
+        away = math.sqrt(dx * dx + dy * dy + dz * dz)
+        steps = int((away - margin[0] - margin[1] * away * away) / edge)
+        dx, dy, dz = dx / away * edge, dy / away * edge, dz / away * edge
+        for step in range(steps):
+            i = math.floor((sensor[0] + step * dx) / edge)
+            j = math.floor((sensor[1] + step * dy) / edge)
+            k = math.floor((sensor[2] + step * dz) / height)
+            if not _within(low, size, i, j):
+                break
+            if not low[2] <= k < low[2] + layers:
+                continue
+            a, b, c = i % size, j % size, k % layers
+            if seen[a, b, c] != stamp:
+                seen[a, b, c] = stamp
+                evidence[a, b, c] = max(evidence[a, b, c] - miss, least)
+                touched[a, b] = stamp
+
+
+@njit(cache=True)
+def _within(low: I64, size: int, i: int, j: int) -> bool:
+    """Whether the column (i, j) of the map is one of the window."""
+    inside: bool = low[0] <= i < low[0] + size and low[1] <= j < low[1] + size
+    return inside
+
+
+@njit(cache=True)
+def classify(
+    evidence: NDArray[np.int8],
+    state: NDArray[np.uint8],
+    heights: NDArray[np.uint8],
+    touched: NDArray[np.uint8],
+    sums: F32,
+    low: I64,
+    stamp: int,
+    ground: tuple[int, int],
+    band: tuple[int, int],
+    borders: tuple[int, int],
+    share: float,
+    least: int,
+    over: int,
+) -> None:
+    """Write the state (W, W) of the columns that carry a stamp; 0: of all. And of those with an obstacle the
+    heights (W, W), see `pc2grid.model.SLICES`.
+
+    ground, band : of the first and behind the last layer of the floor, and of an obstacle.
+    borders : of the first layer of each slice but the lowest. A wall is occupied in at least `least` layers,
+    and in so large a `share` of those that were observed, and less than `over` layers above it were observed
+    to be free.
+    """
+    size, layers = evidence.shape[0], evidence.shape[2]
+    band = max(band[0], low[2]), min(band[1], low[2] + layers)
+    ground = max(ground[0], low[2]), min(ground[1], low[2] + layers)
+    for a in range(size):
+        for b in range(size):
+            if stamp == 0 or touched[a, b] == stamp:
+                measured = sums[a, b, 2] > 0
+                state[a, b], heights[a, b] = _column(
+                    evidence[a, b], ground, band, borders, share, least, over, measured
+                )
+
+
+@njit(cache=True)
+def _column(
+    evidence: NDArray[np.int8],
+    ground: tuple[int, int],
+    band: tuple[int, int],
+    borders: tuple[int, int],
+    share: float,
+    least: int,
+    over: int,
+    measured: bool,
+) -> tuple[int, int]:
+    """State and heights of a column by the evidence (L,) in its cells.
+
+    ground, band : the first and behind the last layer of the floor, and of an obstacle. measured : whether
+    points tell where a wall is.
+    """
+    layers = len(evidence)
+    occupied, free, passed_over = 0, 0, 0
+    filled, empty = 0, 0
+    for k in range(band[0], band[1]):
+        value = evidence[k % layers]
+        slice_bit = 1 << ((k >= borders[0]) + (k >= borders[1]))
+        filled |= slice_bit * (value > 0)
+        empty |= slice_bit * (value < 0)
+        occupied += value > 0
+        free += value < 0
+        passed_over = 0 if value > 0 else passed_over + (value < 0)
+    if occupied:
+        tall = occupied >= least and passed_over < over
+        is_wall = tall and measured and occupied >= share * (occupied + free)
+        return WALL if is_wall else LOW, filled | (empty & ~filled) << SLICES
+    for k in range(ground[0], ground[1]):
+        free += evidence[k % layers] > 0
+    return FREE if free else UNKNOWN, 0
+
+
+@njit(cache=True)
+def view(
+    state: NDArray[np.uint8],
+    sums: F32,
+    low: I64,
+    origin: F64,
+    turn: float,
+    reach: float,
+    edge: float,
+    gap: float,
+    depth: tuple[float, float],
+    bearings: int,
+) -> tuple[F64, F64, F64]:
+    """What a place (2,) sees of the columns: the first wall along each bearing, and the floor before it.
+
+    turn : direction of the first bearing, radians. gap : unknown ground wider than this ends what is free.
+    depth : (d, q), walls behind the first one are part of it up to d + q * range^2.
+
+    Returns how far each bearing is free (0: not at all), for each wall the sums of x, y and 1 of its points
+    (S, 3), by increasing bearing, and the low columns passed (K, 2), each once, as their middles.
+    """
+    size = state.shape[0]
+    free_m = np.zeros(bearings)
+    walls = np.empty((bearings, 3))
+    passed = np.zeros((size, size), np.uint8)
+    found = 0
+    lows = np.empty((size * size, 2))
+    count = 0
+    for bearing in range(bearings):
+        angle = turn + bearing * (2.0 * math.pi / bearings)
+        along = (math.cos(angle), math.sin(angle))
+        free, first, count = _first_wall(state, low, origin, along, reach, edge, gap, passed, lows, count)
+        if first >= 0.0:
+            if first - free <= gap:
+                free = max(first - 0.5 * edge, free)
+            thick = depth[0] + depth[1] * first * first
+            sx, sy, total = _wall(state, sums, low, origin, along, first, thick, reach, edge)
+            walls[found, 0], walls[found, 1], walls[found, 2] = sx, sy, total
+            found += 1
+        free_m[bearing] = free
+    return free_m, walls[:found].copy(), lows[:count].copy()
+
+
+@njit(cache=True)
+def _first_wall(
+    state: NDArray[np.uint8],
+    low: I64,
+    origin: F64,
+    along: tuple[float, float],
+    reach: float,
+    edge: float,
+    gap: float,
+    passed: NDArray[np.uint8],
+    lows: F64,
+    count: int,
+) -> tuple[float, float, int]:
+    """How far a bearing is free, the range of its first wall (-1: none), and how many low columns are passed.
+
+    passed : (W, W), whether a low column was passed before. lows : gets the middles of those that were not.
+    """
+    size = state.shape[0]
+    free, known = 0.0, False
+    last_a, last_b = -1, -1
+    r = 0.0
+    while r < reach:
+        r += 0.5 * edge
+        i, j = math.floor((origin[0] + r * along[0]) / edge), math.floor((origin[1] + r * along[1]) / edge)
+        if not _within(low, size, i, j):
+            break
+        a, b = i % size, j % size
+        if a == last_a and b == last_b:
+            continue
+        last_a, last_b = a, b
+        if state[a, b] == WALL:
+            return free, r, count
+        if state[a, b] == UNKNOWN:
+            if known and r - free > gap:
+                break
+            continue
+        known, free = True, r
+        if state[a, b] == LOW and not passed[a, b]:
+            passed[a, b] = 1
+            lows[count, 0], lows[count, 1] = (i + 0.5) * edge, (j + 0.5) * edge
+            count += 1
+    return free, -1.0, count
+
+
+@njit(cache=True)
+def _wall(
+    state: NDArray[np.uint8],
+    sums: F32,
+    low: I64,
+    origin: F64,
+    along: tuple[float, float],
+    first: float,
+    thick: float,
+    reach: float,
+    edge: float,
+) -> tuple[float, float, float]:
+    """The sums of x, y and 1 of the points of a wall that begins at the range `first` and is so thick."""
+    size = state.shape[0]
+    sx = sy = total = 0.0
+    last_a, last_b = -1, -1
+    r = first
+    while True:
+        i, j = math.floor((origin[0] + r * along[0]) / edge), math.floor((origin[1] + r * along[1]) / edge)
+        a, b = i % size, j % size
+        new = a != last_a or b != last_b
+        last_a, last_b = a, b
+        if not _within(low, size, i, j) or (new and r - first > thick):
+            return sx, sy, total
+        if new and state[a, b] == WALL:
+            total += sums[a, b, 2]
+            sx += sums[a, b, 0] + i * edge * sums[a, b, 2]
+            sy += sums[a, b, 1] + j * edge * sums[a, b, 2]
+        if r >= reach:
+            return sx, sy, total
+        r += 0.5 * edge
+
+
+@njit(cache=True)
+def agreement(
+    evidence: NDArray[np.int8], low: I64, points: F64, cell: tuple[float, float]
+) -> tuple[int, int, int]:
+    """How many of points (N, 3) lie in or beside a cell with a surface, how many where rays have passed,
+    and how many lie in the window."""
+    size, layers = evidence.shape[0], evidence.shape[2]
+    met, against, inside = 0, 0, 0
+    for n in range(len(points)):
+        i, j = math.floor(points[n, 0] / cell[0]), math.floor(points[n, 1] / cell[0])
+        k = math.floor(points[n, 2] / cell[1])
+        if not (
+            low[0] < i < low[0] + size - 1
+            and low[1] < j < low[1] + size - 1
+            and low[2] < k < low[2] + layers - 1
+        ):
+            continue
+        inside += 1
+        here = evidence[i % size, j % size, k % layers]
+        best = here
+        for a in range(-1, 2):
+            for b in range(-1, 2):
+                for c in range(-1, 2):
+                    best = max(best, evidence[(i + a) % size, (j + b) % size, (k + c) % layers])
+        if best > 0:
+            met += 1
+        elif here < 0:
+            against += 1
+    return met, against, inside

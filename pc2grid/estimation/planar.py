@@ -1,0 +1,263 @@
+"""A sensor on wheels: KISS-ICP brings a scan near, point-to-line matching in the plane places it.
+
+KISS-ICP in space has a wide reach. A scan in the plane knows the pose to millimetres, but only across the
+walls that it shows; how far it knows each direction is measured, and the smoother does the rest.
+
+The local maps that a scan is matched with: the last metres of travel, as grids of point moments.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterator
+
+import numpy as np
+
+from pc2grid.clouds.planar_scan import DepthLimit, PlanarScan, project_to_plane
+from pc2grid.estimation.ground_model import GroundModel
+from pc2grid.estimation.line_map import (
+    CAMERA_MATCHING,
+    MATCHING_PARAMETERS,
+    TRACKING_PARAMETERS,
+    Match,
+    MatchingParameters,
+    PointGrid,
+    TrackingParameters,
+    best_placements,
+    evenly,
+)
+from pc2grid.estimation.placing import Estimate, Fit
+from pc2grid.estimation.registration import KissRegistration
+from pc2grid.estimation.smoother import KERNEL, PLANAR, Belief
+from pc2grid.geometry import F32, F64, SE2
+from pc2grid.model import SENSOR_MODELS, Scan
+from pc2grid.settings import ProjectionConfig, RegistrationConfig
+
+
+class SensorOnWheels:
+    """Places the scans of a sensor whose base stands on the floor."""
+
+    free = PLANAR
+
+    def __init__(
+        self,
+        registration: RegistrationConfig,
+        projection: ProjectionConfig,
+        parameters: TrackingParameters = TRACKING_PARAMETERS,
+    ) -> None:
+        self._registration, self._projection, self._parameters = registration, projection, parameters
+        self._depth_limit = DepthLimit()
+        self._floor = GroundModel(None, parameters)
+        self._matching = MATCHING_PARAMETERS
+        self._maps = MatchingMaps(projection.max_range_m, parameters)
+        self._kiss = KissRegistration(registration)
+        # Of the scan taken last: in the plane, its points without the floor, whether it has no odometry.
+        self._planar_scan: PlanarScan
+        self._points_m, self._unaided = np.empty((0, 3), np.float32), True
+        self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)
+
+    def start(self, scan: Scan, points_m: F32) -> F64:
+        """See `PlacingSensor`."""
+        self._floor = GroundModel.start(points_m, scan, self._parameters)
+        narrow = SENSOR_MODELS[scan.sensor].narrow  # the sensor sees a part of its surroundings only
+        self._matching = CAMERA_MATCHING if narrow else MATCHING_PARAMETERS
+        self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
+        self._points_m = self._floor.remove(points_m)
+        self._planar_scan = self._project(scan, points_m)
+        return self.levelled(np.eye(4))
+
+    def restart(self) -> None:
+        """Forget the local maps: the next keyframe begins new ones."""
+        self._maps.restart()
+        self._kiss = KissRegistration(self._registration)
+
+    def levelled(self, pose: F64) -> F64:
+        """A pose (4, 4) in the plane with tilt and height from the floor: walls alone let them drift."""
+        return pose @ self._floor.T_level_base()
+
+    def __bool__(self) -> bool:
+        """Whether there is a local map."""
+        return bool(self._maps)
+
+    def take(self, scan: Scan, points_m: F32) -> None:
+        """See `PlacingSensor`."""
+        self._floor.follow(points_m, scan)
+        self._points_m = self._floor.remove(points_m)
+        self._planar_scan, self._unaided = self._project(scan, points_m), scan.T_odom_base is None
+
+    def match(self, belief: Belief) -> list[Fit]:
+        """See `PlacingSensor`. Along a corridor KISS-ICP tends to stand still, scan after scan, so what was
+        expected is always beside it."""
+        expected = self.levelled(belief.pose)
+        starts = self._kiss.register(self._points_m, expected), expected
+        return [self._matched(self._maps, SE2.from_matrix(start), belief) for start in starts]
+
+    def search(self, belief: Belief) -> Iterator[Fit]:
+        """See `PlacingSensor`."""
+        p, (sigma_m, sigma_rad), prior = self._parameters, belief.sigmas, SE2.from_matrix(belief.pose)
+        window = min(KERNEL * sigma_m, p.search_most_m), min(KERNEL * sigma_rad, math.pi)
+        for guess in self._maps.search(self._planar_scan, prior, *window):
+            yield self._matched(self._maps, guess, belief)
+
+    def held(self, fit: Fit) -> Fit:
+        """Lines hold what lies on them."""
+        return fit
+
+    def follow(self, belief: Belief) -> Estimate | None:
+        """See `PlacingSensor`. Half of what a camera sees while it turns may be new to the map, but not to
+        the scans before. Odometry is trusted more."""
+        if not self._unaided:
+            return None
+        fit = self._matched_with_last(belief)
+        at, information = fit.alone
+        motion = self._last.inverse() @ SE2.from_matrix(at)
+        return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible else None
+
+    def fits_last(self, belief: Belief) -> bool:
+        """See `PlacingSensor`."""
+        fit = self._matched_with_last(belief)
+        return fit.credible and fit.measured
+
+    def _matched_with_last(self, belief: Belief) -> Fit:
+        """The planar scan matched with a map of the last scans alone."""
+        last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
+        for before, pose in self._latest:
+            last.extend(before, pose)
+        return self._matched(last, SE2.from_matrix(belief.pose), belief)
+
+    def _matched(self, maps: MatchingMaps, guess: SE2, belief: Belief) -> Fit:
+        """The planar scan matched with local maps from a guess, held to a belief.
+
+        Ground that the map does not know speaks neither for nor against a placement: what lies there counts
+        as if it fitted no better than a scan must. Else a scan that shows much new ground, at a short range
+        or after a long step, would fit best where the scan before was taken.
+        """
+        p, prior = self._parameters, SE2.from_matrix(belief.pose)
+        information = _turned(belief.information, -prior.yaw)  # in the axes of the session frame
+        match = maps.match(self._planar_scan, guess, prior, information)
+        unknown = 1.0 - match.overlap - match.contradicted
+        return Fit(
+            pose=match.pose.lift(),
+            alone=(match.by_points.lift(), _turned(match.information, match.by_points.yaw)),
+            overlap=match.overlap,
+            measured=match.measured,
+            evidence=self._weight * (match.overlap + p.sure_overlap * unknown),
+            credible=match.overlap >= p.sure_overlap,
+        )
+
+    @property
+    def _last(self) -> SE2:
+        """The final pose of the scan before."""
+        return self._latest[-1][1]
+
+    @property
+    def _weight(self) -> float:
+        """What the scan taken last tells if it fits without any error."""
+        p = self._parameters
+        return p.hit_weight * min(len(self._planar_scan.hits_m), p.matched_hits)
+
+    def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
+        """The planar scan of the scan taken last."""
+        del scan, points_m, lost
+        self._latest.append((self._planar_scan, SE2.from_matrix(pose)))
+        return self._planar_scan
+
+    def extend(self, pose: F64) -> None:
+        """Add the scan taken last to the local maps at its final pose (4, 4)."""
+        self._maps.extend(self._planar_scan, SE2.from_matrix(pose))
+        self._kiss.add(self._points_m, pose)
+
+    def _project(self, scan: Scan, points_m: F32) -> PlanarScan:
+        """Reduce points (N, 3) of the base frame to the plane."""
+        T_level_base = self._floor.T_level_base()
+        noisy = SENSOR_MODELS[scan.sensor].noise_per_m2 > 0.0
+        if noisy:
+            self._depth_limit.observe(points_m, scan.T_base_sensor)
+        sensor_m, ground = scan.T_base_sensor[:3, 3], self._floor.ground
+        if ground is not None:
+            R = T_level_base.copy()
+            R[:3, 3] = 0.0  # a planar scan keeps the base's own origin; heights are relative to the ground
+            points_m = points_m @ R[:3, :3].T.astype(np.float32)
+            sensor_m, ground = R[:3, :3] @ sensor_m, ground.moved(R)
+        planar_scan = project_to_plane(
+            points_m,
+            stamp_ns=scan.stamp_ns,
+            sensor_m=sensor_m,
+            ground=ground,
+            config=self._projection,
+            sensor=scan.sensor,
+        )
+        if not noisy:
+            return planar_scan
+        return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
+
+
+def _turned(matrix: F64, yaw_rad: float) -> F64:
+    """A covariance or information (3, 3) of x, y, yaw in axes that are turned."""
+    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
+    R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    turned: F64 = R @ matrix @ R.T
+    return turned
+
+
+class MatchingMaps:
+    """Two overlapping local maps: scans are matched with the older one, and the younger replaces it in time.
+
+    reach_m : range of the hits of a scan. matching : numbers of the matching, which depend on the sensor.
+    """
+
+    def __init__(
+        self,
+        reach_m: float,
+        parameters: TrackingParameters = TRACKING_PARAMETERS,
+        matching: MatchingParameters = MATCHING_PARAMETERS,
+    ) -> None:
+        self._half_m = reach_m + 2.0 * parameters.map_travel_m
+        self._parameters = parameters
+        self._matching = matching
+        self._maps: list[tuple[PointGrid, float]] = []  # each with the travel at which it was begun
+        self._last: SE2 | None = None  # where a scan was added last
+        self._travel_m = 0.0
+
+    def __bool__(self) -> bool:
+        return bool(self._maps)
+
+    def search(self, planar_scan: PlanarScan, guess: SE2, window_m: float, window_rad: float) -> list[SE2]:
+        """Return the best placements of a planar scan around a guess T_session_base, to be refined."""
+        p, grid = self._parameters, self._maps[0][0]
+        hits = planar_scan.hits_m[evenly(len(planar_scan.hits_m), p.matched_hits)].astype(np.float64)
+        field = grid.likelihood(p.search_sigma_m)
+        found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
+        return [pose for _, pose in found]
+
+    def match(self, planar_scan: PlanarScan, near: SE2, prior: SE2, information: F64) -> Match:
+        """Match a planar scan that has been brought near where it fits, T_session_base.
+
+        prior, information : pose that the result is held to, and its information (3, 3) of x, y, yaw.
+        """
+        grid = self._maps[0][0]
+        chosen = evenly(len(planar_scan.hits_m), self._parameters.matched_hits)
+        hits, normals = planar_scan.hits_m[chosen], planar_scan.normal_rad[chosen]
+        guess = grid.weighed(hits, normals, near, prior, information)
+        return grid.match(hits, normals, guess, prior, information)
+
+    def extend(self, planar_scan: PlanarScan, pose: SE2) -> None:
+        """Add a planar scan at its final pose T_session_base."""
+        if self._last is not None:
+            step = self._last.inverse() @ pose
+            self._travel_m += math.hypot(step.x, step.y)
+        self._last = pose
+        if not self._maps or self._travel_m - self._maps[-1][1] > self._parameters.map_travel_m:
+            middle = np.array([pose.x, pose.y])
+            low_m, high_m = middle - self._half_m, middle + self._half_m
+            self._maps.append((PointGrid(low_m, high_m, parameters=self._matching), self._travel_m))
+        if len(self._maps) > 2:
+            del self._maps[0]
+        for grid, _ in self._maps:
+            grid.add(pose.apply(planar_scan.hits_m), planar_scan.normal_rad + pose.yaw)
+            grid.clear(pose.apply(planar_scan.free_polygon()))
+
+    def restart(self) -> None:
+        """Forget the maps: the next scan begins new ones."""
+        self._maps, self._last = [], None

@@ -1,0 +1,446 @@
+"""A carried sensor: followed in space, and reduced to the plane by the map of its last metres.
+
+A narrow, tilted, noisy view shows neither where the floor is nor what is a wall. So each scan is registered
+to what was seen before, by KISS-ICP and then by the shapes of the surfaces, with the odometry of the device,
+where there is one, as what it is: six degrees of freedom that drift. The planar scan is cut out of the map
+(`SpaceMap`). A scan that does not fit is searched for in all headings, and what then agrees with the surfaces
+and the free space of the map is believed, else it is lost.
+
+The local map of a carried sensor in space: its surfaces, its columns, and the floor in them.
+
+The registered clouds of the last metres are fused in two ways: as shapes that scans are registered to
+(`SurfaceMap`), and as columns of occupied and free cells that planar scans are cut out of (`ColumnMap`).
+Memory is that of the surroundings, whatever the length.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import chain, islice
+
+import numpy as np
+
+from pc2grid.clouds.columns import ColumnMap
+from pc2grid.clouds.ground import LEVEL, FloorBelow, level_floor
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
+from pc2grid.estimation.line_map import (
+    TRACKING_PARAMETERS,
+    TrackingParameters,
+    best_placements,
+    evenly,
+    moved,
+    steps,
+)
+from pc2grid.estimation.placing import Estimate, Fit
+from pc2grid.estimation.smoother import KERNEL, SPATIAL, Belief
+from pc2grid.estimation.surface_map import SURFACES, Placement, SurfaceMap
+from pc2grid.geometry import F32, F64, SE2, BoolGrid, invert_pose, leveling, motion_size
+from pc2grid.model import SENSOR_MODELS, Scan
+from pc2grid.settings import ProjectionConfig, RegistrationConfig
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CarriedParameters:
+    """Numbers of carried sensors. Chosen by hand.
+
+    least_agreement : of a pose with what is known where the points lie, -1..1, that is credible. In a hall,
+        right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
+    residual_weight_per_m : of two placements the one with the larger agreement - weight * residual is taken.
+    starts : placements that a search refines in space. turned_rad : by how much these may be turned, a
+        standard deviation: more than a step of the search.
+    most_waiting : scans that wait for one that shows the floor, or for a motion, at most: some 50 MB.
+    standing_s : a base that stands level for so long is on wheels: a robot that waits to be located must not
+        wait for its own motion, and a hand has trembled by then.
+    """
+
+    least_agreement: float = 0.85
+    residual_weight_per_m: float = 5.0
+    starts: int = 10
+    turned_rad: float = 0.1
+    most_waiting: int = 100
+    standing_s: float = 5.0
+
+
+CARRIED = CarriedParameters()
+
+
+class CarriedSensor:
+    """Places the scans of a sensor in the hand, one after another, in the session frame: z up."""
+
+    free = SPATIAL
+
+    def __init__(
+        self,
+        registration: RegistrationConfig,
+        projection: ProjectionConfig,
+        parameters: CarriedParameters = CARRIED,
+        tracking: TrackingParameters = TRACKING_PARAMETERS,
+    ) -> None:
+        self._registration, self._projection = registration, projection
+        self._parameters, self._tracking = parameters, tracking
+        self._map: SpaceMap | None = None
+        self._last: F64 = np.eye(4)  # pose of the last scan that was not lost
+        self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0))  # the scan taken last
+
+    @property
+    def map(self) -> SpaceMap | None:
+        """The local map in space; None before the first scan and after `restart`."""
+        return self._map
+
+    def restart(self) -> None:
+        """Forget the map: the next scan begins a new one."""
+        self._map = None
+
+    def start(self, scan: Scan, points_m: F32) -> F64:
+        """See `PlacingSensor`."""
+        self.take(scan, points_m)
+        return first_pose(scan, points_m)
+
+    def levelled(self, pose: F64) -> F64:
+        """A pose (4, 4) in space has its tilt and its height already."""
+        return pose
+
+    def __bool__(self) -> bool:
+        """Whether there is a local map."""
+        return bool(self._map)
+
+    def take(self, scan: Scan, points_m: F32) -> None:
+        """See `PlacingSensor`."""
+        if self._map is None:
+            self._map = SpaceMap(scan, points_m, self._registration, self._projection)
+        self._thinned = self._map.thin(scan, points_m)
+
+    def match(self, belief: Belief) -> list[Fit]:
+        """See `PlacingSensor`."""
+        return [self._matched(belief.pose, belief)]
+
+    def search(self, belief: Belief) -> Iterator[Fit]:
+        """Match in all headings around the last pose, with its height and tilt.
+
+        A hand turns fast; then the predicted direction of the step says nothing.
+        """
+        p, t = self._parameters, self._tracking
+        step_m = float(np.linalg.norm(belief.pose[:3, 3] - self._last[:3, 3]))
+        window_m = min(step_m + KERNEL * belief.sigmas[0], t.search_most_m)
+        covariance = np.diag([window_m**2] * 3 + [p.turned_rad**2] * 3)
+        for guess in self._space.search(self._thinned, self._last, window_m, p.starts):
+            yield self._matched(guess, Belief(guess, covariance, belief.free))
+
+    def _matched(self, guess: F64, held: Belief) -> Fit:
+        """The scan taken last matched with the map from a guess (4, 4), held to a belief."""
+        space = self._space
+        found = space.match(self._thinned, guess, held)
+        of_known, of_all = space.agreement(self._thinned, found.pose)
+        quality = of_all - self._parameters.residual_weight_per_m * found.residual_m
+        return Fit(
+            pose=found.pose,
+            alone=_alone(found, held),
+            overlap=found.overlap,
+            measured=found.measured,
+            evidence=SURFACES.independent(len(self._thinned.points_m)) * quality,
+            credible=of_known >= self._parameters.least_agreement,
+        )
+
+    def held(self, fit: Fit) -> Fit:
+        """See `PlacingSensor`."""
+        alone, information = fit.alone
+        placement = Placement(fit.pose, information, fit.overlap, 0.0, fit.measured)
+        held = self._space.held(self._thinned, placement)
+        return replace(fit, alone=(alone, held.information), measured=held.measured)
+
+    def follow(self, belief: Belief) -> None:
+        """Nothing: the surfaces of the last scans are in the map."""
+
+    def fits_last(self, belief: Belief) -> bool:
+        """Not known: see `follow`."""
+        del belief
+        return False
+
+    def extend(self, pose: F64) -> None:
+        """Nothing: scans join the map in space oftener than keyframes begin, see `cut`."""
+
+    def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
+        """Add the scan taken last to the map at its final pose (4, 4), and cut its planar scan out of it.
+
+        The planar scan is in the levelled base frame.
+        """
+        if not lost:
+            self._space.extend(scan, points_m, self._thinned, pose)
+            self._last = pose
+        return self._space.cut(scan, pose)
+
+    @property
+    def _space(self) -> SpaceMap:
+        """The map, of which there is one as soon as a scan has been taken."""
+        if self._map is None:
+            raise ValueError("no scan has been taken")
+        return self._map
+
+
+def _alone(found: Placement, held: Belief) -> Estimate:
+    """The pose (4, 4) by the points alone, with its information (6, 6). held : what drew it aside."""
+    away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], found.pose[None]))
+    information = found.information + 1e-3 * np.eye(6)
+    change = np.linalg.solve(information, J.T @ held.information @ away)
+    return moved(found.pose[None], change[None])[0], information
+
+
+def first_pose(scan: Scan, points_m: F32) -> F64:
+    """T_session_base (4, 4) of the first scan of a carried sensor: the session frame is the base, levelled.
+
+    The vertical is that of the odometry, which has six degrees of freedom; else that of the floor in the
+    points (N, 3), unless an IMU contradicts it, which measures it less exactly; else that of the IMU, else
+    the z axis of the base.
+    """
+    if scan.T_odom_base is not None:
+        return leveling(scan.T_odom_base[2, :3])
+    ground = level_floor(scan, points_m)
+    if scan.T_level_base is not None:
+        up = scan.T_level_base[2, :3]
+        if ground is None or ground.normal @ up < LEVEL.level:
+            return leveling(up)
+    return np.eye(4) if ground is None else ground.leveling()
+
+
+@dataclass(frozen=True, slots=True)
+class Beginning:
+    """The first scans of a session, of which none is missing but those `left_out`.
+
+    in_hand : how the sensor is carried: in the hand, else on wheels. All stages are given this.
+    warning : what was left out, or assumed, as a sentence for the user; None: nothing.
+    """
+
+    scans: Sequence[Scan]
+    in_hand: bool = False
+    left_out: int = 0
+    warning: str | None = None
+
+
+def begin(scans: Iterator[Scan], parameters: CarriedParameters = CARRIED) -> Beginning:
+    """Look ahead until it is known how the sensor is carried, and in the hand, which way is up.
+
+    A session in the hand begins with the first scan that shows which way is up. If none of the first scans
+    does, all of them are kept: the sensor is taken to be held level.
+    """
+    ahead = islice(scans, parameters.most_waiting)
+    waiting, in_hand = _until_decided(ahead, parameters.standing_s)
+    if not in_hand:
+        return Beginning(waiting)
+    unknown = "no floor, and neither odometry nor an IMU says which way is up"
+    seen: list[Scan] = []
+    for scan in chain(waiting, ahead):
+        if _knows_vertical(scan):
+            said = f"{len(seen)} scans show {unknown}: they are left out; begin with the floor in view"
+            rest = [scan, *waiting[len(seen) + 1 :]]
+            return Beginning(rest, True, len(seen), said if seen else None)
+        seen.append(scan)
+    said = f"the scans show {unknown}: the sensor is taken to be held level; begin with the floor in view"
+    return Beginning(seen, True, warning=said)
+
+
+def _until_decided(scans: Iterator[Scan], standing_s: float) -> tuple[list[Scan], bool]:
+    """Take scans until they tell whether the sensor is in the hand; returns them, and whether it is.
+
+    A hand may be level for a moment. So only scans count after which the base has moved, or of which that is
+    not known; or a base that has stood for so long.
+    """
+    waiting: list[Scan] = []
+    moving = 0
+    for scan in scans:
+        waiting.append(scan)
+        if not is_rolling(scan, waiting[0]):
+            return waiting, True
+        moving += _has_moved(waiting[0], scan)
+        stands = not moving and scan.stamp_ns - waiting[0].stamp_ns > standing_s * 1e9
+        if SENSOR_MODELS[scan.sensor].planar or moving == DECIDING_SCANS or stands:
+            break
+    return waiting, False
+
+
+def _has_moved(first: Scan, scan: Scan) -> bool:
+    """Whether a base has moved since the first scan as far as makes a keyframe, unless that is not known."""
+    if first.T_odom_base is None or scan.T_odom_base is None:
+        return True
+    distance_m, turn_rad = motion_size(invert_pose(first.T_odom_base) @ scan.T_odom_base)
+    p = TRACKING_PARAMETERS
+    return distance_m >= p.keyframe_travel_m or turn_rad >= p.keyframe_turn_rad
+
+
+def _knows_vertical(scan: Scan) -> bool:
+    """Whether odometry, an IMU or a floor in view tells the vertical."""
+    known = scan.T_odom_base is not None or scan.T_level_base is not None
+    return known or level_floor(scan, scan.points_m) is not None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpaceMapParameters:
+    """Numbers of the local map in space. Chosen by hand.
+
+    noise_m : points whose deviation is larger are not used. good_m : points whose deviation is smaller count
+        fully when a scan is registered.
+    step_m, step_rad : a scan joins the map after this motion.
+    assumed_m : height of the sensor above the floor as long as no floor is seen.
+    search_sigma_m : of the likelihood field that is searched. search_points : points that are searched with.
+    """
+
+    noise_m: float = 0.025
+    good_m: float = 0.01
+    step_m: float = 0.05
+    step_rad: float = math.radians(3.0)
+    assumed_m: float = 1.4
+    search_sigma_m: float = 0.15
+    search_points: int = 200
+
+
+SPACE_MAP = SpaceMapParameters()
+_DOWN = np.array([(0.05 * i, 0.05 * j, -1.0) for i, j in np.ndindex(9, 9)]) - (0.2, 0.2, 0.0)
+"""Rays from a sensor to the floor, in its height above that: who carries it walks on ground 0.4 m wide.
+So it is free, unless what was measured there says more."""
+
+
+@dataclass(frozen=True, slots=True)
+class ThinnedScan:
+    """The points of a scan that are registered.
+
+    points_m : (N, 3) about one for each half voxel, base frame. weights : (N,) 0..1, by their noise.
+    """
+
+    points_m: F64
+    weights: F64
+
+    def placed(self, pose: F64) -> F64:
+        """The points (N, 3) at a pose (4, 4)."""
+        moved: F64 = self.points_m @ pose[:3, :3].T + pose[:3, 3]
+        return moved
+
+
+class SpaceMap:
+    """What a carried sensor has seen around it, in the session frame (z up).
+
+    Its columns stand on their own floor: each scan is entered at its height above the floor that was seen
+    around it, so that the passes of a pose that rises or sinks lie over each other.
+    """
+
+    def __init__(
+        self,
+        scan: Scan,
+        points_m: F32,
+        registration: RegistrationConfig,
+        projection: ProjectionConfig,
+        parameters: SpaceMapParameters = SPACE_MAP,
+    ) -> None:
+        """An empty map with voxels as the points (N, 3) of a scan, base frame, ask for."""
+        self._projection, self._parameters = projection, parameters
+        self._noise_per_m2 = SENSOR_MODELS[scan.sensor].noise_per_m2
+        noise_range_m = SENSOR_MODELS[scan.sensor].range_of_noise_m(parameters.noise_m)
+        self._reach_m = min(projection.max_range_m, noise_range_m)
+        ranges_m = np.linalg.norm(points_m - scan.T_base_sensor[:3, 3], axis=1)
+        self._surfaces = SurfaceMap.of_first_scan(ranges_m, 2.0 * projection.max_range_m, registration)
+        self._columns = ColumnMap(self._reach_m, scan.sensor, projection)
+        self._added_at: F64 | None = None  # pose of the last scan that joined
+        self._floor = FloorBelow()
+        self._above_floor_m: float | None = None  # the base, by the last scan
+
+    def __bool__(self) -> bool:
+        return self._added_at is not None and bool(self.surfaces)
+
+    @property
+    def surfaces(self) -> SurfaceMap:
+        """The shapes that scans are registered to."""
+        return self._surfaces
+
+    def thin(self, scan: Scan, points_m: F32) -> ThinnedScan:
+        """The points (N, 3) of a deskewed scan, base frame, thinned."""
+        thinned = self._surfaces.thinned(points_m[self._near(scan, points_m)])
+        away = thinned - scan.T_base_sensor[:3, 3]
+        sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
+        return ThinnedScan(thinned, 1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2))
+
+    def match(self, thinned: ThinnedScan, guess: F64, prior: Belief) -> Placement:
+        """Register a scan from a guess (4, 4), by KISS-ICP and then exactly; it is held to a prior."""
+        near = self._surfaces.near(thinned.points_m, thinned.weights, guess, prior)
+        return self._surfaces.match(thinned.points_m, thinned.weights, near, prior)
+
+    def held(self, thinned: ThinnedScan, placement: Placement) -> Placement:
+        """A placement of a scan with the information that surfaces give; see `SurfaceMap.held`."""
+        return self._surfaces.held(thinned.points_m, thinned.weights, placement)
+
+    def agreement(self, thinned: ThinnedScan, pose: F64) -> tuple[float, float]:
+        """How a scan at a pose (4, 4) agrees with surfaces and free space, see `ColumnMap.agreement`."""
+        return self._columns.agreement(self._lowered(thinned.placed(pose)))
+
+    def search(self, thinned: ThinnedScan, guess: F64, window_m: float, count: int) -> list[F64]:
+        """The best few poses (4, 4) in all headings, with the height and the tilt of a guess (4, 4).
+
+        The points at the height of walls are searched for in the plane, within `window_m` along x and y.
+        """
+        p = self._parameters
+        planar = SE2.from_matrix(guess)
+        T_level_base = planar.inverse().lift() @ guess
+        level = thinned.placed(T_level_base)
+        heights = level[:, 2] - self._floor_m(guess[:3, 3])
+        band = level[(heights > self._projection.band_min_m) & (heights < self._projection.band_max_m), :2]
+        if not len(band):
+            return []
+        field, corner_m = self._columns.walls(p.search_sigma_m)
+        chosen = band[evenly(len(band), p.search_points)]
+        found = best_placements(
+            field, corner_m, self._projection.resolution_m, chosen, planar, window_m, math.pi, count=count
+        )
+        return [pose.lift() @ T_level_base for _, pose in found]
+
+    def extend(self, scan: Scan, points_m: F32, thinned: ThinnedScan, pose: F64) -> None:
+        """Add a scan at its final pose (4, 4), if the sensor has moved enough since the last one."""
+        p = self._parameters
+        self._above_floor_m, travel_m = None, 0.0
+        if self._added_at is not None:
+            travel_m, turned_rad = motion_size(invert_pose(self._added_at) @ pose)
+            if travel_m < p.step_m and turned_rad < p.step_rad:
+                return
+        self._added_at = pose
+        self._surfaces.add(thinned.points_m, pose)
+        sensor_m, placed = (pose @ scan.T_base_sensor)[:3, 3], thinned.placed(pose)
+        near_m = points_m[self._near(scan, points_m)].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        fine = self._surfaces.fine
+        seen_m = self._floor.follow(
+            travel_m, self._surfaces.alone(near_m), fine.shapes, fine.edge_m, sensor_m
+        )
+        if seen_m is not None:
+            self._above_floor_m = float(pose[2, 3]) - seen_m
+        rays_m = placed
+        if travel_m >= p.step_m:  # who turns on the spot may hold the sensor over a table
+            rays_m = np.concatenate(
+                (placed, sensor_m + _DOWN * (1.0, 1.0, sensor_m[2] - self._floor_m(sensor_m)))
+            )
+        self._columns.add(
+            self._lowered(near_m),
+            self._lowered(rays_m),
+            self._lowered(sensor_m),
+            self._floor_m(sensor_m) - self._floor.risen_m,
+            2.0 * self._floor.sigma_m,
+        )
+
+    def cut(self, scan: Scan, pose: F64) -> PlanarScan:
+        """The planar scan of a scan at its pose (4, 4), in the levelled base frame."""
+        planar = self._columns.cut(SE2.from_matrix(pose), (pose @ scan.T_base_sensor)[:3, 3], scan.stamp_ns)
+        # Without a floor, heights above it are not known.
+        heights = planar.heights[:0] if self._floor.z_m is None else planar.heights
+        return replace(planar, heights=heights, above_floor_m=self._above_floor_m)
+
+    def _floor_m(self, sensor_m: F64) -> float:
+        """z of the floor below a sensor at (3,)."""
+        assumed_m = float(sensor_m[2]) - self._parameters.assumed_m
+        return assumed_m if self._floor.z_m is None else self._floor.z_m
+
+    def _lowered(self, points_m: F64) -> F64:
+        """Points (..., 3), session frame, by as much lower as the poses have risen."""
+        return points_m - (0.0, 0.0, self._floor.risen_m)
+
+    def _near(self, scan: Scan, points_m: F32) -> BoolGrid:
+        """The points (N, 3) that are near enough to be exact."""
+        away = points_m - scan.T_base_sensor[:3, 3].astype(np.float32)
+        near: BoolGrid = np.einsum("ij,ij->i", away, away) < self._reach_m**2
+        return near

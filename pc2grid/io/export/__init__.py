@@ -1,1 +1,0 @@
-"""Results -> files of other programs: MCAP, g2o, GraphML, point clouds."""

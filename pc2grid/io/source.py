@@ -1,0 +1,226 @@
+"""The interface of everything that messages come from: topics, times and bytes.
+
+Files of each format implement `MessageSource` (`pc2grid.io.containers`); a live source would, too. A source
+does not decode its messages: `pc2grid.io.recording` turns the bytes of any source into scans.
+
+The one place where exceptions of the libraries that read recordings become errors of pc2grid.
+
+Decoders of other projects raise a dozen unrelated types for damaged bytes (17 were counted for `mcap` alone);
+a user gets one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Annotated, NamedTuple, Protocol, TypeVar, cast
+
+from pydantic import Field, computed_field
+
+from pc2grid.errors import LogCorrupt, LogError, Pc2GridError, one_line
+from pc2grid.model import ReadReport, SensorKind
+
+GAP_NS = 5_000_000_000
+"""A longer time without messages, and clocks that differ by more, are reported; chosen by hand."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TopicInfo:
+    """One topic of one type; two are equal if these and the encoding are.
+
+    type : such as `sensor_msgs/PointCloud2`, without the `msg` in the middle.
+    encoding : of the messages: `cdr`, `ros1`, `protobuf`, `json`, or a format of files such as `ply`.
+    schema_encoding, schema : the definition of the type in the log, such as `ros2msg` and its text; empty if
+    there is none.
+    message_count : None if it is unknown unless the log is read in full.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    schema_encoding: Annotated[str, Field(exclude=True)] = field(default="", compare=False)
+    schema: Annotated[bytes, Field(exclude=True)] = field(default=b"", repr=False, compare=False)
+    message_count: int | None = field(default=None, compare=False)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LogInfo:
+    """The facts about a recording that are known without decoding it.
+
+    format : `mcap/ros2`, `mcap/ros1`, `bag/ros1`, `db3/ros2`, `folder/ply`, ...
+    start_ns, end_ns : first and last log time of all messages; 0 and 0 if there is none. Of an open `Log`
+    these are the times of the scans.
+    message_count : None if unknown.
+    """
+
+    path: Path
+    format: str
+    size_bytes: int
+    start_ns: int
+    end_ns: int
+    message_count: int | None
+    topics: tuple[TopicInfo, ...]
+    warnings: tuple[str, ...] = ()
+
+    @computed_field  # type: ignore[prop-decorator]  # mypy has no decorated properties
+    @property
+    def duration_s(self) -> float:
+        """Time from the start to the end."""
+        return (self.end_ns - self.start_ns) * 1e-9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Choice:
+    """Which topics a log is read from, and why.
+
+    topic, sensor : of the scans.
+    odometry_topic : None if there is none; a tf topic if the odometry is the transform odom -> base.
+    imu_topic : None if there is none, or if none is needed.
+    base_frame : the robot's frame, in which points are expressed.
+    sensor_frame : the frame in the header of the scans; None if it is empty. further_frames : of the sensors
+    whose scans are put together with these.
+    reason : one sentence for the user.
+    """
+
+    topic: str
+    sensor: SensorKind
+    odometry_topic: str | None
+    base_frame: str
+    sensor_frame: str | None
+    reason: str
+    imu_topic: str | None = None
+    further_frames: tuple[str, ...] = ()
+
+
+class RawMessage(NamedTuple):
+    """A message as it stands in the log; data holds its bytes in the encoding of its channel."""
+
+    channel: TopicInfo
+    log_time_ns: int
+    data: memoryview | bytes
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts of what was read and of what could not be read.
+
+    points_dropped : without a finite position. skipped : scans left out, by reason.
+    bytes_lost : of the files, passed over for damage. topics_lost : whether these bytes may have held topics
+    that are not known from elsewhere.
+    warnings : sentences for the user.
+    """
+
+    scans_read: int = 0
+    points_dropped: int = 0
+    bytes_lost: int = 0
+    topics_lost: bool = False
+    skipped: dict[str, int] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def warn(self, sentence: str) -> None:
+        """Add a sentence for the user, unless it is there already."""
+        if sentence not in self.warnings:
+            self.warnings.append(sentence)
+
+    def report(self, more_warnings: Iterable[str] = ()) -> ReadReport:
+        """The counts so far."""
+        return ReadReport(
+            scans_read=self.scans_read,
+            points_dropped=self.points_dropped,
+            scans_skipped=dict(self.skipped),
+            bytes_lost=self.bytes_lost,
+            warnings=tuple(dict.fromkeys((*self.warnings, *more_warnings))),
+        )
+
+    def take_over(self, other: Tally) -> None:
+        """Add what another one counts of damage, and its warnings."""
+        self.bytes_lost += other.bytes_lost
+        self.topics_lost |= other.topics_lost
+        for sentence in other.warnings:
+            self.warn(sentence)
+
+    def skip(self, reason: str) -> None:
+        """Count one more scan left out for `reason`."""
+        self.skipped[reason] = self.skipped.get(reason, 0) + 1
+
+
+class MessageSource(Protocol):
+    """A source of timed messages.
+
+    info : known as soon as the source is open. tally : counts while it is read.
+    files : those that the messages come from.
+    """
+
+    info: LogInfo
+    tally: Tally
+    files: tuple[Path, ...]
+
+    def messages(
+        self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
+    ) -> Iterator[RawMessage]:
+        """Messages of the topics with start_ns <= log time < end_ns (nanoseconds; None: no bound).
+
+        Sorted by log time, as far as the memory suffices for it. May be called again, for another pass.
+
+        Raises LogError (LogCorrupt, LimitExceeded, ...) when damage is reached.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close the files."""
+        ...
+
+
+RECOVER_HINT = "--recover reads what is whole"
+LFS_HINT = "`git lfs pull` in its repository fetches the file itself"
+
+T = TypeVar("T")
+
+
+def is_lfs_pointer(head: bytes) -> bool:
+    """Whether a file that begins so is what Git leaves in place of a large file that was not fetched."""
+    return head.startswith(b"version https://git-lfs")
+
+
+def translated(path: Path, error: Exception, hint: str | None = None) -> Pc2GridError:
+    """The error to show for one that a decoder raised; a LogError gets the path of its recording added.
+
+    hint : what helps against damage in this kind of file; `--recover` if it is None.
+    """
+    if isinstance(error, LogError) and one_line(path.name) not in error.message:
+        return type(error)(f"{path}: {error.message}", hint=error.hint or hint)
+    if isinstance(error, Pc2GridError):
+        return error
+    if isinstance(error, OSError):
+        return LogCorrupt(f"{path}: cannot be read: {error.strerror or error}")
+    return LogCorrupt(
+        f"{path}: damaged ({type(error).__name__}: {' '.join(str(error).split())[:120]})",
+        hint=hint or RECOVER_HINT,
+    )
+
+
+def guarded(path: Path, action: Callable[[], T], hint: str | None = None) -> T:
+    """The result of an action; an exception in it is translated."""
+    try:
+        return action()
+    except MemoryError:
+        raise
+    except Exception as error:
+        ours = translated(path, error, hint)
+        try:
+            if ours is error:
+                raise
+            raise ours from error
+        finally:
+            # Its traceback holds this frame, and what was read. A name of it here would keep both alive.
+            del ours
+
+
+def guarded_stream(path: Path, stream: Iterator[T], hint: str | None = None) -> Iterator[T]:
+    """The same for an iterator; exceptions of its consumer do not pass through here."""
+    end = object()
+    following = partial(next, stream, end)
+    while (item := guarded(path, following, hint)) is not end:
+        yield cast("T", item)

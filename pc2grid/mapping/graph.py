@@ -1,0 +1,453 @@
+"""Sparse least squares over planar poses with robust edges.
+
+The manifold Gauss-Newton of Grisetti et al., "A tutorial on graph-based SLAM" (2010), section IV. Cauchy
+weights tell which of the edges that may be wrong are right, and those solve the graph. In the plane it needs
+3 numbers a pose where Open3D's optimiser has 6, uses each edge's information as it was measured, and needs no
+Open3D for a 2D laser.
+It was measured against Open3D's `global_optimization` (`docs/method.md`).
+
+The axes of a building as a compass: most walls meet at right angles.
+
+Loops tie a heading to the places that are seen twice. Along a corridor that is driven once nothing does, and
+an error of one degree moves its far end by 1.7 m in 100 m. The walls themselves show the direction, as far as
+the building is right-angled (the Manhattan world of Coughlan and Yuille, 1999; in a pose graph: Peasley et
+al., "Accurate on-line 3D occupancy grids using Manhattan world constraints", 2012).
+
+Each local map contributes the direction of its walls modulo 90 degrees, weakly and robustly: what a building
+with other angles shows is either not concentrated (curved walls) or farther from the axes than the robust
+scale (a wing at another angle), and loses its weight. The loops and the tracked steps, which are ten times
+as exact, decide wherever they say anything.
+
+The heights of a session's keyframes: one recording is one floor, and a floor is level.
+
+A pose in space drifts in height as it does in the plane. For gravity-aligned poses height is independent of
+x, y and yaw, so it is a least-squares problem of its own, and a linear one: steps of tracking between
+keyframes, the height above the floor where that is seen, and the heights of loops.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix, csc_matrix, identity
+from scipy.sparse.linalg import splu
+
+from pc2grid.clouds.ground import LEVEL
+from pc2grid.geometry import F64, I64, SE2, wrap_angle
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PoseGraphParameters:
+    """Numbers of the optimisation; chosen by hand.
+
+    iterations : of each of the two rounds, at most. converged : largest change of a coordinate, metres and
+        radians, that ends them.
+    damping : added to the diagonal of the normal equations, so that they can always be solved.
+    robust_sigmas : standard deviations at which a loop edge has half of its weight.
+    annealing : factor by which the robust scale of loops shrinks in each iteration.
+    kept : share of its weight with which a loop still counts in full, when the graph is solved again: that
+        which is left at a chi-square of three `robust_sigmas` squared, 27. Of true loops, which have three
+        degrees of freedom, six in a million are farther off.
+    """
+
+    iterations: int = 25
+    converged: float = 1e-5
+    damping: float = 1e-6
+    robust_sigmas: float = 3.0
+    annealing: float = 3.0
+    kept: float = 0.25
+
+
+POSE_GRAPH = PoseGraphParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class Edge:
+    """A measured relative pose T_first_second with its information (3, 3) in the first pose's axes.
+
+    loop : whether the measurement may be wrong altogether; its weight is then robust. counts : how much of
+    its information it has kept, 0..1, as one at the edge of being a loop.
+    """
+
+    first: int
+    second: int
+    T_first_second: SE2
+    information: F64
+    loop: bool = False
+    counts: float = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Solution:
+    """The poses that agree best with the edges.
+
+    poses : (N, 3) x, y, yaw. accepted : (E,) False for loops that contradict the poses by more than
+    `PoseGraphParameters.robust_sigmas`.
+    """
+
+    poses: F64
+    accepted: NDArray[np.bool_]
+
+
+def optimise(
+    poses: F64,
+    edges: Sequence[Edge],
+    walls: Sequence[WallDirection] | None = None,
+    parameters: PoseGraphParameters = POSE_GRAPH,
+) -> Solution:
+    """The poses (N, 3) that agree best with the edges; the first pose stays where it is.
+
+    walls : of each pose, where the building's axes constrain the headings; see
+        `pc2grid.mapping.graph`.
+
+    First, Cauchy weights say which loops agree. The robust scale of a loop that contradicts the poses starts
+    so large that it has half of its weight, and shrinks to its final value during the iterations (graduated
+    non-convexity, Yang et al. 2020): large drift is taken out by loops that agree, and a false loop is
+    outvoted. But together false loops still pull, each by the inverse of its error. So the graph is solved
+    again with fixed weights. A loop that has kept `kept` of its weight counts in full; beyond, its pull falls
+    with the fifth power of its error. There is no edge of being dropped at which a map would hang on the last
+    bit of a number.
+    """
+    poses = np.array(poses, dtype=np.float64)
+    if not edges or len(poses) < 2:
+        return Solution(poses, np.ones(len(edges), np.bool_))
+    i, j, measured, information = _arrays(edges)
+    loop = np.array([e.loop for e in edges])
+    rows = _unknowns(i, j)
+    damping = parameters.damping * identity(3 * len(poses) - 3, format="csc")
+    limit = parameters.robust_sigmas**2
+    error, jacobian = _linearise(poses, i, j, measured)
+    chi2 = np.einsum("ea,eab,eb->e", error, information, error)
+    scale = np.maximum(chi2 / limit, 1.0)
+    fixed: F64 | None = None
+    for _ in range(2):
+        for _ in range(parameters.iterations):
+            weight = 1.0 / (1.0 + chi2 / (scale * limit)) if fixed is None else fixed
+            JtO = jacobian.transpose(0, 2, 1) @ (information * np.where(loop, weight, 1.0)[:, None, None])
+            H, g = _normal_equations(poses, rows, JtO, jacobian, error, walls)
+            delta = np.zeros(3 * len(poses))
+            # Ordered and pivoted as a symmetric matrix: 2,000 poses take 0.8 s in place of 1.8.
+            factors = splu(H[3:, 3:] + damping, permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+            delta[3:] = factors.solve(-g[3:])
+            poses += delta.reshape(-1, 3)
+            poses[:, 2] = wrap_angle(poses[:, 2])
+            error, jacobian = _linearise(poses, i, j, measured)
+            chi2 = np.einsum("ea,eab,eb->e", error, information, error)
+            if scale.max() == 1.0 and np.abs(delta).max() < parameters.converged:
+                break
+            scale = np.maximum(scale / parameters.annealing, 1.0)
+        fixed = np.minimum(1.0 / (1.0 + chi2 / limit) / parameters.kept, 1.0) ** 3
+    return Solution(poses, ~loop | (chi2 <= limit))
+
+
+def _normal_equations(
+    poses: F64,
+    rows: NDArray[np.intp],
+    JtO: F64,
+    jacobian: F64,
+    error: F64,
+    walls: Sequence[WallDirection] | None,
+) -> tuple[csc_matrix, F64]:
+    """The matrix (3 N, 3 N) and the gradient (3 N,) of edges and of the building's axes.
+
+    rows : (E, 6) unknowns of each edge. JtO : (E, 6, 3) transposed Jacobian times information.
+    """
+    H = _of_edges(JtO @ jacobian, rows, len(poses)).tocsc()
+    g = np.zeros(3 * len(poses))
+    np.add.at(g, rows, np.einsum("eab,eb->ea", JtO, error))
+    if walls is not None:
+        deviation, heading = pull_to_axes(poses[:, 2], walls)
+        H += _of_headings(heading)
+        g[2::3] += heading * deviation
+    return H, g
+
+
+def information_matrix(
+    poses: F64, edges: Sequence[Edge], walls: Sequence[WallDirection] | None = None
+) -> coo_matrix:
+    """The information matrix (3 N, 3 N) of poses (N, 3), sparse: x, y, yaw of one pose after the other.
+
+    It leaves open where the whole lies. walls : as for `optimise`.
+    """
+    i, j, measured, information = _arrays(edges)
+    _, jacobian = _linearise(poses, i, j, measured)
+    H = jacobian.transpose(0, 2, 1) @ information @ jacobian
+    by_edges = _of_edges(H, _unknowns(i, j), len(poses))
+    if walls is None:
+        return by_edges
+    return by_edges + _of_headings(pull_to_axes(poses[:, 2], walls)[1])
+
+
+def _of_edges(information: F64, rows: NDArray[np.intp], count: int) -> coo_matrix:
+    """The information matrix (3 N, 3 N) of edges, (E, 6, 6), between their unknowns (E, 6); N: `count`."""
+    row, column = np.repeat(rows, 6, axis=1).ravel(), np.tile(rows, (1, 6)).ravel()
+    return coo_matrix((information.ravel(), (row, column)), shape=(3 * count, 3 * count))
+
+
+def _of_headings(information: F64) -> coo_matrix:
+    """The information matrix (3 N, 3 N) of headings that are known with `information` (N,)."""
+    yaw = 3 * np.arange(len(information)) + 2
+    return coo_matrix((information, (yaw, yaw)), shape=(3 * len(yaw), 3 * len(yaw)))
+
+
+def _arrays(edges: Sequence[Edge]) -> tuple[NDArray[np.intp], NDArray[np.intp], F64, F64]:
+    """Of edges: first (E,) and second (E,) poses, measured steps (E, 3), information (E, 3, 3)."""
+    i, j = np.array([(e.first, e.second) for e in edges]).T
+    measured = np.array([(e.T_first_second.x, e.T_first_second.y, e.T_first_second.yaw) for e in edges])
+    return i, j, measured, np.array([e.information for e in edges])
+
+
+def _unknowns(i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.intp]:
+    """The numbers (E, 6) of the coordinates of both poses of each edge among those of all poses."""
+    return np.stack((3 * i, 3 * i + 1, 3 * i + 2, 3 * j, 3 * j + 1, 3 * j + 2), axis=1)
+
+
+def _linearise(poses: F64, i: NDArray[np.intp], j: NDArray[np.intp], measured: F64) -> tuple[F64, F64]:
+    """Errors (E, 3) and Jacobians (E, 3, 6) with respect to both poses of each edge."""
+    a, b = poses[i], poses[j]
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
+    error = between(a, b) - measured
+    error[:, 2] = wrap_angle(error[:, 2])
+    jacobian = np.zeros((len(i), 3, 6))
+    jacobian[:, 0, 0], jacobian[:, 0, 1] = -c, -s
+    jacobian[:, 1, 0], jacobian[:, 1, 1] = s, -c
+    jacobian[:, 0, 2] = -s * dx + c * dy
+    jacobian[:, 1, 2] = -c * dx - s * dy
+    jacobian[:, :2, 3:5] = -jacobian[:, :2, :2]
+    jacobian[:, 2, 2], jacobian[:, 2, 5] = -1.0, 1.0
+    return error, jacobian
+
+
+def between(a: F64, b: F64) -> F64:
+    """T_a_b (N, 3) of poses (N, 3) in one frame: x, y, yaw."""
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
+    return np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]))
+
+
+def compose(a: F64, b: F64) -> F64:
+    """Poses (N, 3) `b`, given in the frames of poses (N, 3) `a`, in the frame of these."""
+    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
+    return np.column_stack(
+        (a[:, 0] + c * b[:, 0] - s * b[:, 1], a[:, 1] + s * b[:, 0] + c * b[:, 1], a[:, 2] + b[:, 2])
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AxesParameters:
+    """Numbers of the constraint. They follow from what walls look like, and were not fitted.
+
+    robust_rad : deviation from the axes at which a local map has a quarter of its weight: two to seven times
+        that of real walls (`docs/method.md`).
+    sigma_rad : standard deviation of the direction of one local map whose walls are all parallel to the axes.
+        Local maps 4 m apart show the same walls up to 12 m ahead and behind: six of them are about one
+        observation with 3 degrees, so that each alone counts as one with sqrt(6) times as much.
+    rounds : in which the axes are found; outliers lose their weight in the first of them.
+    """
+
+    robust_rad: float = math.radians(3.0)
+    sigma_rad: float = math.radians(7.0)
+    rounds: int = 5
+
+
+AXES = AxesParameters()
+
+
+@dataclass(frozen=True, slots=True)
+class WallDirection:
+    """In which direction the walls of a local map run, modulo 90 degrees.
+
+    direction_rad : in the frame of the local map, within 45 degrees of its x axis. concentration : 0 where
+    all directions are as frequent, 1 where all walls are parallel or at right angles.
+    """
+
+    direction_rad: float
+    concentration: float
+
+
+def wall_direction(normal_rad: NDArray[np.floating]) -> WallDirection:
+    """The direction of the walls with normals (N,); without a wall, of concentration 0."""
+    if not len(normal_rad):
+        return WallDirection(0.0, 0.0)
+    # Four times an angle is the same for directions that differ by right angles.
+    mean = np.exp(4j * np.asarray(normal_rad, np.float64)).mean()
+    return WallDirection(float(np.angle(mean)) / 4.0, float(np.abs(mean)))
+
+
+def pull_to_axes(
+    yaw_rad: F64, walls: Sequence[WallDirection], parameters: AxesParameters = AXES
+) -> tuple[F64, F64]:
+    """How far the walls of local maps with headings (N,) deviate from the axes, and what that counts.
+
+    Returns deviations (N,) in radians, within 45 degrees, by which the headings are too large, and their
+    robust information (N,) in 1 / rad^2 (weights of Geman and McClure). The axes are those of the local maps
+    themselves.
+    """
+    direction = np.array([wall.direction_rad for wall in walls]) + yaw_rad
+    weight = np.array([wall.concentration for wall in walls]) ** 2
+    axis_rad = float(np.angle((weight * np.exp(4j * direction)).sum())) / 4.0
+    for _ in range(parameters.rounds):
+        deviation = _from_axis(direction, axis_rad)
+        robust = weight / (1.0 + (deviation / parameters.robust_rad) ** 2) ** 2
+        axis_rad += float((robust * deviation).sum() / max(robust.sum(), np.finfo(float).tiny))
+    return _from_axis(direction, axis_rad), robust / parameters.sigma_rad**2
+
+
+def _from_axis(direction_rad: F64, axis_rad: float) -> F64:
+    """Directions (N,) relative to the nearest axis, from -45 to 45 degrees."""
+    return wrap_angle(4.0 * (direction_rad - axis_rad)) / 4.0
+
+
+@dataclass(frozen=True, slots=True)
+class HeightStep:
+    """The height of one keyframe above another one, in metres, with its standard deviation."""
+
+    first: int
+    second: int
+    rise_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FloorLevelParameters:
+    """Numbers of the least squares; chosen by hand.
+
+    sigmas : standard deviations at which a floor or a loop has half of its weight (Cauchy). rounds : of
+        reweighting; the first begins so wide that the worst has half of its weight, each narrows it by
+        `annealing`.
+    around : keyframes on either side of the two of a loop whose points are compared.
+    reach_m : the passes of a loop differ in height by no more. layer_m, cell_m : height and edge of the
+        voxels in which they are. thin : layers that a column without a wall fills at most: floor, table and
+        ceiling. beside, stands_out : level surfaces make their meeting a peak, so many times as high as so
+        many layers beside it.
+    known_m : standard deviation of the first height; it counts where no floor is seen. lost_m : of a step
+        where tracking was lost.
+    apart_from_m : floors of a map that lie so far apart are told.
+    """
+
+    sigmas: float = 3.0
+    rounds: int = 12
+    annealing: float = 2.0
+    around: int = 2
+    reach_m: float = 0.6
+    layer_m: float = 0.04
+    thin: int = 6
+    cell_m: float = 0.1
+    beside: int = 3
+    stands_out: float = 1.5
+    known_m: float = 100.0
+    lost_m: float = 1.0
+    apart_from_m: float = 0.1
+
+
+FLOOR_LEVELS = FloorLevelParameters()
+
+
+def settled_heights(
+    tracked_m: F64,
+    travel_m: F64,
+    above_floor_m: F64,
+    restarts: Sequence[int] | I64,
+    loops: Sequence[HeightStep] = (),
+    parameters: FloorLevelParameters = FLOOR_LEVELS,
+) -> F64:
+    """The heights (K,) of keyframes above their one floor; without a floor, above any level.
+
+    tracked_m : (K,) z as tracked. travel_m : (K,) metres of travel at each. above_floor_m : (K,) as seen, NaN
+    where no floor is. restarts : the keyframes before which tracking was lost.
+    """
+    p, count = parameters, len(tracked_m)
+    seen = np.flatnonzero(np.isfinite(above_floor_m))
+    steps_m = np.sqrt(LEVEL.drift_per_m * np.maximum(np.diff(travel_m), 1e-3))
+    steps_m[np.asarray(restarts, np.int64) - 1] = p.lost_m
+    chain = np.arange(count - 1)
+    # One row for each observation: the height of `second` less that of `first`, which is -1 for the floor.
+    first = np.concatenate((chain, [-1], np.full(len(seen), -1), [loop.first for loop in loops]))
+    second = np.concatenate((chain + 1, [0], seen, [loop.second for loop in loops])).astype(np.int64)
+    rise_m = np.concatenate(
+        (np.diff(tracked_m), tracked_m[:1], above_floor_m[seen], [loop.rise_m for loop in loops])
+    )
+    sigma_m = np.concatenate(
+        (steps_m, [p.known_m], np.full(len(seen), LEVEL.seen_m), [loop.sigma_m for loop in loops])
+    )
+    first = first.astype(np.int64)
+    may_be_wrong = np.arange(len(first)) >= count
+    row = np.arange(len(first))
+    inner = first >= 0
+    values = np.concatenate((np.ones(len(row)), -np.ones(int(inner.sum()))))
+    A = coo_matrix(
+        (values, (np.concatenate((row, row[inner])), np.concatenate((second, first[inner])))),
+        shape=(len(row), count),
+    ).tocsc()
+    weight, scale, heights_m = sigma_m**-2, np.inf, tracked_m
+    for _ in range(p.rounds):
+        heights_m = splu((A.T @ A.multiply(weight[:, None])).tocsc()).solve(A.T @ (weight * rise_m))
+        off = np.abs(A @ heights_m - rise_m) / sigma_m
+        scale = max(min(scale / p.annealing, off[may_be_wrong].max(initial=0.0)), p.sigmas)
+        weight = sigma_m**-2 * np.where(may_be_wrong, 1.0 / (1.0 + (off / scale) ** 2), 1.0)
+    return np.asarray(heights_m)
+
+
+def rise_between(
+    first_m: F64, second_m: F64, parameters: FloorLevelParameters = FLOOR_LEVELS
+) -> float | None:
+    """By how much points (M, 3) must rise to meet others (N, 3); None if no level surface of both tells.
+
+    first_m : the others. Floors, tables and ceilings meet at one height, walls at all.
+    """
+    p = parameters
+    most = round(p.reach_m / p.layer_m)
+    edges_m = np.array((p.cell_m, p.cell_m, p.layer_m))
+    first, second = (np.floor(points / edges_m).astype(np.int64) for points in (first_m, second_m))
+    columns = [cells[:, :2] @ (1 << 20, 1) for cells in (first, second)]
+    shared = np.intersect1d(*columns)
+    if not len(shared):
+        return None
+    lowest = min(first[:, 2].min(), second[:, 2].min()) - most
+    layers = int(max(first[:, 2].max(), second[:, 2].max()) - lowest) + most + 1
+    full = np.zeros((2, len(shared), layers), np.bool_)
+    for cloud, cells, column in zip(full, (first, second), columns, strict=True):
+        both = np.isin(column, shared)
+        cloud[np.searchsorted(shared, column[both]), cells[both, 2] - lowest] = True
+    # A wall meets itself at any height, in as many layers as it is high.
+    full = full[:, full.sum(axis=2).max(axis=0) <= p.thin]
+    inner = full[1, :, most:-most]
+    meet = np.array(
+        [(full[0, :, k : k + inner.shape[1]] & inner).sum() for k in range(2 * most + 1)], np.float64
+    )
+    best = int(np.argmax(meet))
+    if not p.beside <= best < len(meet) - p.beside:
+        return None
+    if meet[best] < p.stands_out * max(meet[best - p.beside], meet[best + p.beside], 1.0):
+        return None
+    before, peak, after = meet[best - 1 : best + 2]
+    between = 0.5 * (before - after) / min(before - 2.0 * peak + after, -1.0)
+    return float((best - most + between) * p.layer_m)
+
+
+def floors_apart_m(heights_m: F64, above_floor_m: F64) -> float | None:
+    """Over which height the floor lies that keyframes at heights (K,) see, without the outer twentieths.
+
+    None if none is seen.
+    """
+    floor_m = (heights_m - above_floor_m)[np.isfinite(above_floor_m)]
+    if not len(floor_m):
+        return None
+    low_m, high_m = np.percentile(floor_m, (5.0, 95.0))
+    return float(high_m - low_m)
+
+
+def floor_warning(apart_m: float | None, parameters: FloorLevelParameters = FLOOR_LEVELS) -> str | None:
+    """One sentence that says how far the floors of a map lie apart and what to do; None if they do not."""
+    if apart_m is None or apart_m < parameters.apart_from_m:
+        return None
+    return (
+        f"a floor is level, but what was seen of it lies over {apart_m:.2f} m of height: where it was passed "
+        "twice, one floor may stand on the other as an obstacle; hold the sensor so that it sees the floor, "
+        "or cut the recording at a step or ramp, with --start and --duration"
+    )

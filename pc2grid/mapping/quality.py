@@ -1,0 +1,377 @@
+"""Does a map agree with the scans it was drawn from?
+
+Where a trajectory is bent, the robot draws a place a second time beside the first. Scans of one visit then
+put walls on ground that scans of other visits saw free. A map of several scans keeps what most of them say,
+so the figure is, for each scan, the share of its wall hits that lie on free ground of the final map, away
+from every wall. No ground truth is needed. A place that was seen only once cannot disagree.
+
+Only hits that end the view are taken as walls. People put hits on free ground as well, but they walk on: a
+hit counts only if the keyframe before or after has seen it too. Doors and moved chairs stay for a while, in
+one corner of the view, whereas a bent place shifts whole walls for metres of travel. So the share is averaged
+over a few metres of travel, and only a large share counts.
+
+How exactly the places of a map lie to each other, from the pose graph it was made with.
+
+A corridor that was driven once and never met again cannot contradict anything, so the checks of
+`consistency.py` are silent about it. But the pose graph knows: the covariance of its solution grows along
+such a corridor and shrinks wherever a loop ties it to the rest.
+
+The covariance of the poses is the inverse of the information matrix (Thrun, Burgard and Fox, "Probabilistic
+Robotics", chapter 11). It is stated relative to the part of the session that is well tied together, not to
+the first pose: the error of each position is what remains after the whole has been placed on the truth, with
+the weight of well-known places (the S-transformation of Baarda, 1973, as free networks are adjusted in
+geodesy).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import chain, tee
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import diags
+from scipy.sparse.linalg import splu
+from scipy.spatial import cKDTree
+
+from pc2grid.geometry import F64, I64, SE2, BoolGrid, wrap_angle
+from pc2grid.mapping.graph import Edge, WallDirection, information_matrix
+from pc2grid.mapping.keyframes import Keyframe
+from pc2grid.mapping.parts import PARTS
+from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory, UncertainStretch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConsistencyParameters:
+    """Numbers of the check.
+
+    reach_m : hits farther from the sensor are left out: there a small error of yaw moves them far. From the
+        first trial on real logs.
+    wall_m : a hit on free ground counts if it is farther than this from every wall; three cells of the
+        default resolution. From the same trial.
+    sectors, behind_m : a hit counts if no other hit in its sector of the view lies more than `behind_m`
+        behind it: what a lidar sees over, or a floor taken for an obstacle, is no wall. Half a degree.
+    same_m : a neighbouring keyframe has seen a hit if it has a hit within this distance; two cells of the
+        default resolution.
+    window_m : travel over which the share of contradicting hits is averaged.
+    turn_m_per_rad : travel that a turn on the spot counts as, as in loop closure.
+    fewest_hits : of a window; with fewer, the share is computed as if there were so many.
+    contradicted_from : share of the hits of a window from which its middle contradicts the map.
+    bent_from : share of the travel that contradicts a map from which the map is called bent.
+    shown : stretches that are kept, the longest first.
+
+    `window_m`, `contradicted_from` and `bent_from` were chosen on real logs and simulated drives, whose poses
+    were the true ones, those with loops closed, those without loops, and true poses bent on purpose
+    (`examples/recordings.md`).
+    """
+
+    reach_m: float = 12.0
+    wall_m: float = 0.15
+    sectors: int = 720
+    behind_m: float = 0.3
+    same_m: float = 0.1
+    window_m: float = 5.0
+    turn_m_per_rad: float = 0.3
+    fewest_hits: int = 30
+    contradicted_from: float = 0.2
+    bent_from: float = 0.005
+    shown: int = 20
+
+
+CONSISTENCY = ConsistencyParameters()
+
+
+def measure_consistency(
+    keyframes: Iterable[Keyframe],
+    grid: OccupancyGrid,
+    trajectory: Trajectory,
+    parameters: ConsistencyParameters = CONSISTENCY,
+) -> Consistency:
+    """Compare keyframes with the grid that was drawn from them.
+
+    trajectory : the poses at which they were drawn; `Keyframe.index` is the number of a pose.
+    The keyframes are read one after the other; of each, three numbers stay in memory.
+    """
+    clear = _clear_ground(grid, parameters.wall_m)
+    drawn = (
+        _drawn(keyframe, SE2.from_matrix(trajectory.T_session_base[keyframe.index]), grid, clear, parameters)
+        for keyframe in keyframes
+    )
+    counts = [
+        (scan.index, len(scan.hits_m), _confirmed(before, scan, after, parameters.same_m))
+        for before, scan, after in _with_neighbours(drawn)
+    ]
+    if not counts:
+        return Consistency()
+    index, hits, contradicting = np.array(counts, dtype=np.int64).T
+    poses = trajectory.planar()[index]
+    shares = _window_shares(poses, hits, contradicting, parameters)
+    contradicted = shares >= parameters.contradicted_from
+    share_of_keyframes = float(contradicted.mean())
+    return Consistency(
+        hits_on_free=float(contradicting.sum() / max(hits.sum(), 1)),
+        contradicted=share_of_keyframes,
+        bent=share_of_keyframes >= parameters.bent_from,
+        stretches=_stretches(contradicted, shares, poses, trajectory.stamps_ns[index])[: parameters.shown],
+    )
+
+
+def consistency_warning(
+    consistency: Consistency,
+    trajectory: Trajectory,
+    *,
+    with_odometry: bool = False,
+) -> str | None:
+    """One sentence that says where a map is bent and what to do; None if it is not bent.
+
+    with_odometry : the recording has odometry, so that it need not be advised.
+    """
+    if not consistency.bent or not consistency.stretches:
+        return None
+    longest = consistency.stretches[0]
+    start_ns = int(trajectory.stamps_ns[0])
+    from_s, to_s = ((stamp - start_ns) * 1e-9 for stamp in (longest.from_ns, longest.to_ns))
+    return (
+        f"the map contradicts itself along {consistency.contradicted:.0%} of the travel and is probably "
+        f"bent: near x {longest.x_m:.1f}, y {longest.y_m:.1f} m, {from_s:.0f} to {to_s:.0f} s after the "
+        "first scan, walls stand on ground that other scans saw free; look there in the report, and record "
+        f"that part again{'' if with_odometry else ' with odometry'}, or leave it out with --start and "
+        "--duration"
+    )
+
+
+def _clear_ground(grid: OccupancyGrid, wall_m: float) -> BoolGrid:
+    """(H, W) free cells whose centres are farther than `wall_m` from the centre of every occupied cell."""
+    if not grid.cells.size:
+        return np.zeros(grid.cells.shape, np.bool_)
+    reach = math.floor(wall_m / grid.resolution_m)
+    offsets = np.arange(-reach, reach + 1)
+    disc = (np.hypot(*np.meshgrid(offsets, offsets)) * grid.resolution_m <= wall_m + 1e-9).astype(np.uint8)
+    near_wall = cv2.dilate(grid.occupied.astype(np.uint8), disc)
+    clear: BoolGrid = grid.free & (near_wall == 0)
+    return clear
+
+
+@dataclass(frozen=True, slots=True)
+class _Drawn:
+    """The hits of a keyframe in the session frame.
+
+    index : number of its scan. hits_m : (M, 2) within reach. on_clear : (M,) which lie on clear ground.
+    """
+
+    index: int
+    hits_m: F64
+    on_clear: NDArray[np.bool_]
+
+
+def _drawn(
+    keyframe: Keyframe, pose: SE2, grid: OccupancyGrid, clear: BoolGrid, parameters: ConsistencyParameters
+) -> _Drawn:
+    """The hits that end the view, and which of them lie on clear ground."""
+    rays_m = keyframe.planar_scan.hits_m - keyframe.planar_scan.origin_m
+    range_m, bearing_rad = np.hypot(*rays_m.T), np.arctan2(rays_m[:, 1], rays_m[:, 0])
+    sector = (
+        np.floor(bearing_rad / (2.0 * math.pi) * parameters.sectors).astype(np.int64) % parameters.sectors
+    )
+    farthest_m = np.zeros(parameters.sectors)
+    np.maximum.at(farthest_m, sector, range_m)
+    ends_view = range_m > farthest_m[sector] - parameters.behind_m
+    hits_m = pose.apply(keyframe.planar_scan.hits_m[ends_view & (range_m < parameters.reach_m)])
+    cells = grid.to_cell(hits_m)
+    inside = ((cells >= 0) & (cells < clear.shape)).all(axis=1)
+    on_clear = np.zeros(len(hits_m), np.bool_)
+    on_clear[inside] = clear[tuple(cells[inside].T)]
+    return _Drawn(keyframe.index, hits_m, on_clear)
+
+
+def _with_neighbours(scans: Iterable[_Drawn]) -> Iterator[tuple[_Drawn | None, _Drawn, _Drawn | None]]:
+    """Each scan between the one before and the one after it; None at the two ends."""
+    before, here, after = tee(scans, 3)
+    next(after, None)
+    return zip(chain((None,), before), here, chain(after, (None,)), strict=False)
+
+
+def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m: float) -> int:
+    """How many hits on clear ground a neighbouring scan has seen too, within `same_m`.
+
+    Something that moves is elsewhere in the next keyframe; a wall in the wrong place is not.
+    """
+    doubtful_m = scan.hits_m[scan.on_clear]
+    seen_again = np.zeros(len(doubtful_m), np.bool_)
+    for neighbour in (before, after):
+        if neighbour is not None and len(doubtful_m) and len(neighbour.hits_m):
+            distance_m, _ = cKDTree(neighbour.hits_m).query(doubtful_m, distance_upper_bound=same_m)
+            seen_again |= distance_m < same_m
+    return int(np.count_nonzero(seen_again))
+
+
+def _window_shares(poses: F64, hits: I64, contradicting: I64, parameters: ConsistencyParameters) -> F64:
+    """Share of contradicting hits in the window of travel around each of the poses (K, 3)."""
+    steps = np.diff(poses, axis=0)
+    step_m = np.hypot(steps[:, 0], steps[:, 1]) + parameters.turn_m_per_rad * np.abs(wrap_angle(steps[:, 2]))
+    travel_m = np.concatenate(([0.0], np.cumsum(step_m)))
+    first = np.searchsorted(travel_m, travel_m - 0.5 * parameters.window_m, side="left")
+    last = np.searchsorted(travel_m, travel_m + 0.5 * parameters.window_m, side="right")
+    in_window = [np.concatenate(([0], np.cumsum(counts))) for counts in (hits, contradicting)]
+    all_hits, all_contradicting = (total[last] - total[first] for total in in_window)
+    shares: F64 = all_contradicting / np.maximum(all_hits, parameters.fewest_hits)
+    return shares
+
+
+def _stretches(contradicted: BoolGrid, shares: F64, poses: F64, stamps_ns: I64) -> tuple[Contradiction, ...]:
+    """The runs of contradicting keyframes (K,), the longest in metres first."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], contradicted, [False]))))
+    found = []
+    for begin, end in edges.reshape(-1, 2).tolist():
+        worst = begin + int(np.argmax(shares[begin:end]))
+        length_m = np.hypot(*np.diff(poses[begin:end, :2], axis=0).T).sum()
+        found.append(
+            Contradiction(
+                from_ns=int(stamps_ns[begin]),
+                to_ns=int(stamps_ns[end - 1]),
+                x_m=float(poses[worst, 0]),
+                y_m=float(poses[worst, 1]),
+                length_m=float(length_m),
+                share=float(shares[worst]),
+            )
+        )
+    return tuple(sorted(found, key=lambda stretch: (-stretch.length_m, stretch.from_ns)))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrecisionParameters:
+    """Numbers of the estimate.
+
+    promised_m : standard deviation of a position from which a place is called uncertain. Beyond it, an answer
+        that is exact to the walls around it is off in the map by more than that as often as one in three.
+    rounds : in which the weights of the places are found; they change little after two.
+    first_information : per square metre and radian, on the first pose, so that the matrix can be inverted.
+        The result does not depend on it.
+    """
+
+    promised_m: float = 0.5
+    rounds: int = 3
+    first_information: float = 1e4
+
+
+PRECISION = PrecisionParameters()
+
+_TOGETHER = 64
+"""Poses whose covariance is computed at once; memory grows linearly with the length of a session."""
+
+
+def position_sigmas(
+    poses: F64,
+    edges: Sequence[Edge],
+    walls: Sequence[WallDirection] | None = None,
+    parameters: PrecisionParameters = PRECISION,
+) -> tuple[F64, F64]:
+    """Standard deviation (N,) of each position in metres, in its least certain direction, and weights (N,).
+
+    poses : (N, 3) x, y, yaw that agree best with the edges. edges : those that count; they connect all poses.
+    walls : of each pose, if the building's axes constrain the headings.
+    weights : with which the places count when the map is placed on the truth.
+    """
+    count = len(poses)
+    sigma, weight = np.zeros(count), np.ones(count)
+    if count < 2:
+        return sigma, weight
+    first = np.zeros(3 * count)
+    first[:3] = parameters.first_information
+    information = information_matrix(poses, edges, walls) + diags(first)
+    solve = splu(information.tocsc(), permc_spec="MMD_AT_PLUS_A").solve
+    blocks = _diagonal_blocks(solve, count)
+    moved = _moved_by_whole(poses)
+    for _ in range(parameters.rounds):
+        # The whole is placed by weighted least squares: its motion is `placing` (3, 3 N) times the errors.
+        normal = np.einsum("n,nai,naj->ij", weight, moved, moved)
+        by_pose = np.zeros((count, 3, 3))
+        by_pose[:, :2] = weight[:, None, None] * moved @ np.linalg.inv(normal)
+        placing = by_pose.reshape(-1, 3)
+        with_errors = solve(placing)
+        of_whole = placing.T @ with_errors
+        across = with_errors.reshape(-1, 3, 3)[:, :2] @ moved.transpose(0, 2, 1)
+        covariance = blocks - across - across.transpose(0, 2, 1)
+        covariance += moved @ of_whole @ moved.transpose(0, 2, 1)
+        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
+        weight = 1.0 / (sigma**2 + parameters.promised_m**2)
+    return sigma, weight
+
+
+def _diagonal_blocks(solve: Callable[[F64], F64], count: int) -> F64:
+    """The covariance (N, 2, 2) of x and y of each of the poses.
+
+    solve : the product of columns (3 N, K) with the covariance (3 N, 3 N) of all.
+    """
+    blocks = np.empty((count, 2, 2))
+    for begin in range(0, count, _TOGETHER):
+        some = np.arange(begin, min(begin + _TOGETHER, count))
+        rows = (3 * some[:, None] + np.arange(2)).ravel()
+        columns = np.zeros((3 * count, len(rows)))
+        columns[rows, np.arange(len(rows))] = 1.0
+        found = solve(columns)[rows].reshape(len(some), 2, len(some), 2)
+        blocks[some] = found[some - begin, :, some - begin]
+    return blocks
+
+
+def _moved_by_whole(poses: F64) -> F64:
+    """How each position moves (N, 2, 3) with a motion x, y, yaw of the whole about its middle."""
+    moved = np.zeros((len(poses), 2, 3))
+    moved[:, 0, 0] = moved[:, 1, 1] = 1.0
+    away = poses[:, :2] - poses[:, :2].mean(axis=0)
+    moved[:, 0, 2], moved[:, 1, 2] = -away[:, 1], away[:, 0]
+    return moved
+
+
+def precision_of(
+    trajectory: Trajectory, scans: I64, sigma_m: F64, parameters: PrecisionParameters = PRECISION
+) -> Precision:
+    """The precision of a map, from the standard deviations (N,) at some of its scans (N,), in their order."""
+    if not len(scans):
+        return Precision()
+    stamps_ns, xy, travel_m = trajectory.stamps_ns, trajectory.planar()[:, :2], trajectory.path_m()
+    # Every local map stands for the travel up to the middle between it and the next.
+    middles = (scans[1:] + scans[:-1]) // 2
+    begins, ends = np.append(0, middles), np.append(middles, len(trajectory) - 1)
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], sigma_m > parameters.promised_m, [False]))))
+    found = []
+    for begin, end in edges.reshape(-1, 2).tolist():
+        first, last = int(begins[begin]), int(ends[end - 1])
+        worst = begin + int(np.argmax(sigma_m[begin:end]))
+        length_m = float(travel_m[last] - travel_m[first])
+        if length_m >= PARTS.least_travel_m:
+            found.append(
+                UncertainStretch(
+                    from_ns=int(stamps_ns[first]),
+                    to_ns=int(stamps_ns[last]),
+                    x_m=float(xy[scans[worst], 0]),
+                    y_m=float(xy[scans[worst], 1]),
+                    length_m=length_m,
+                    sigma_m=round(float(sigma_m[worst]), 3),
+                )
+            )
+    return Precision(
+        stamps_ns=tuple(stamps_ns[scans].tolist()),
+        sigma_m=tuple(sigma_m.round(3).tolist()),
+        loose=tuple(sorted(found, key=lambda stretch: (-stretch.sigma_m, stretch.from_ns))),
+    )
+
+
+def precision_warning(precision: Precision, trajectory: Trajectory) -> str | None:
+    """One sentence that says which part of a map is weakly tied to the rest and what to do; None if none."""
+    if not precision.loose:
+        return None
+    worst = precision.loose[0]
+    start_ns = int(trajectory.stamps_ns[0])
+    from_s, to_s = ((stamp - start_ns) * 1e-9 for stamp in (worst.from_ns, worst.to_ns))
+    others = len(precision.loose) - 1
+    more = f" (and {others} more such stretch{'es' if others > 1 else ''})" if others else ""
+    return (
+        f"no loop ties {worst.length_m:.0f} m of the travel, {from_s:.0f} to {to_s:.0f} s after the first "
+        f"scan{more}, well to the rest: near x {worst.x_m:.1f}, y {worst.y_m:.1f} m the map may be off "
+        f"by {worst.sigma_m:.1f} m (standard deviation), and no doubled wall would show it; come back from "
+        "there to a place seen before, by another way if there is one"
+    )

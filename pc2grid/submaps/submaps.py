@@ -1,0 +1,222 @@
+"""A map's division into submaps around the junctions of its free space (paper III-A).
+
+What can be seen from a place of a grid: its isovist (Benedikt 1979, "To take hold of space").
+
+Two recordings of one place agree only on what both could see: an area behind a wall may be known in one of
+them only. Both are therefore cut down to the isovist of a common centre, which makes them comparable
+whatever the sensor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.geometry import F32, F64, BoolGrid, cells_of, freeze
+from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid, Submap
+from pc2grid.settings import PartitionConfig
+from pc2grid.submaps.junction_graph import clearance_of, graph_of_skeleton, map_skeleton, sample_evenly
+
+if TYPE_CHECKING:
+    import networkx as nx
+
+
+def partition(grid: OccupancyGrid, config: PartitionConfig = PartitionConfig()) -> tuple[Submap, ...]:
+    """Divide a map into submaps of `config.radius_m` around the junctions of its junction graph (III-A).
+
+    With `config.spacing_m`, points of the skeleton that far apart become centres as well. Submaps are
+    numbered from 0 by (y, x) of their centre. A map with free space but without any junction (one room, one
+    corridor) has a centre where it is widest; a map without free space has no submaps.
+
+    >>> import pc2grid
+    >>> submaps = partition(pc2grid.load_map("map.yaml"), PartitionConfig(radius_m=4.0))
+    >>> [submap.submap_id for submap in submaps] == list(range(len(submaps)))
+    True
+    """
+    return divide(grid, config)[1]
+
+
+def divide(grid: OccupancyGrid, config: PartitionConfig) -> tuple[nx.Graph, tuple[Submap, ...]]:
+    """The junction graph of a map, and the submaps of `partition`, which are made around its nodes."""
+    skeleton = map_skeleton(grid, config)
+    graph = graph_of_skeleton(skeleton, grid, config)
+    centers_m = _centers(graph, skeleton, grid, config)
+    return graph, tuple(
+        view_at(grid, (x, y), config, submap_id=number) for number, (x, y) in enumerate(centers_m.tolist())
+    )
+
+
+def view_at(
+    grid: OccupancyGrid, center_m: tuple[float, float], config: PartitionConfig, *, submap_id: int = 0
+) -> Submap:
+    """The submap around `center_m` as `config.view` defines it: the whole disc, or its isovist.
+
+    The views of a query are made by this function, too, because only views of one kind are comparable.
+    """
+    if config.view == "isovist":
+        return visible_submap(grid, isovist(grid, center_m, config.radius_m), submap_id)
+    return submap_at(grid, center_m, config.radius_m, submap_id=submap_id)
+
+
+def submap_at(
+    grid: OccupancyGrid, center_m: tuple[float, float], radius_m: float, *, submap_id: int = 0
+) -> Submap:
+    """The disc of `grid` around `center_m` (map frame); cells farther than `radius_m` become unknown."""
+    crop = grid.crop(center_m, radius_m)
+    n = crop.cells.shape[0] // 2
+    steps = np.arange(-n, n + 1) ** 2
+    inside = steps[:, None] + steps <= (radius_m / grid.resolution_m) ** 2 + 1e-9
+    cells = np.where(inside, crop.cells, np.int8(UNKNOWN))
+    return Submap(
+        submap_id=submap_id,
+        center_m=center_m,
+        radius_m=radius_m,
+        grid=OccupancyGrid(cells=cells, resolution_m=crop.resolution_m, origin_m=crop.origin_m),
+    )
+
+
+def submap_centers(grid: OccupancyGrid, config: PartitionConfig) -> F64:
+    """Centres (N, 2) of the submaps in the map frame, metres, sorted by (y, x)."""
+    skeleton = map_skeleton(grid, config)
+    return _centers(graph_of_skeleton(skeleton, grid, config), skeleton, grid, config)
+
+
+def _centers(graph: nx.Graph, skeleton: BoolGrid, grid: OccupancyGrid, config: PartitionConfig) -> F64:
+    """The same, from the junction graph and the skeleton that it was made from."""
+    if not grid.ground.any():
+        return np.empty((0, 2))
+    points_m = [node["center_m"] for _, node in graph.nodes(data=True) if node["kind"] == "junction"]
+    centers = grid.to_cell(np.array(points_m).reshape(-1, 2))
+    if not len(centers):
+        clearance_m = clearance_of(grid.ground, grid.resolution_m)
+        centers = np.array([np.unravel_index(int(np.argmax(clearance_m)), clearance_m.shape)])
+    if config.spacing_m is not None:
+        # Junctions come first, so they are kept; the skeleton fills the gaps between them.
+        candidates = np.concatenate((centers, cells_of(skeleton)))
+        more = sample_evenly(candidates, config.spacing_m / grid.resolution_m)
+        centers = np.unique(np.concatenate((centers, more)), axis=0)
+    return grid.to_point(centers[np.lexsort(centers.T[::-1])])
+
+
+BEARINGS = 360
+
+WALL, OPEN, HIDDEN = 1, 0, -1
+"""How a ray ends: on an occupied cell, at the limit of sight, or where nothing is known."""
+
+_STEP_CELLS = 0.5
+PATIENCE_M = 0.1
+"""A ray passes this much of unknown cells: two cells of 5 cm that lay between the beams (chosen by hand)."""
+WALL_MARGIN_M = 0.15
+"""Depth of a wall that stays in a visible submap: three cells of 5 cm (chosen by hand)."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Isovist:
+    """What is seen from `center_m` up to `sight_m`.
+
+    ranges_m : (B,) float32, length of ray b; its bearing is 2 pi b / B from the map's x axis.
+    ends : (B,) int8, WALL, OPEN (nothing within sight) or HIDDEN (reached unknown cells).
+    """
+
+    center_m: tuple[float, float]
+    sight_m: float
+    ranges_m: F32
+    ends: NDArray[np.int8]
+
+    def __post_init__(self) -> None:
+        freeze(self, "ranges_m", np.float32, (None,))
+        freeze(self, "ends", np.int8, (len(self.ranges_m),))
+
+    @property
+    def observed(self) -> float:
+        """Share of the rays, 0..1, whose end is known (not HIDDEN)."""
+        return float(np.mean(self.ends != HIDDEN))
+
+
+def look_around(
+    grid: OccupancyGrid,
+    centers_m: F64,
+    sight_m: float,
+    *,
+    bearings: int = BEARINGS,
+    patience_m: float = PATIENCE_M,
+) -> tuple[F32, NDArray[np.int8]]:
+    """Ranges (N, B) in metres and ends (N, B) of the isovists of many points (N, 2); see `isovist`."""
+    from pc2grid.submaps.junction_graph import cast_rays
+
+    columns, rows = ((centers_m - np.asarray(grid.origin_m)) / grid.resolution_m).T
+    ranges, ends = cast_rays(
+        grid.cells,
+        np.ascontiguousarray(rows, np.float64),
+        np.ascontiguousarray(columns, np.float64),
+        sight_m / grid.resolution_m,
+        bearings,
+        int(patience_m / grid.resolution_m / _STEP_CELLS),
+    )
+    return ranges * np.float32(grid.resolution_m), ends
+
+
+def ray_ends(ranges_m: F32) -> F64:
+    """The points (N, B, 2) where the rays of isovists (N, B) end, from the points that they are seen from."""
+    bearings_rad = 2.0 * np.pi * np.arange(ranges_m.shape[1]) / ranges_m.shape[1]
+    directions = np.stack((np.cos(bearings_rad), np.sin(bearings_rad)), axis=-1)
+    return np.asarray(ranges_m[..., None] * directions, np.float64)
+
+
+def isovist(
+    grid: OccupancyGrid,
+    center_m: tuple[float, float],
+    sight_m: float,
+    *,
+    bearings: int = BEARINGS,
+    patience_m: float = PATIENCE_M,
+) -> Isovist:
+    """Cast `bearings` rays from a point of the map frame.
+
+    A ray ends at the first occupied cell, at `sight_m`, or after more than `patience_m` of unknown cells
+    (single unobserved cells between beams do not hide what lies behind them).
+    """
+    ranges_m, ends = look_around(
+        grid, np.array([center_m]), sight_m, bearings=bearings, patience_m=patience_m
+    )
+    return Isovist(center_m=center_m, sight_m=sight_m, ranges_m=ranges_m[0], ends=ends[0])
+
+
+def polygon_mask(view: Isovist, grid: OccupancyGrid, *, margin_m: float = 0.0) -> NDArray[np.bool_]:
+    """Cells (H, W) of `grid` inside the isovist's polygon; each ray is longer by `margin_m`."""
+    angles = 2 * np.pi * np.arange(len(view.ranges_m)) / len(view.ranges_m)
+    reach = np.minimum(view.ranges_m + margin_m, view.sight_m + margin_m)
+    x = (view.center_m[0] + reach * np.cos(angles) - grid.origin_m[0]) / grid.resolution_m - 0.5
+    y = (view.center_m[1] + reach * np.sin(angles) - grid.origin_m[1]) / grid.resolution_m - 0.5
+    shift = 4
+    corners = np.round(np.column_stack((x, y)) * (1 << shift)).astype(np.int32)
+    mask = np.zeros(grid.cells.shape, dtype=np.uint8)
+    cv2.fillPoly(mask, [corners], 1, lineType=cv2.LINE_8, shift=shift)
+    return mask.astype(bool)
+
+
+def visible_submap(grid: OccupancyGrid, view: Isovist, submap_id: int) -> Submap:
+    """The submap around the isovist's centre; cells that are not seen from there become unknown.
+
+    Of a wall that a ray ends on, the first `WALL_MARGIN_M` are kept. Free cells inside the isovist stay
+    free; the last cell of a ray that ends on a wall becomes occupied.
+    """
+    crop = grid.crop(view.center_m, view.sight_m)
+    inside = polygon_mask(view, crop, margin_m=WALL_MARGIN_M)
+    cells = np.where(inside, crop.cells, np.int8(UNKNOWN)).astype(np.int8)
+    hit = view.ends == WALL
+    angles = 2 * np.pi * np.flatnonzero(hit) / len(view.ranges_m)
+    ends_m = view.ranges_m[hit, None] * np.column_stack((np.cos(angles), np.sin(angles))) + view.center_m
+    at = crop.to_cell(ends_m.astype(np.float64))
+    ok = ((at >= 0) & (at < np.array(cells.shape))).all(axis=1)
+    cells[at[ok, 0], at[ok, 1]] = OCCUPIED
+    return Submap(
+        submap_id=submap_id,
+        center_m=view.center_m,
+        radius_m=view.sight_m,
+        grid=OccupancyGrid(cells=cells, resolution_m=crop.resolution_m, origin_m=crop.origin_m),
+    )

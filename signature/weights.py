@@ -1,0 +1,282 @@
+"""How likely two descriptions of what was seen show one place; weights of the bins, learned and explained.
+
+Two sensors at one place do not fill the bins equally, and some bins differ more than others. A bin tells
+places apart if it varies more between places than between sensors. Both were measured: `within`, the
+covariance of the difference between a query and a map at one place, over real drives in maps of another time,
+and `between`, that of different places. By the whole of `within` the distance is Mahalanobis'. Fisher's
+linear discriminant, the generalized eigenvalue problem `between v = q within v`, gives in closed form the
+directions v with the largest quotients q, along which the differences at one place have unit variance. Along
+these the distance is Euclidean: there is one short vector for each place and view, and an index can search
+them.
+
+A squared distance D^2 says less the less was seen. With u, the share of rays hidden from one side plus that
+hidden from the other, ln D^2 has the mean a + b u + c u^2 at one place and a' + b' u at two; both were
+measured, too. D^2 is taken as gamma distributed with these means, and the logarithm of the ratio of the two
+densities is the evidence for one place. It goes to 0 where little was seen.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+
+from pc2grid.geometry import F32, F64, I64, freeze
+from pc2grid.io.atomic import replace_file
+from signature.visible import parts, signature_columns
+
+DIMENSIONS = 24
+"""Length of the vectors. On real windows of buildings that were left out, 48, 96 and all, which is
+Mahalanobis' distance, find as many places: docs/method.md."""
+_SHRINK = 0.6
+"""So much of `within` is its diagonal alone, as there are few pairs for so many bins; 0.2 and 0.9 gave 0.01
+and 0.02 less recall among the first 20 of real windows that were left out, which is little."""
+_RIDGE = 1e-3
+"""Added to the diagonal of `within`, as a share of its mean, so that bins that are always empty stay finite;
+0.01 and 0.0001 gave the same."""
+_LEAST_SEEN = 0.7
+"""The weights are learned from pairs of which both sides have seen at least this share of the rays. With 0.5
+and 0.3, 0.01 and 0.03 fewer of real views that were left out found their place among the first 20."""
+_FOLDS = 8
+"""How much a distance says is learned from each of so many parts of the pairs, by weights of the others:
+the pairs that weights are learned from are nearer to each other than those of another building."""
+_TOO_LITTLE = 0.15
+"""Share of the rays; a view that has seen less is not used to learn how much a distance says."""
+COMBINATIONS = tuple(c for n in (1, 2, 3) for c in itertools.combinations(parts(), n))
+"""The names of all combinations of the signatures; the last one is all three."""
+_FILE = Path(__file__).with_name("statistics.npz")
+
+
+FloatArray = TypeVar("FloatArray", F32, F64)
+
+
+class Pairs(NamedTuple):
+    """Signatures of what was seen, (N, K) each: views of `queries`, places of maps at the `same` points, and
+    places of `other` buildings."""
+
+    queries: F32
+    same: F32
+    other: F32
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenStatistics:
+    """What the weights are made of, for the C columns of the three signatures.
+
+    query_mean, place_mean (C,) : means over queries and over places of maps. within, between (C, C) :
+    covariances, see above. spreads (7, 7) : the numbers of a `Spread` for each of `COMBINATIONS`.
+    """
+
+    query_mean: F64
+    place_mean: F64
+    within: F64
+    between: F64
+    spreads: F64
+
+    def __post_init__(self) -> None:
+        freeze(self, "query_mean", np.float64, (None,))
+        freeze(self, "place_mean", np.float64, (len(self.query_mean),))
+        for name in ("within", "between"):
+            freeze(self, name, np.float64, (len(self.query_mean), len(self.query_mean)))
+        freeze(self, "spreads", np.float64, (len(COMBINATIONS), 7))
+
+    @staticmethod
+    def of(pairs: Pairs, *, seed: int = 0) -> SeenStatistics:
+        """The weights from pairs of which enough was seen, how much a distance says from all; pairs of one
+        recording are side by side."""
+        return replace(SeenStatistics.without_spreads(pairs), spreads=fitted_spreads(pairs, seed=seed))
+
+    @staticmethod
+    def without_spreads(pairs: Pairs) -> SeenStatistics:
+        """What the weights are made of, alone."""
+        enough = (pairs.queries[:, -1] >= _LEAST_SEEN) & (pairs.same[:, -1] >= _LEAST_SEEN)
+        queries, same = (rows[enough][:, signature_columns()].astype(np.float64) for rows in pairs[:2])
+        apart = (queries - queries.mean(axis=0)) - (same - same.mean(axis=0))
+        places = np.concatenate((pairs.other[:, signature_columns()], same)).astype(np.float64)
+        every = places - places.mean(axis=0)
+        return SeenStatistics(
+            query_mean=queries.mean(axis=0),
+            place_mean=places.mean(axis=0),
+            within=apart.T @ apart / len(apart),
+            between=every.T @ every / len(every),
+            spreads=np.zeros((len(COMBINATIONS), 7)),
+        )
+
+    def columns(self, names: Sequence[str] = ()) -> I64:
+        """The columns of the signatures `names`, by default of all."""
+        return np.concatenate([np.r_[part] for name, part in parts().items() if not names or name in names])
+
+    def spread(self, names: Sequence[str] = ()) -> Spread:
+        """How much the distance by some of the signatures says."""
+        chosen = tuple(name for name in parts() if not names or name in names)
+        a, b, c, d, e, one, two = self.spreads[COMBINATIONS.index(chosen)].tolist()
+        return Spread(one_place=(a, b, c), two_places=(d, e), one_shape=one, two_shape=two)
+
+    def save(self, path: Path) -> None:
+        """Write them to an .npz file."""
+        content = {field.name: getattr(self, field.name).astype(np.float32) for field in fields(self)}
+        with replace_file(path) as draft, draft.open("wb") as file:
+            np.savez_compressed(file, **content)
+
+    @staticmethod
+    def load(path: Path = _FILE) -> SeenStatistics:
+        """Read what `save` has written; by default the statistics that come with the program, which
+        `pc2grid_lab.fit.signatures` has learned from real logs."""
+        with np.load(path, allow_pickle=False) as file:
+            return SeenStatistics(
+                **{field.name: file[field.name].astype(np.float64) for field in fields(SeenStatistics)}
+            )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeenWeights:
+    """A linear map of signatures to vectors whose Euclidean distance tells places apart.
+
+    query_mean, place_mean (C,), matrix (C, D).
+    """
+
+    query_mean: F64
+    place_mean: F64
+    matrix: F64
+
+    @staticmethod
+    def of(statistics: SeenStatistics, names: Sequence[str] = ()) -> SeenWeights:
+        """The best weights of the signatures `names`, by default of all of `signature.visible.parts`."""
+        from scipy.linalg import eigh
+
+        columns = statistics.columns(names)
+        chosen = np.ix_(columns, columns)
+        within = statistics.within[chosen]
+        variances = np.diag(within)
+        within = (1.0 - _SHRINK) * within + np.diag(_SHRINK * variances + _RIDGE * variances.mean())
+        quotients, directions = eigh(statistics.between[chosen], within)
+        matrix = np.zeros((len(statistics.query_mean), min(DIMENSIONS, len(columns))))
+        matrix[columns] = directions[:, np.argsort(-quotients)[: matrix.shape[1]]]
+        return SeenWeights(query_mean=statistics.query_mean, place_mean=statistics.place_mean, matrix=matrix)
+
+    def of_queries(self, signatures: F32) -> F32:
+        """Vectors (N, D) of views of queries, given as (N, K)."""
+        return np.asarray((signatures[:, signature_columns()] - self.query_mean) @ self.matrix, np.float32)
+
+    def of_places(self, signatures: F32) -> F32:
+        """Vectors (N, D) of places of maps, given as (N, K)."""
+        return np.asarray((signatures[:, signature_columns()] - self.place_mean) @ self.matrix, np.float32)
+
+
+learned = functools.cache(SeenStatistics.load)
+"""The statistics that come with the program; read once."""
+
+
+@functools.cache
+def seen_weights(*names: str) -> SeenWeights:
+    """The weights of all three signatures, or of those named, by the statistics that come with the
+    program."""
+    return SeenWeights.of(learned(), names)
+
+
+def fitted_spreads(pairs: Pairs, *, seed: int = 0) -> F64:
+    """(7, 7) the numbers of a `Spread` for each of `COMBINATIONS`, by pairs in `_FOLDS` parts, see there."""
+    rng, every = np.random.default_rng(seed), np.arange(len(pairs.queries))
+    folds = []
+    for held in np.array_split(every, _FOLDS):
+        queries, same = (np.delete(rows, held, axis=0) for rows in pairs[:2])
+        learned_from = SeenStatistics.without_spreads(Pairs(queries, same, pairs.other))
+        folds.append((Pairs(pairs.queries[held], pairs.same[held], pairs.other), learned_from))
+
+    def spread(names: Sequence[str]) -> Spread:
+        found = [squared_distances(held, SeenWeights.of(by, names), rng) for held, by in folds]
+        return Spread.of(*(np.concatenate(each) for each in zip(*found, strict=True)))
+
+    return np.array([spread(names).numbers() for names in COMBINATIONS])
+
+
+def squared_distances(
+    pairs: Pairs, weights: SeenWeights, rng: np.random.Generator
+) -> tuple[F64, F64, F64, F64]:
+    """The arguments of `Spread.of`: of pairs at one place, and of as many at two, with a place of another
+    building, and of another pair.
+
+    Pairs of which one side has seen less than `_TOO_LITTLE` are left out.
+    """
+    kept = (pairs.queries[:, -1] > _TOO_LITTLE) & (pairs.same[:, -1] > _TOO_LITTLE)
+    queries, same = pairs.queries[kept], pairs.same[kept]
+    other = pairs.other[rng.integers(0, len(pairs.other), len(queries))]
+    shuffled = same[rng.permutation(len(same))]
+    at = weights.of_queries(queries)
+    squared, hidden = zip(
+        *(
+            (((at - weights.of_places(rows)) ** 2).sum(axis=1), 2.0 - queries[:, -1] - rows[:, -1])
+            for rows in (same, other, shuffled)
+        ),
+        strict=True,
+    )
+    return squared[0], hidden[0], np.concatenate(squared[1:]), np.concatenate(hidden[1:])
+
+
+@functools.cache
+def seen_spread(*names: str) -> Spread:
+    """How much the distance by the signatures of `seen_weights` says."""
+    return learned().spread(names)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spread:
+    """How D^2 is distributed: coefficients of the mean of ln D^2, and shapes of the gamma distributions.
+
+    one_place : a, b, c. two_places : a', b'. See the text above.
+    """
+
+    one_place: tuple[float, float, float]
+    two_places: tuple[float, float]
+    one_shape: float
+    two_shape: float
+
+    @staticmethod
+    def of(one_place: F64, one_hidden: F64, two_places: F64, two_hidden: F64) -> Spread:
+        """From squared distances (N,) and (M,) with the hidden shares u of each.
+
+        The variance of the logarithm of a gamma variable of shape k is about 1 / (k - 1/2).
+        """
+        one = np.polynomial.polynomial.polyfit(one_hidden, np.log(one_place), 2)
+        two = np.polynomial.polynomial.polyfit(two_hidden, np.log(two_places), 1)
+        rest = [
+            np.log(squares) - np.polynomial.polynomial.polyval(hidden, fit)
+            for squares, hidden, fit in ((one_place, one_hidden, one), (two_places, two_hidden, two))
+        ]
+        a, b, c = one.tolist()
+        first, second = two.tolist()
+        return Spread(
+            one_place=(a, b, c),
+            two_places=(first, second),
+            one_shape=float(1.0 / rest[0].var() + 0.5),
+            two_shape=float(1.0 / rest[1].var() + 0.5),
+        )
+
+    def numbers(self) -> tuple[float, ...]:
+        """All seven, in the order of the fields."""
+        return (*self.one_place, *self.two_places, self.one_shape, self.two_shape)
+
+    def log_ratio(self, squared: FloatArray, hidden: FloatArray) -> FloatArray:
+        """Natural logarithm of the ratio of the likelihoods of one place and of two, elementwise, as exact as
+        the arguments: float32 takes a quarter of the time.
+
+        squared : D^2. hidden : u, 0..2.
+        """
+        one, two, (a, b, c) = self.one_shape, self.two_shape, self.one_place
+        # The mean of the logarithm of a gamma variable is about the logarithm of its mean less 1 / (2 k).
+        mean_two = self.two_places[0] + self.two_places[1] * hidden + 0.5 / two
+        mean_one = np.minimum(a + hidden * (b + hidden * c) + 0.5 / one, mean_two)
+        # The ratio of the gamma densities falls again towards 0; a view that is nearer than most views of one
+        # place are is no less likely than these.
+        nearest = (one - two) / np.maximum(one * np.exp(-mean_one) - two * np.exp(-mean_two), 1e-9)
+        x = np.log(np.maximum(squared, np.maximum(nearest, 1e-3)))
+        same = one * (math.log(one) - mean_one + x - np.exp(x - mean_one)) - math.lgamma(one)
+        different = two * (math.log(two) - mean_two + x - np.exp(x - mean_two)) - math.lgamma(two)
+        ratio: FloatArray = same - different
+        return ratio

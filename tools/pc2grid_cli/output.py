@@ -1,0 +1,164 @@
+"""The files that options name for writing; they are checked before any work begins.
+
+The one style of the tables that commands print on stdout.
+
+Data that was lost while a recording was read: the warning, and whether the exit code is 3.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rich.box import SIMPLE_HEAD
+from rich.console import Console
+from rich.table import Table
+
+from pc2grid.errors import OutputError
+from pc2grid.io.atomic import require_writable
+from signature.database.postgres import is_url
+
+if TYPE_CHECKING:
+    from pc2grid.model import ReadReport
+
+
+SUFFIXES: dict[str, tuple[str, ...]] = {
+    "trajectory": (".tum", ".kitti", ".txt"),
+    "map": (".yaml", ".yml", ".pgm"),
+    "cloud": (".ply", ".pcd"),
+    "graph": (".graphml",),
+    "g2o": (".g2o",),
+    "mcap": (".mcap",),
+    "output": (".mcap",),
+    "initialpose": (".json", ".yaml", ".yml"),
+    "plot": (".png",),
+    "report": (".html", ".htm"),
+    "csv": (".csv",),
+}
+"""By option: the suffixes of the files that it writes."""
+_OF_OTHERS = {suffix for known in SUFFIXES.values() for suffix in known} | {".bag", ".db3", ".rrd"}
+"""Suffixes of formats that a database or the stem of a map must not be named after."""
+
+
+def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool = False) -> None:
+    """Refuse a file that the option `--{option}` cannot write; None is no file.
+
+    A name without a suffix is taken, unless the suffix selects the format. any_suffix : the format is given
+    by another option.
+
+    Raises OutputError for a suffix of another format, and as `require_writable`.
+    """
+    if path is None:
+        return
+    known, suffix = SUFFIXES[option], path.suffix.lower()
+    unnamed = any_suffix or (not suffix and option != "cloud")
+    if suffix not in known and not unnamed:
+        raise OutputError(
+            f"{path}: --{option} does not write the format {suffix or '(no suffix)'}",
+            hint=f"end its name in {' or '.join(known)}",
+        )
+    require_writable(path, force)
+
+
+def files_of(**options: Path | None) -> dict[str, Path]:
+    """What is to be written, by option; an option that was not given is left out."""
+    return {option: path for option, path in options.items() if path is not None}
+
+
+def written_files(outputs: Mapping[str, Path]) -> list[Path]:
+    """The files of some options; `map` names the stem of two."""
+    files = []
+    for option, path in outputs.items():
+        ends = (".yaml", ".pgm") if option == "map" else ("",)
+        files += [path.with_name(f"{path.name}{end}") for end in ends]
+    return files
+
+
+def map_stem(path: Path) -> Path:
+    """The stem of a nav2 map: its files are STEM.yaml and STEM.pgm. Either may be named instead of the stem.
+
+    Raises OutputError for the suffix of another format.
+    """
+    suffix = path.suffix.lower()
+    if suffix in SUFFIXES["map"]:
+        return path.with_suffix("")
+    if suffix in _OF_OTHERS:
+        raise OutputError(
+            f"{path}: --map writes STEM.yaml and STEM.pgm, not the format {suffix}",
+            hint=f"give the stem: --map {path.with_suffix('')}",
+        )
+    return path
+
+
+def check_database_name(output: str) -> None:
+    """Raises OutputError if the file of a new database has the suffix of another format."""
+    path = Path(output)
+    if path.suffix.lower() in _OF_OTHERS:
+        raise OutputError(
+            f"{output}: a submap database is not written as {path.suffix}",
+            hint=f"end its name in .submaps: -o {path.with_suffix('.submaps')}",
+        )
+
+
+def check_database(output: str) -> None:
+    """Raises OutputError if the file of a database cannot be written; a server is asked later."""
+    if not is_url(output):
+        require_writable(output, overwrite=True)
+
+
+def make_folder(path: Path) -> None:
+    """Make the folder for results. Raises OutputError if it cannot be made or written to."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: cannot make this folder: {error.strerror}", hint="choose another one with --output"
+        ) from error
+    require_writable(path / "results", overwrite=True)
+
+
+_WIDEST = 10_000
+"""Columns of text: a table is as wide as what it holds. A narrow terminal breaks its lines, but nothing is
+left out."""
+
+
+def table(title: str, texts: Iterable[str], numbers: Iterable[str] = ()) -> Table:
+    """An empty table: columns of texts, aligned left, and then columns of numbers, aligned right."""
+    made = Table(
+        title=title,
+        title_justify="left",
+        title_style="bold",
+        box=SIMPLE_HEAD,
+        pad_edge=False,
+        collapse_padding=True,
+        highlight=False,
+    )
+    for heading in texts:
+        made.add_column(heading, no_wrap=True)
+    for heading in numbers:
+        made.add_column(heading, justify="right", no_wrap=True)
+    return made
+
+
+def show(*parts: Table | str) -> None:
+    """Print tables, and sentences between them."""
+    console = Console(width=_WIDEST, highlight=False)
+    for part in parts:
+        if isinstance(part, str):
+            print(part)
+        else:
+            console.print(part)
+
+
+def sentence(report: ReadReport) -> str:
+    """What was lost, by reason, for a warning."""
+    parts = [f"{count} scans skipped ({reason})" for reason, count in report.scans_skipped.items()]
+    if report.bytes_lost:
+        parts.append(f"{report.bytes_lost} bytes unreadable")
+    return f"data was lost: {', '.join(parts)}"
+
+
+def ends_with_3(report: ReadReport, strict: bool) -> bool:
+    """Whether the loss is severe; with `strict` any loss is."""
+    return report.severe or (strict and report.lossy)
