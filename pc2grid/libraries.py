@@ -1,14 +1,13 @@
-"""The packages that only some commands need, and how they are asked for: all before any work, all at once.
+"""How libraries are used: extras that a command asks for, threads of BLAS, and functions that numba compiles.
 
-`pip install .` installs none of them. pc2grid is on no package index, so `pip install '.[live]'` works only
-where its source is; the packages themselves can be named everywhere.
+Extras: `pip install .` installs none of them. pc2grid is on no package index, so `pip install '.[live]'`
+works only where its source is; the packages themselves can be named everywhere. A command asks for all that
+it needs at once, before any work.
 
-How many threads the numeric libraries use: one for BLAS.
-
-The matrices of pc2grid have some hundred rows. OpenBLAS divides the work on them among threads that spin
-while they wait: a depth camera took five times the processor time of one thread, a lidar nearly twice. The
-threads of Open3D and OpenCV cost nothing and keep their own defaults. KISS-ICP runs with one thread, because
-its sums depend on the number (`pc2grid.estimation.registration`).
+Threads: one for BLAS. The matrices of pc2grid have some hundred rows. OpenBLAS divides the work on them among
+threads that spin while they wait: a depth camera took five times the processor time of one thread, a lidar
+nearly twice. The threads of Open3D and OpenCV cost nothing and keep their own defaults. KISS-ICP runs with
+one thread, because its sums depend on the number (`pc2grid.estimation.registration`).
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from collections.abc import Callable, Iterator, Mapping, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass
 from importlib import import_module
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec, TypeVar, cast
 
 from pc2grid.errors import ClusterError, ConfigError, DatabaseError, LiveError, Pc2GridError
 
@@ -144,3 +143,38 @@ def one_blas_thread_each(items: Iterator[T]) -> Iterator[T]:
         while True:
             item = advance()
             yield item
+
+
+class _Compiled:
+    """A function that numba compiles when it is called first; importing numba takes 0.2 s."""
+
+    def __init__(self, function: Callable[..., Any], options: Mapping[str, Any]) -> None:
+        self._function, self._options = function, options
+        functools.update_wrapper(self, function)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.dispatcher(*args)
+
+    @functools.cached_property
+    def dispatcher(self) -> Any:
+        """Numba's function. In its module it stands in the place of this one, for others that call it."""
+        from numba import njit
+
+        names = self._function.__globals__
+        found = self.__dict__["dispatcher"] = njit(cache=True, **self._options)(self._function)
+        for name, value in list(names.items()):
+            if isinstance(value, _Compiled):
+                names[name] = value.dispatcher
+        return found
+
+
+_Function = TypeVar("_Function", bound=Callable[..., Any])
+
+
+def compiled(**options: Any) -> Callable[[_Function], _Function]:
+    """Compile a function of numbers and arrays by `numba.njit(cache=True, **options)` at its first call."""
+
+    def decorate(function: _Function) -> _Function:
+        return cast(_Function, _Compiled(function, options))
+
+    return decorate

@@ -13,11 +13,11 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.libraries import compiled
 from pc2grid.model import Submap
 from pc2grid.submaps.junction_graph import sample_evenly, thin
 from pc2grid.submaps.submaps import HIDDEN, OPEN, WALL, ray_ends
@@ -131,7 +131,7 @@ def as_shares(counts: NDArray[np.number]) -> F64:
     return np.asarray(counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0), np.float64)
 
 
-@numba.njit(cache=True)
+@compiled()
 def pair_counts(cells: I64, bin_of: NDArray[np.int32], bins: int) -> I64:
     """How many pairs of cells (N, 2) lie in each bin of their distance: (bins,).
 
@@ -152,7 +152,7 @@ def pair_counts(cells: I64, bin_of: NDArray[np.int32], bins: int) -> I64:
     return counts
 
 
-@numba.njit(cache=True)
+@compiled()
 def weighed_pairs(points: F64, walls: F64, opens: F64, counts: F64) -> None:
     """Add the weights of all pairs of points (N, B, 2) to `counts` (N, R, bins + 2) of their distance.
 

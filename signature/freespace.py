@@ -12,11 +12,11 @@ import math
 from itertools import chain
 from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.libraries import compiled
 from pc2grid.model import OccupancyGrid, Submap
 from pc2grid.submaps.junction_graph import sample_evenly, skeleton_of
 from pc2grid.submaps.submaps import HIDDEN, ray_ends
@@ -246,7 +246,7 @@ def _nodes(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, NDArray[np.bool_
     return points_m, known, visible
 
 
-@numba.njit(cache=True)
+@compiled()
 def in_sight(
     occupied: NDArray[np.bool_], cells: I64, first: NDArray[np.intp], second: NDArray[np.intp]
 ) -> NDArray[np.bool_]:

@@ -12,7 +12,6 @@ import numpy as np
 from pc2grid.display import html_table, short
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
 from pc2grid.model import Loop, OccupancyGrid, PointMap, SessionMap, Submap, Trajectory
-from pc2grid.submaps.junction_graph import graph_from_arrays
 from pc2grid.submaps.submaps import view_at
 from signature.config import Config
 from signature.database import document
@@ -23,6 +22,7 @@ from signature.database.document import (
     StoredSession,
     SubmapArrays,
     explained,
+    graph_from_arrays,
     stored_session,
 )
 from signature.database.protocol import BuildingFrame, Label, Problem, Provenance, SessionInfo

@@ -17,11 +17,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64, I64
+from pc2grid.libraries import compiled
 from signature.visible import LATTICE_M, SeenPlaces, View, seen_signatures
 from signature.weights import SeenWeights, Spread, seen_spread, seen_weights
 
@@ -209,7 +209,7 @@ def turned(steps_m: F64) -> F64:
     return np.asarray(np.einsum("hij,...j->h...i", turn, steps_m), np.float64)
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def best_headings(
     scores: F32,
     squares: F32,

@@ -31,12 +31,11 @@ from pc2grid.model import (
     Trajectory,
     UncertainStretch,
 )
-from pc2grid.submaps.junction_graph import graph_to_arrays
 from pc2grid.submaps.submaps import view_at
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database import Provenance, SubmapDatabase, open_database
-from signature.database.document import row_crc, unpack
+from signature.database.document import graph_to_arrays, row_crc, unpack
 from signature.database.protocol import Entry
 from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
 from signature.freespace import freespace_bins

@@ -18,16 +18,14 @@ from sklearn.cluster import DBSCAN
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.junction_graph import (
-    GraphArrays,
     clusters,
-    graph_from_arrays,
-    graph_to_arrays,
     junction_graph,
     junctions_and_ends,
     map_skeleton,
     pixel_steps,
 )
 from pc2grid.submaps.submaps import partition, submap_at
+from signature.database.document import GraphArrays, graph_from_arrays, graph_to_arrays
 from tests.helpers.rooms import canvas, cross, grid_of
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
