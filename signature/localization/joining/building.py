@@ -1,25 +1,16 @@
 """All sessions of a database joined: pairs of sessions become buildings with one frame each.
 
-Sessions are compared in pairs (`pairing`). The pairs that were joined make buildings, and say where the
-sessions lie (`placing`). One pose graph over all that they have measured says how they are bent
-(`straightening`).
-
-Where sessions lie in their buildings, by the pairs that were joined.
-
-Pairs are joined in the order of their probability (Kruskal's algorithm), so each building begins with what
-is surest, and never two sessions into one building whose labels name different buildings or floors. Then one
-pose graph over the sessions, each pair a robust edge, says where they lie, and how exactly.
-
-One pose graph over the sessions of a building: what one of them knows straightens another one.
-
-A session is the graph that it was mapped by, the steps of its way and its own loops, in a frame of its own
-(the anchors of Kim et al., "Multiple relative pose graphs for robust cooperative mapping", ICRA 2010). At the
-poses that it was drawn with its graph is at rest, so it resists every bend as much as it has measured: a
-session with many loops is stiff, and one that drifts is soft. Sessions are linked by the pieces of one that
-were found in the map of another one (`pieces`). Maps without a way, and sessions that are to stay where they
-are, are rigid.
-
-The maps of joined sessions as one: what stands there now.
+1. Every two sessions are compared (`signature.localization.joining.join`).
+2. Pairs are taken in the order of their probability (Kruskal's algorithm), so each building begins with what
+   is surest, and never two sessions in one building whose labels name different buildings or floors. Then one
+   pose graph over the sessions, each pair a robust edge, gives where they lie, and how exactly (`place`).
+3. One pose graph over all that the sessions have measured gives how they are bent: what one of them knows
+   straightens another one (`straighten`). A session is the graph that it was mapped by, the steps of its way
+   and its own loops, in a frame of its own (the anchors of Kim et al., "Multiple relative pose graphs for
+   robust cooperative mapping", ICRA 2010). At the poses that it was drawn with its graph is at rest, so it
+   resists every bend as much as it has measured: a session with many loops is stiff, and one that drifts is
+   soft. Maps without a way, and sessions that are to stay where they are, are rigid.
+4. The maps of a building are drawn as one: what stands there now (`building_map`).
 """
 
 from __future__ import annotations
@@ -89,7 +80,7 @@ def join_sessions(
     only: Collection[str] | None = None,
     observer: Observer = Observer(),
 ) -> Joined:
-    """Which sessions of a database show one building, and how they lie in its frame.
+    """Find which sessions of a database show one building, and how they lie in its frame.
 
     frame : the session whose map frame is that of its building. None: the frame of those that were joined
     before, else of the session that was stored first. only : sessions that are joined, with the others and
@@ -128,7 +119,7 @@ def _lying(
     joined: Sequence[SessionPair],
     stay: Mapping[str, BuildingFrame],
 ) -> tuple[dict[str, BuildingFrame], set[Names]]:
-    """How the sessions of one building lie and are bent, and the names of the pairs that count."""
+    """Return how the sessions of one building lie and are bent, and the names of the pairs that count."""
     within = [pair for pair in joined if pair.target in tree and pair.source in tree]
     placed, counted = place(tree, anchor, within, stay)
     links = {pair.names: pair.join.links for pair in within if pair.names in counted}
@@ -138,7 +129,7 @@ def _lying(
 def buildings_of(
     infos: Mapping[str, SessionInfo], joined: Sequence[SessionPair], stay: Mapping[str, BuildingFrame]
 ) -> list[nx.Graph]:
-    """The sessions of each building, two at least, as a tree of the surest pairs, its edges with `pair`.
+    """Return the sessions of each building, two at least, as a tree of the surest pairs; edges have `pair`.
 
     stay : sessions that lie in buildings already, which stay apart; their edges have none.
     """
@@ -164,7 +155,7 @@ def anchor_of(
     known: Mapping[str, BuildingFrame],
     stay: Mapping[str, BuildingFrame],
 ) -> tuple[str, BuildingFrame]:
-    """The session of a building that stays where it is, and where that is.
+    """Return the session of a building that stays where it is, and where that is.
 
     frame : the session whose map frame is that of its building, if it is one of the `members`; else that of
     one that stays, or that was joined before, or the first one.
@@ -176,7 +167,7 @@ def anchor_of(
 
 
 def _frame_of(name: str) -> BuildingFrame:
-    """The frame of a building that is that of a session."""
+    """Return the frame of a building that has the frame of a session."""
     return BuildingFrame(name=name, T_building_session=SE2(), covariance=_rows(np.zeros((3, 3))))
 
 
@@ -186,7 +177,7 @@ def place(
     joined: Sequence[SessionPair],
     stay: Mapping[str, BuildingFrame],
 ) -> tuple[dict[str, BuildingFrame], set[Names]]:
-    """Where the sessions of a building lie, by all its joined pairs, and the names of those that count."""
+    """Place the sessions of a building by all its joined pairs; return also the names of those that count."""
     first, at = anchor
     poses = _along_tree(tree, anchor, stay)
     number = {name: k for k, name in enumerate(poses)}
@@ -223,7 +214,7 @@ def place(
 def _along_tree(
     tree: nx.Graph, anchor: tuple[str, BuildingFrame], stay: Mapping[str, BuildingFrame]
 ) -> dict[str, SE2]:
-    """Where the sessions of a building lie by its surest pairs alone, the anchor first."""
+    """Place the sessions of a building by its surest pairs alone, the anchor first."""
     import networkx as nx
 
     first, at = anchor
@@ -237,7 +228,7 @@ def _along_tree(
 
 
 def _covariances(poses: F64, edges: Sequence[Edge]) -> F64:
-    """(N - 1, 3, 3) of all poses but the first, which stays where it is."""
+    """Return the covariances (N - 1, 3, 3) of all poses but the first, which stays where it is."""
     information = information_matrix(poses, edges).toarray()[3:, 3:]
     blocks = np.linalg.inv(information).reshape(len(poses) - 1, 3, len(poses) - 1, 3)
     diagonal = np.arange(len(poses) - 1)
@@ -267,7 +258,7 @@ class SessionBody:
 
     @property
     def rigid(self) -> bool:
-        """Whether nothing can bend it."""
+        """Tell whether nothing can bend it."""
         return len(self.nodes) == 1
 
 
@@ -275,7 +266,7 @@ RIGID = SessionBody(np.zeros((1, 3)))
 
 
 def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision | None) -> SessionBody:
-    """The graph of a session over the local maps that its precision is known of.
+    """Return the graph of a session over the local maps whose precision is known.
 
     Its steps and loops say how stiff its parts are to each other. As a whole it is as stiff as its precision
     says, which knows also what the local maps show of each step.
@@ -306,14 +297,14 @@ def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision 
 
 
 def _lost(trajectory: Trajectory, begin: int, end: int) -> bool:
-    """Whether tracking was lost from one scan to another."""
+    """Tell whether tracking was lost from one scan to another."""
     return Health.LOST in trajectory.health[begin : end + 1]
 
 
 def bodies_of(
     database: SubmapDatabase, names: Collection[str], held: Collection[str]
 ) -> dict[str, SessionBody]:
-    """The graphs of sessions. held : those that stay as they are."""
+    """Return the graphs of sessions. held : those that stay as they are."""
     found = dict.fromkeys(names, RIGID)
     for info in database.sessions([name for name in names if name not in held]):
         found[info.name] = body_of(database.trajectory(info.name), database.loops(info.name), info.precision)
@@ -326,7 +317,7 @@ def straighten(
     links: Mapping[tuple[str, str], Sequence[Link]],
     held: Collection[str] = (),
 ) -> dict[str, BuildingFrame]:
-    """Where the sessions of a building lie, and how they are bent there, by all that they know.
+    """Solve for where the sessions of a building lie, and how they are bent there, by all that they measured.
 
     bodies : of the sessions. frames : where they lie as they were drawn; the first stays there, on an average
     over its way. links : of a target and a source, by their names. held : rigid ones that stay, too.
@@ -349,7 +340,7 @@ def _solved(
     links: Mapping[tuple[str, str], Sequence[Link]],
     held: Collection[str],
 ) -> dict[str, F64]:
-    """The poses (N, 3) of the nodes of each session in the building; the first node of all stays."""
+    """Solve for the poses (N, 3) of the nodes of each session in the building; the very first stays."""
     counts = [len(bodies[name].nodes) for name in frames]
     first = dict(zip(frames, np.cumsum([0, *counts]).tolist(), strict=False))
     T_first_building = frames[next(iter(frames))].T_building_session.inverse()
@@ -379,8 +370,10 @@ def _lying_straight(
     solved: Mapping[str, F64],
     held: Collection[str],
 ) -> dict[str, BuildingFrame]:
-    """Where sessions lie, and how they are bent, by the poses of their nodes; the first one lies where it
-    lay, and `held` are as they were."""
+    """Divide the solved poses of nodes into where each session lies and how it is bent.
+
+    The first session lies where it lay, and `held` are as they were.
+    """
     T = {name: _placement(bodies[name].nodes, poses) for name, poses in solved.items()}
     first = next(iter(frames))
     T_building_solved = frames[first].T_building_session @ T[first].inverse()
@@ -393,14 +386,14 @@ def _lying_straight(
 
 
 def _moved(T: SE2, poses: F64) -> F64:
-    """Poses (N, 3), each x, y, yaw, in another frame."""
+    """Return poses (N, 3), each x, y, yaw, in another frame."""
     return np.column_stack((T.apply(poses[:, :2]), poses[:, 2] + T.yaw))
 
 
 def _edge(
     link: Link, target: SessionBody, source: SessionBody, in_target: BuildingFrame, in_source: BuildingFrame
 ) -> Edge:
-    """What a piece of the source says of the two nodes that are nearest to it.
+    """Return the edge that a piece of the source makes between the two nodes that are nearest to it.
 
     The frames tell how sessions that stay are bent already. The piece was found wherever the poses are, so
     that they disagree with it is no evidence against it.
@@ -422,12 +415,12 @@ def _edge(
 
 
 def _nearest(body: SessionBody, x_m: float, y_m: float) -> int:
-    """The node that is nearest to a place of the session's map."""
+    """Return the node that is nearest to a place of the session's map."""
     return int(np.argmin(np.hypot(body.nodes[:, 0] - x_m, body.nodes[:, 1] - y_m)))
 
 
 def _placement(nodes: F64, solved: F64) -> SE2:
-    """Where a session lies, on an average over its nodes."""
+    """Return where a session lies, on an average over its nodes."""
     turned = solved[:, 2] - nodes[:, 2]
     yaw = math.atan2(float(np.sin(turned).sum()), float(np.cos(turned).sum()))
     x, y = (solved[:, :2] - SE2(0.0, 0.0, yaw).apply(nodes[:, :2])).mean(axis=0).tolist()
@@ -435,8 +428,10 @@ def _placement(nodes: F64, solved: F64) -> SE2:
 
 
 def _bend(nodes: F64, solved: F64, T: SE2) -> Bend:
-    """How a session is bent where it lies at T: a row for each square of its way, as wide as a local map is
-    long; none if hardly."""
+    """Return how a session is bent where it lies at T: a row for each square of its way, none if hardly.
+
+    A square is as wide as a local map is long.
+    """
     moved = np.column_stack((T.inverse().apply(solved[:, :2]) - nodes[:, :2], solved[:, 2] - nodes[:, 2]))
     moved[:, 2] = wrap_angle(moved[:, 2] - T.yaw)
     _, square = np.unique(np.floor(nodes[:, :2] / LOOPS.travel_m), axis=0, return_inverse=True)
@@ -456,10 +451,10 @@ _SQUARE_M = 1.0
 
 
 def building_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGrid:
-    """The maps of sessions, oldest first, each with where it lies, as one in the building's frame.
+    """Draw the maps of sessions, oldest first, each with where it lies, as one in the building's frame.
 
-    Cells are as large as those of the first map; each is what the newest map says that is sure of its centre
-    (free, occupied, or a thing); where none is sure, the oldest that knows it.
+    Cells are as large as those of the first map. Each has the value of the newest map that is sure of its
+    centre (free, occupied, or a thing); where none is sure, of the oldest that knows it.
     Raises ValueError without a map.
 
     >>> import pc2grid
@@ -481,12 +476,12 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> Occupan
 
 
 def _sure(cells: Cells) -> BoolGrid:
-    """Where a map says what is there: an obstacle, a thing, or nothing."""
+    """Return where a map is sure: of an obstacle, of a thing, or of nothing."""
     return np.asarray((cells >= OCCUPIED_FROM) | (cells == THING) | ((cells >= FREE) & (cells < FREE_BELOW)))
 
 
 def _around(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGrid:
-    """A grid of unknown cells that holds all maps."""
+    """Return a grid of unknown cells that holds all maps."""
     if not maps:
         raise ValueError("a building without a map")
     cell_m = maps[0][0].resolution_m
@@ -506,7 +501,7 @@ def _around(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGri
 def _drawn(
     maps: Sequence[tuple[OccupancyGrid, BuildingFrame]], whole: OccupancyGrid
 ) -> Iterator[tuple[tuple[slice, slice], Cells]]:
-    """For each map the window of the grid that it lies in, and what it says of the cells there."""
+    """Yield for each map the window of the grid that it lies in, and its values for the cells there."""
     for grid, frame in maps:
         rows, columns = _covered(whole, _corners(grid, frame))
         told = _cells_at(grid, _as_drawn(frame, whole, rows, columns).reshape(-1, 2))
@@ -515,7 +510,7 @@ def _drawn(
 
 
 def _corners(grid: OccupancyGrid, frame: BuildingFrame) -> F64:
-    """(4, 2) of a map, wherever it is bent to, in the building."""
+    """Return the corners (4, 2) of a map, wherever it is bent to, in the building."""
     height, width = grid.cells.shape
     around_m = largest_m(frame.bend)
     corners = np.array([(0, 0), (width, 0), (0, height), (width, height)], np.float64) * grid.resolution_m
@@ -526,7 +521,7 @@ def _corners(grid: OccupancyGrid, frame: BuildingFrame) -> F64:
 def _as_drawn(
     frame: BuildingFrame, whole: OccupancyGrid, rows: NDArray[np.int64], columns: NDArray[np.int64]
 ) -> F64:
-    """Where the centres of cells of a building (R, C, 2) lie in the map of a session.
+    """Return where the centres of cells of a building (R, C, 2) lie in the map of a session.
 
     A bend changes little from cell to cell: it is inverted for the middles of large squares, and in between
     it is interpolated.
@@ -548,14 +543,14 @@ def _as_drawn(
 def _covered(
     whole: OccupancyGrid, corners_m: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows and columns of a grid that a box with these corners may lie in."""
+    """Return the rows and columns of a grid that a box with these corners may lie in."""
     at = whole.to_cell(corners_m)
     low, high = at.min(axis=0).clip(min=0), at.max(axis=0).clip(max=np.array(whole.cells.shape) - 1)
     return np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
 
 
 def _cells_at(grid: OccupancyGrid, points_m: NDArray[np.float64]) -> NDArray[np.int8]:
-    """The cells (N,) of a grid at points (N, 2); unknown outside."""
+    """Return the cells (N,) of a grid at points (N, 2); unknown outside."""
     at = grid.to_cell(points_m)
     inside = ((at >= 0) & (at < grid.cells.shape)).all(axis=1)
     found = np.full(len(at), UNKNOWN, np.int8)
@@ -564,7 +559,7 @@ def _cells_at(grid: OccupancyGrid, points_m: NDArray[np.float64]) -> NDArray[np.
 
 
 def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> tuple[tuple[str, ...], ...]:
-    """The joined sessions of each floor, the oldest first. frames : of sessions, by name."""
+    """Return the joined sessions of each floor, the oldest first. frames : of sessions, by name."""
     floors: dict[str, list[str]] = {}
     for name in (info.name for info in database.sessions() if info.name in frames):
         floors.setdefault(frames[name].name, []).append(name)
@@ -572,7 +567,7 @@ def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> 
 
 
 def map_of(database: SubmapDatabase, session: str, frames: Mapping[str, BuildingFrame]) -> OccupancyGrid:
-    """The map in whose frame answers in a session are: of its floor, or of the session alone.
+    """Return the map in whose frame answers in a session are: of its floor, or of the session alone.
 
     frames : of the sessions whose answers are in the frames of their buildings. A floor is drawn from all its
     sessions, see `building_map`.

@@ -1,23 +1,15 @@
-"""Do two sessions show one building, and how does one lie to the other?
+"""Do two sessions show one building, and how does one lie in the map of the other? (`join_maps`)
 
-The pieces of the source propose transforms (`proposals`); each is refined and scored by the walls of both.
-What is judged is the part of the source that lies on known ground of the target: it is a query that the
-target is asked for, and the posterior of every other answer decides (`posterior`). The other transforms are
-its rivals, with the same part. So are decoys: the source is also matched in its mirror image, which lies
-nowhere for certain. What that scores is what wrong transforms of these two maps score, and where a building
-is symmetric, or another one has its plan turned over, it scores as much as any.
-
-A map in pieces, each aligned by itself: a bent map fits another one in pieces, and nowhere as a whole.
-
-The pieces are aligned one after the other, from the one that proposed a transform outwards. Each begins
-where its nearest neighbour came to lie, so the alignment follows the bend.
-
-How a session may lie in another one: each of its pieces is a query, which is looked up like any other.
-
-Signatures say where in the target a piece may be, and its walls are aligned there
-(`signature.localization.map_index`). A place of one piece is a transform of the whole session.
-
-Sessions compared in pairs: every two that may show one building.
+1. The map of the source is cut into square pieces. Each piece is a query that is looked up in the target like
+   any other (`signature.localization.map_index`); a place of one piece is a transform of the whole source
+   (`proposals`).
+2. Under each transform the pieces are aligned with the walls of the target, one after the other, from the one
+   that proposed it outwards. Each begins where its nearest neighbour came to lie, because a bent map fits
+   another one in pieces, and nowhere as a whole (`align_pieces`, `rigid`).
+3. What is judged is the part of the source that lies on known ground of the target, by the posterior of every
+   other answer. The other transforms are its rivals, with the same part. So are decoys: the pieces of the
+   mirror image of the source, which lies nowhere for certain. They score what wrong transforms of these two
+   maps score, and where a building is symmetric, or another one has its plan turned over, as much as any.
 """
 
 from __future__ import annotations
@@ -51,208 +43,25 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PieceParameters:
-    """How a map is cut, and what of it counts. By hand.
+class JoinParameters:
+    """How a map is cut into pieces, and how a transform of the whole map is judged. By hand.
 
-    side_m : of a square piece: about what a robot sees from a place. least_walls : wall points of a piece, by
-        weight. follows : a piece that agrees less than this does not say where its neighbours begin; wrong
-        places agree by 0.6, see `signature.localization.posterior`.
+    side_m : of a square piece: about what a robot sees from a place.
+    least_walls : wall points of a piece, by weight.
+    follows : a piece that agrees less than this does not show where its neighbours begin; wrong places agree
+        by 0.6, see `signature.localization.posterior`.
+    proposed : transforms that are compared at most: a building of equal rooms has as many.
+    least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
+    accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
+    labelled : prior odds that two sessions show one floor if their labels agree, relative to those of other
+        sessions, which the posterior begins with.
+    wall_m : the ground that a session knows is widened by this, so that the walls at its edge count.
     """
 
     side_m: float = 12.0
     least_walls: float = 20.0
     follows: float = 0.6
-
-
-PIECES = PieceParameters()
-_STEPS = 4
-"""Of Gauss and Newton; only the heading is not linear."""
-
-
-@dataclass(frozen=True, slots=True)
-class Piece:
-    """A square of a map, described as a query. center_m : (x, y) the middle of its walls."""
-
-    query: QueryMap
-    center_m: tuple[float, float]
-
-    @staticmethod
-    def of(square: OccupancyGrid, index: MapIndex) -> Piece:
-        """A square of a map, described as the places of an index are."""
-        query = map_as_query(square, index.made_with, index.config)
-        x, y = query.walls.points_m.mean(axis=0).tolist() if len(query.walls.points_m) else (0.0, 0.0)
-        return Piece(query, (x, y))
-
-    @property
-    def walls(self) -> Walls:
-        """Its walls."""
-        return self.query.walls
-
-
-def pieces_of(index: MapIndex) -> tuple[Piece, ...]:
-    """The squares of the map of one session that hold enough walls."""
-    grid = index.grids[0]
-    side = round(PIECES.side_m / grid.resolution_m)
-    height, width = grid.cells.shape
-    squares = (
-        _square(grid, row, column, side) for row in range(0, height, side) for column in range(0, width, side)
-    )
-    pieces = (Piece.of(square, index) for square in squares if (square.cells > UNKNOWN).any())
-    return tuple(piece for piece in pieces if piece.walls.weight >= PIECES.least_walls)
-
-
-def mirrored(piece: Piece, index: MapIndex) -> Piece:
-    """A piece with x turned into -x."""
-    grid = piece.query.grid
-    right_m = grid.origin_m[0] + grid.cells.shape[1] * grid.resolution_m
-    heights = None if grid.heights is None else grid.heights[:, ::-1]
-    turned = replace(grid, cells=grid.cells[:, ::-1], heights=heights, origin_m=(-right_m, grid.origin_m[1]))
-    return Piece.of(turned, index)
-
-
-def _square(grid: OccupancyGrid, row: int, column: int, side: int) -> OccupancyGrid:
-    here = np.s_[row : row + side, column : column + side]
-    x, y = grid.origin_m
-    return replace(
-        grid,
-        cells=grid.cells[here],
-        heights=None if grid.heights is None else grid.heights[here],
-        origin_m=(x + column * grid.resolution_m, y + row * grid.resolution_m),
-    )
-
-
-def align_pieces(
-    target: SearchMap, pieces: Sequence[Piece], T_target_source: SE2, from_m: tuple[float, float]
-) -> tuple[Fit, ...]:
-    """Where each piece lies in a target. from_m : (x, y) in the source where `T_target_source` is good."""
-    centers_m = np.array([piece.center_m for piece in pieces]).reshape(-1, 2)
-    fits: dict[int, Fit] = {}
-    trusted: list[int] = []
-    for number in np.argsort(np.hypot(*(centers_m - from_m).T), kind="stable").tolist():
-        start = T_target_source
-        if trusted:
-            nearest = np.argmin(np.hypot(*(centers_m[trusted] - centers_m[number]).T))
-            start = fits[trusted[int(nearest)]].T_map_query
-        piece = pieces[number]
-        points_m = piece.walls.facing(target.walls).points_m
-        pose, covariance = refine(target.field, points_m, start, piece.center_m)
-        fits[number] = fit = score_fit(target.walls, piece.walls, pose, covariance)
-        if fit.known_agreement_both_ways >= PIECES.follows:
-            trusted.append(number)
-    return tuple(fits[number] for number in range(len(pieces)))
-
-
-@dataclass(frozen=True, slots=True)
-class PieceFits:
-    """The fits of K pieces under each of H transforms.
-
-    seen, looked_at (H, K) : wall points on known ground, by weight, forward and backward. forward, backward
-    (H, K) : mean likelihood, neutral on unknown ground. agreement (H, K) : forward, on known ground only.
-    """
-
-    seen: F64
-    looked_at: F64
-    forward: F64
-    backward: F64
-    agreement: F64
-
-    @staticmethod
-    def of(fits: Sequence[Sequence[Fit]]) -> PieceFits:
-        """From the fits of all pieces under each transform."""
-
-        def column(name: str) -> F64:
-            return np.array([[getattr(fit, name) for fit in row] for row in fits], ndmin=2)
-
-        looked_at = column("looked_at")
-        return PieceFits(
-            seen=column("compared"),
-            looked_at=looked_at,
-            forward=column("forward"),
-            backward=np.where(looked_at > 0.0, column("backward"), LIKELIHOOD.neutral),
-            agreement=column("known_agreement"),
-        )
-
-    def of_part(self, chosen: int) -> tuple[float, float, F64]:
-        """Agreement forward and backward of one transform where both know the ground, and the score (H,) of
-        all transforms for this part of the source."""
-        seen, looked_at = self.seen[chosen], self.looked_at[chosen]
-        if not seen.sum() or not looked_at.sum():
-            return 0.0, 0.0, np.zeros(len(self.seen))
-        forward = self.forward @ seen / seen.sum()
-        forward[chosen] = self.agreement[chosen] @ seen / seen.sum()
-        backward = self.backward @ looked_at / looked_at.sum()
-        return float(forward[chosen]), float(backward[chosen]), np.sqrt(forward * backward)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Link:
-    """Where a piece of a source lies in a target.
-
-    center_m : (x, y) the middle of its walls, in the source. covariance : (3, 3) of the piece's pose there,
-    in the axes of the target, with what a map leaves open of where it shows anything.
-    """
-
-    center_m: tuple[float, float]
-    T_target_source: SE2
-    covariance: F64
-
-
-def links_of(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[Link, ...]:
-    """The pieces that agree with the target. Those on ground that it hardly knows do not count."""
-    seen = [fit.compared for fit in fits]
-    shown = [k for k, walls in enumerate(seen) if walls >= PIECES.least_walls] or [int(np.argmax(seen))]
-    kept = [k for k in shown if fits[k].known_agreement_both_ways >= PIECES.follows] or shown
-    noise = np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
-    return tuple(
-        Link(
-            center_m=pieces[k].center_m,
-            T_target_source=fits[k].T_map_query,
-            covariance=fits[k].covariance + noise,
-        )
-        for k in kept
-    )
-
-
-def rigid(links: Sequence[Link]) -> tuple[SE2, float]:
-    """The one transform that is nearest to those of the pieces, and how far (m, rms of an axis) these deviate
-    from it.
-
-    Least squares over the poses of the pieces at their middles, each with the information that its walls
-    give: one that shows a corridor only says nothing along it.
-    """
-    middles_m = np.array([link.center_m for link in links])
-    there_m = np.array([link.T_target_source.apply(np.array([link.center_m]))[0] for link in links])
-    yaws = np.array([link.T_target_source.yaw for link in links])
-    information = np.linalg.inv(np.array([link.covariance for link in links]))
-    T = links[0].T_target_source
-    for _ in range(_STEPS):
-        at_m = T.apply(middles_m)
-        error = np.column_stack((there_m - at_m, wrap_angle(yaws - T.yaw)))
-        J = np.tile(np.eye(3), (len(links), 1, 1))
-        J[:, 0, 2], J[:, 1, 2] = T.y - at_m[:, 1], at_m[:, 0] - T.x
-        normal = np.einsum("kia,kij,kjb->ab", J, information, J)
-        x, y, yaw = np.linalg.solve(normal, np.einsum("kia,kij,kj->a", J, information, error)).tolist()
-        T = SE2(T.x + x, T.y + y, wrap_angle(T.yaw + yaw))
-    off_m, weight = T.apply(middles_m) - there_m, information[:, :2, :2]
-    squares = np.einsum("ki,kij,kj->", off_m, weight, off_m) / np.einsum("kii->", weight)
-    return T, math.sqrt(float(squares))
-
-
-JoinStatus = Literal["joined", "ambiguous", "different"]
-"""different: nothing says that the two show one building."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class JoinParameters:
-    """How a transform is verified and judged. By hand.
-
-    least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
-    accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
-    labelled : prior odds that two sessions show one floor if their labels say so, relative to those of other
-        sessions, which the posterior begins with.
-    wall_m : the ground that a session knows is widened by this, so that the walls at its edge count.
-    """
-
+    proposed: int = 20
     least_m2: float = 20.0
     accept: float = 0.99
     labelled: float = 10.0
@@ -260,8 +69,66 @@ class JoinParameters:
 
 
 JOIN = JoinParameters()
-_MIRROR = np.array((-1.0, 1.0), np.float32)
-"""Turns x into -x."""
+
+
+Names = tuple[str, str]
+"""Of two sessions."""
+
+
+JoinStatus = Literal["joined", "ambiguous", "different"]
+"""different: nothing says that the two show one building."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SessionPair:
+    """Two sessions that were compared. accepted : whether their join counts: the pair is joined, and neither
+    labels nor the other pairs contradict it."""
+
+    target: str
+    source: str
+    join: Join
+    accepted: bool = False
+
+    @property
+    def names(self) -> Names:
+        """Return the names of the two sessions."""
+        return self.target, self.source
+
+
+def told_apart(a: SessionInfo, b: SessionInfo) -> bool:
+    """Tell whether labels exclude that two sessions are of one floor of one building."""
+    return a.provenance.label.contradicts(b.provenance.label)
+
+
+def compare_pairs(
+    database: SubmapDatabase, infos: Mapping[str, SessionInfo], only: Collection[str], observer: Observer
+) -> Iterator[SessionPair]:
+    """Join every two sessions that labels do not tell apart, as far as they can be.
+
+    only : one of each pair, at least, is of these.
+    """
+    pairs = [
+        (a, b) for a, b in combinations(infos, 2) if {a, b} & {*only} and not told_apart(infos[a], infos[b])
+    ]
+
+    @functools.cache
+    def prepared(name: str) -> JoinableMap:
+        return JoinableMap(MapIndex.of_session(database, name))
+
+    with observer.step(f"compare {len(pairs)} pairs of sessions"):
+        for done, (a, b) in enumerate(pairs, start=1):
+            labelled = infos[a].provenance.label.agrees(infos[b].provenance.label)
+            join = join_maps(prepared(a), prepared(b), labelled=labelled)
+            yield SessionPair(target=a, source=b, join=join)
+            observer.on_progress(done / len(pairs))
+
+
+def by_building(frames: Mapping[str, BuildingFrame]) -> dict[str, list[str]]:
+    """Return the names of the sessions of each building, by the name of its frame."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for name, at in frames.items():
+        found[at.name].append(name)
+    return found
 
 
 @dataclass(frozen=True)  # no slots, for what is computed once
@@ -275,17 +142,17 @@ class JoinableMap:
 
     @property
     def grid(self) -> OccupancyGrid:
-        """The map."""
+        """Return the map."""
         return self.index.grids[0]
 
     @cached_property
     def walls(self) -> Walls:
-        """Its walls."""
+        """Return its walls."""
         return Walls.of(self.grid)
 
     @cached_property
     def query(self) -> QueryMap:
-        """The map as a query."""
+        """Return the map as a query."""
         return QueryMap(
             stamp_ns=0,
             path_m=0.0,
@@ -298,17 +165,17 @@ class JoinableMap:
 
     @cached_property
     def pieces(self) -> tuple[Piece, ...]:
-        """The map cut in pieces."""
+        """Return the pieces of the map."""
         return pieces_of(self.index)
 
     @cached_property
     def mirrored_pieces(self) -> tuple[Piece, ...]:
-        """The same pieces of the mirror image, with x turned into -x."""
+        """Return the same pieces of the mirror image, with x turned into -x."""
         return tuple(mirrored(piece, self.index) for piece in self.pieces)
 
     @property
     def search(self) -> SearchMap:
-        """The map, prepared to be searched."""
+        """Return the map, prepared to be searched."""
         return self.index.maps[0]
 
 
@@ -351,22 +218,10 @@ UNJOINED = Join(
 """Two sessions whose graphs propose nothing."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Candidate:
-    """A transform that was made exact by walls. at : the piece of the source that proposed it. fits : of each
-    piece of the source. links : of those that agree. covariance : (3, 3) of the transform at `at`."""
-
-    T_target_source: SE2
-    at: SE2
-    fits: tuple[Fit, ...]
-    links: tuple[Link, ...]
-    covariance: F64
-
-
 def join_maps(
     target: JoinableMap, source: JoinableMap, *, labelled: bool = False, parameters: JoinParameters = JOIN
 ) -> Join:
-    """Whether two sessions show one building, and how the source lies in the target.
+    """Decide whether two sessions show one building, and how the source lies in the target.
 
     labelled : labels say that both are of one floor of one building.
     """
@@ -380,36 +235,8 @@ def join_maps(
     return _best(target, source, candidates, decoys, prior, parameters)
 
 
-def _best(
-    target: JoinableMap,
-    source: JoinableMap,
-    candidates: Sequence[_Candidate],
-    decoys: Sequence[_Candidate],
-    prior: float,
-    parameters: JoinParameters,
-) -> Join:
-    """The most probable of some transforms, all others being its rivals. prior : odds of one building.
-
-    By branch and bound: what is not judged is neither joined nor more probable than the best.
-    """
-    fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)])
-    found = [_evidence(source, one, k, fits) for k, one in enumerate(candidates)]
-    bounds = [_bound(evidence, prior) for evidence in found]
-    best = UNJOINED
-    for k in sorted(range(len(candidates)), key=lambda k: -bounds[k]):
-        if bounds[k] < min(best.probability, parameters.accept):
-            break
-        join = _judged(target, source, candidates[k], k, fits, found[k], prior, parameters)
-        best = max(best, join, key=lambda join: (join.status == "joined", join.probability))
-    return best
-
-
-def _same(a: _Candidate, b: _Candidate) -> bool:
-    return same_pose(a.T_target_source @ a.at, b.T_target_source @ a.at)
-
-
 def _candidates(target: JoinableMap, points_m: F32, pieces: Sequence[Piece]) -> list[_Candidate]:
-    """The transforms of a source that its pieces propose, no two alike."""
+    """Return the transforms of a source that its pieces propose, no two alike."""
     found: list[_Candidate] = []
     for proposal in proposals(target.index, pieces):
         refined = _refined(target, points_m, pieces, proposal)
@@ -418,8 +245,24 @@ def _candidates(target: JoinableMap, points_m: F32, pieces: Sequence[Piece]) -> 
     return found
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Candidate:
+    """A transform that was made exact by walls. at : the piece of the source that proposed it. fits : of each
+    piece of the source. links : of those that agree. covariance : (3, 3) of the transform at `at`."""
+
+    T_target_source: SE2
+    at: SE2
+    fits: tuple[Fit, ...]
+    links: tuple[Link, ...]
+    covariance: F64
+
+
+def _same(a: _Candidate, b: _Candidate) -> bool:
+    return same_pose(a.T_target_source @ a.at, b.T_target_source @ a.at)
+
+
 def _refined(target: JoinableMap, points_m: F32, pieces: Sequence[Piece], proposal: Proposal) -> _Candidate:
-    """The transform of one piece made exact by the walls of all."""
+    """Make the transform that one piece proposes exact by the walls of all."""
     pose = proposal.T_target_source
     fits = align_pieces(target.search, pieces, pose, proposal.at_m)
     links = links_of(pieces, fits)
@@ -438,8 +281,32 @@ def _refined(target: JoinableMap, points_m: F32, pieces: Sequence[Piece], propos
     )
 
 
+def _best(
+    target: JoinableMap,
+    source: JoinableMap,
+    candidates: Sequence[_Candidate],
+    decoys: Sequence[_Candidate],
+    prior: float,
+    parameters: JoinParameters,
+) -> Join:
+    """Return the most probable of some transforms, all others being its rivals. prior : odds of one building.
+
+    By branch and bound: what is not judged is neither joined nor more probable than the best.
+    """
+    fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)])
+    found = [_evidence(source, one, k, fits) for k, one in enumerate(candidates)]
+    bounds = [_bound(evidence, prior) for evidence in found]
+    best = UNJOINED
+    for k in sorted(range(len(candidates)), key=lambda k: -bounds[k]):
+        if bounds[k] < min(best.probability, parameters.accept):
+            break
+        join = _judged(target, source, candidates[k], k, fits, found[k], prior, parameters)
+        best = max(best, join, key=lambda join: (join.status == "joined", join.probability))
+    return best
+
+
 def _evidence(source: JoinableMap, candidate: _Candidate, number: int, fits: PieceFits) -> Evidence:
-    """What tells for a transform, by the walls of the source that lie on known ground of the target.
+    """Return the evidence for a transform: the walls of the source that lie on known ground of the target.
 
     number : its row in `fits`; the other rows are of its rivals.
     """
@@ -461,8 +328,10 @@ def _evidence(source: JoinableMap, candidate: _Candidate, number: int, fits: Pie
 
 
 def _bound(evidence: Evidence, prior: float) -> float:
-    """The probability of a transform if its part of the source is unlike itself, and is all of it: never
-    lower than the true one."""
+    """Return the probability of a transform if its part of the source is unlike itself, and is all of it.
+
+    It is never lower than the true one.
+    """
     highest = replace(evidence, lead=max(evidence.lead, 0.0), likeness=0.0)
     return float(masses([highest], prior)[0])
 
@@ -477,7 +346,7 @@ def _judged(
     prior: float,
     parameters: JoinParameters,
 ) -> Join:
-    """The posterior of a transform, by the part of the source that lies in the target.
+    """Judge a transform by the part of the source that lies in the target.
 
     number : its row in `fits`; the other rows are of its rivals. evidence : see `_evidence`. prior : odds of
     one building.
@@ -493,7 +362,7 @@ def _judged(
     equal = int(np.count_nonzero(np.abs(scores - scores[number]) <= POSTERIOR.alike))
     probability = float(masses([evidence] * equal, odds)[0])
     # Of thousands of wall points a small lead is much, even where walls fit as wrong places do.
-    enough = common_m2 >= parameters.least_m2 and min(forward, backward) >= PIECES.follows
+    enough = common_m2 >= parameters.least_m2 and min(forward, backward) >= JOIN.follows
     return Join(
         status=_status(evidence, odds, probability, enough, parameters),
         T_target_source=candidate.T_target_source,
@@ -510,7 +379,7 @@ def _judged(
 def _status(
     evidence: Evidence, odds: float, probability: float, enough: bool, parameters: JoinParameters
 ) -> JoinStatus:
-    """What is said of a transform. enough : whether enough is in common, and alike, to be joined."""
+    """Return the status of a transform. enough : whether enough is in common, and alike, to be joined."""
     if enough and probability >= parameters.accept:
         return "joined"
     # That the source lies here, or at a place that fits equally well, is more probable than not.
@@ -518,7 +387,7 @@ def _status(
 
 
 def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> OccupancyGrid:
-    """The source without what the target does not know, widened by `JoinParameters.wall_m`."""
+    """Return the source without what the target does not know, widened by `JoinParameters.wall_m`."""
     n = math.ceil(JOIN.wall_m / target.resolution_m)
     known = cv2.dilate((target.cells != UNKNOWN).astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8))
     cells = np.argwhere(source.cells != UNKNOWN)
@@ -529,21 +398,21 @@ def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE
 
 
 def free_in_both(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> float:
-    """Square metres that are free in both."""
+    """Return how many square metres are free in both."""
     points_m = T_target_source.apply(source.to_point(np.argwhere(source.free)))
     return float(_looked_up(target.free, target, points_m).sum()) * source.resolution_m**2
 
 
 def _looked_up(mask: BoolGrid, grid: OccupancyGrid, points_m: F64) -> BoolGrid:
-    """(N,) the values of a mask over a grid at points (N, 2); False outside."""
+    """Return the values (N,) of a mask over a grid at points (N, 2); False outside."""
     at = grid.to_cell(points_m)
     inside: BoolGrid = np.asarray(((at >= 0) & (at < mask.shape)).all(axis=1))
     inside[inside] = mask[tuple(at[inside].T)]
     return inside
 
 
-MOST = 20
-"""Transforms that are proposed, by hand: a building of equal rooms has as many."""
+_MIRROR = np.array((-1.0, 1.0), np.float32)
+"""Turns x into -x."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -557,11 +426,11 @@ class Proposal:
 
 
 def proposals(target: MapIndex, pieces: Sequence[Piece]) -> list[Proposal]:
-    """The ways in which a source may lie in a target, the likeliest first, no two alike."""
+    """Return how a source may lie in a target, the likeliest transform first, no two alike."""
     every = [one for piece in pieces for one in _places_of(target, piece)]
     found: list[Proposal] = []
     for proposal in sorted(every, key=lambda one: -one.log_odds):
-        if len(found) == MOST:
+        if len(found) == JOIN.proposed:
             break
         if not any(_alike(proposal, other) for other in found):
             found.append(proposal)
@@ -569,7 +438,7 @@ def proposals(target: MapIndex, pieces: Sequence[Piece]) -> list[Proposal]:
 
 
 def _places_of(target: MapIndex, piece: Piece) -> list[Proposal]:
-    """Where a piece may lie in the target."""
+    """Look a piece up in the target."""
     found, _ = next(target.search(piece.query))
     fits = [hypothesis.fit for hypothesis in found]
     return [
@@ -579,64 +448,178 @@ def _places_of(target: MapIndex, piece: Piece) -> list[Proposal]:
 
 
 def _alike(a: Proposal, b: Proposal) -> bool:
-    """Whether both put the piece of the first at one place."""
+    """Tell whether both put the piece of the first at one place."""
     at = SE2(*a.at_m)
     return same_pose(a.T_target_source @ at, b.T_target_source @ at)
 
 
-Names = tuple[str, str]
-"""Of two sessions."""
-_KEPT = 30
-"""Prepared maps that stay in memory: no more sessions are joined in a reasonable time."""
+@dataclass(frozen=True, slots=True)
+class Piece:
+    """A square of a map, described as a query. center_m : (x, y) the middle of its walls."""
+
+    query: QueryMap
+    center_m: tuple[float, float]
+
+    @staticmethod
+    def of(square: OccupancyGrid, index: MapIndex) -> Piece:
+        """Describe a square of a map as the places of an index are described."""
+        query = map_as_query(square, index.made_with, index.config)
+        x, y = query.walls.points_m.mean(axis=0).tolist() if len(query.walls.points_m) else (0.0, 0.0)
+        return Piece(query, (x, y))
+
+    @property
+    def walls(self) -> Walls:
+        """Return its walls."""
+        return self.query.walls
+
+
+def pieces_of(index: MapIndex) -> tuple[Piece, ...]:
+    """Cut the map of one session into squares, and keep those with enough walls."""
+    grid = index.grids[0]
+    side = round(JOIN.side_m / grid.resolution_m)
+    height, width = grid.cells.shape
+    squares = (
+        _square(grid, row, column, side) for row in range(0, height, side) for column in range(0, width, side)
+    )
+    pieces = (Piece.of(square, index) for square in squares if (square.cells > UNKNOWN).any())
+    return tuple(piece for piece in pieces if piece.walls.weight >= JOIN.least_walls)
+
+
+def mirrored(piece: Piece, index: MapIndex) -> Piece:
+    """Return the mirror image of a piece: x turned into -x."""
+    grid = piece.query.grid
+    right_m = grid.origin_m[0] + grid.cells.shape[1] * grid.resolution_m
+    heights = None if grid.heights is None else grid.heights[:, ::-1]
+    turned = replace(grid, cells=grid.cells[:, ::-1], heights=heights, origin_m=(-right_m, grid.origin_m[1]))
+    return Piece.of(turned, index)
+
+
+def _square(grid: OccupancyGrid, row: int, column: int, side: int) -> OccupancyGrid:
+    here = np.s_[row : row + side, column : column + side]
+    x, y = grid.origin_m
+    return replace(
+        grid,
+        cells=grid.cells[here],
+        heights=None if grid.heights is None else grid.heights[here],
+        origin_m=(x + column * grid.resolution_m, y + row * grid.resolution_m),
+    )
+
+
+def align_pieces(
+    target: SearchMap, pieces: Sequence[Piece], T_target_source: SE2, from_m: tuple[float, float]
+) -> tuple[Fit, ...]:
+    """Align each piece with the walls of a target.
+
+    from_m : (x, y) in the source where `T_target_source` is good.
+    """
+    centers_m = np.array([piece.center_m for piece in pieces]).reshape(-1, 2)
+    fits: dict[int, Fit] = {}
+    trusted: list[int] = []
+    for number in np.argsort(np.hypot(*(centers_m - from_m).T), kind="stable").tolist():
+        start = T_target_source
+        if trusted:
+            nearest = np.argmin(np.hypot(*(centers_m[trusted] - centers_m[number]).T))
+            start = fits[trusted[int(nearest)]].T_map_query
+        piece = pieces[number]
+        points_m = piece.walls.facing(target.walls).points_m
+        pose, covariance = refine(target.field, points_m, start, piece.center_m)
+        fits[number] = fit = score_fit(target.walls, piece.walls, pose, covariance)
+        if fit.known_agreement_both_ways >= JOIN.follows:
+            trusted.append(number)
+    return tuple(fits[number] for number in range(len(pieces)))
+
+
+@dataclass(frozen=True, slots=True)
+class PieceFits:
+    """The fits of K pieces under each of H transforms.
+
+    seen, looked_at (H, K) : wall points on known ground, by weight, forward and backward. forward, backward
+    (H, K) : mean likelihood, neutral on unknown ground. agreement (H, K) : forward, on known ground only.
+    """
+
+    seen: F64
+    looked_at: F64
+    forward: F64
+    backward: F64
+    agreement: F64
+
+    @staticmethod
+    def of(fits: Sequence[Sequence[Fit]]) -> PieceFits:
+        """Collect the fits of all pieces under each transform."""
+
+        def column(name: str) -> F64:
+            return np.array([[getattr(fit, name) for fit in row] for row in fits], ndmin=2)
+
+        looked_at = column("looked_at")
+        return PieceFits(
+            seen=column("compared"),
+            looked_at=looked_at,
+            forward=column("forward"),
+            backward=np.where(looked_at > 0.0, column("backward"), LIKELIHOOD.neutral),
+            agreement=column("known_agreement"),
+        )
+
+    def of_part(self, chosen: int) -> tuple[float, float, F64]:
+        """Return how one transform agrees forward and backward where both know the ground, and the score (H,)
+        of all transforms for this part of the source."""
+        seen, looked_at = self.seen[chosen], self.looked_at[chosen]
+        if not seen.sum() or not looked_at.sum():
+            return 0.0, 0.0, np.zeros(len(self.seen))
+        forward = self.forward @ seen / seen.sum()
+        forward[chosen] = self.agreement[chosen] @ seen / seen.sum()
+        backward = self.backward @ looked_at / looked_at.sum()
+        return float(forward[chosen]), float(backward[chosen]), np.sqrt(forward * backward)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SessionPair:
-    """Two sessions that were compared. accepted : whether their join counts: the pair is joined, and neither
-    labels nor the other pairs contradict it."""
+class Link:
+    """Where a piece of a source lies in a target.
 
-    target: str
-    source: str
-    join: Join
-    accepted: bool = False
-
-    @property
-    def names(self) -> Names:
-        """Of the two sessions."""
-        return self.target, self.source
-
-
-def told_apart(a: SessionInfo, b: SessionInfo) -> bool:
-    """Whether labels say that two sessions are not of one floor of one building."""
-    return a.provenance.label.contradicts(b.provenance.label)
-
-
-def compare_pairs(
-    database: SubmapDatabase, infos: Mapping[str, SessionInfo], only: Collection[str], observer: Observer
-) -> Iterator[SessionPair]:
-    """Every two sessions that labels do not tell apart, joined as far as they can be.
-
-    only : one of each pair, at least, is of these.
+    center_m : (x, y) the middle of its walls, in the source. covariance : (3, 3) of the piece's pose there,
+    in the axes of the target, with what a map leaves open of where it shows anything.
     """
-    pairs = [
-        (a, b) for a, b in combinations(infos, 2) if {a, b} & {*only} and not told_apart(infos[a], infos[b])
-    ]
 
-    @functools.lru_cache(_KEPT)
-    def prepared(name: str) -> JoinableMap:
-        return JoinableMap(MapIndex.of_session(database, name))
-
-    with observer.step(f"compare {len(pairs)} pairs of sessions"):
-        for done, (a, b) in enumerate(pairs, start=1):
-            labelled = infos[a].provenance.label.agrees(infos[b].provenance.label)
-            join = join_maps(prepared(a), prepared(b), labelled=labelled)
-            yield SessionPair(target=a, source=b, join=join)
-            observer.on_progress(done / len(pairs))
+    center_m: tuple[float, float]
+    T_target_source: SE2
+    covariance: F64
 
 
-def by_building(frames: Mapping[str, BuildingFrame]) -> dict[str, list[str]]:
-    """The names of the sessions of each building, by the name of its frame."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for name, at in frames.items():
-        found[at.name].append(name)
-    return found
+def links_of(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[Link, ...]:
+    """Return the pieces that agree with the target. Those on ground that it hardly knows do not count."""
+    seen = [fit.compared for fit in fits]
+    shown = [k for k, walls in enumerate(seen) if walls >= JOIN.least_walls] or [int(np.argmax(seen))]
+    kept = [k for k in shown if fits[k].known_agreement_both_ways >= JOIN.follows] or shown
+    noise = np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
+    return tuple(
+        Link(
+            center_m=pieces[k].center_m,
+            T_target_source=fits[k].T_map_query,
+            covariance=fits[k].covariance + noise,
+        )
+        for k in kept
+    )
+
+
+def rigid(links: Sequence[Link]) -> tuple[SE2, float]:
+    """Return the one transform that is nearest to those of the pieces, and how far (m, rms of an axis) these
+    deviate from it.
+
+    Least squares over the poses of the pieces at their middles, each with the information that its walls
+    give: one that shows a corridor only says nothing along it.
+    """
+    middles_m = np.array([link.center_m for link in links])
+    there_m = np.array([link.T_target_source.apply(np.array([link.center_m]))[0] for link in links])
+    yaws = np.array([link.T_target_source.yaw for link in links])
+    information = np.linalg.inv(np.array([link.covariance for link in links]))
+    T = links[0].T_target_source
+    for _ in range(4):  # of Gauss and Newton; only the heading is not linear
+        at_m = T.apply(middles_m)
+        error = np.column_stack((there_m - at_m, wrap_angle(yaws - T.yaw)))
+        J = np.tile(np.eye(3), (len(links), 1, 1))
+        J[:, 0, 2], J[:, 1, 2] = T.y - at_m[:, 1], at_m[:, 0] - T.x
+        normal = np.einsum("kia,kij,kjb->ab", J, information, J)
+        x, y, yaw = np.linalg.solve(normal, np.einsum("kia,kij,kj->a", J, information, error)).tolist()
+        T = SE2(T.x + x, T.y + y, wrap_angle(T.yaw + yaw))
+    off_m, weight = T.apply(middles_m) - there_m, information[:, :2, :2]
+    squares = np.einsum("ki,kij,kj->", off_m, weight, off_m) / np.einsum("kii->", weight)
+    return T, math.sqrt(float(squares))
