@@ -473,14 +473,14 @@ def _bytes_of(values: NDArray[Any], dtype: str) -> NDArray[np.uint8]:
     return np.ascontiguousarray(values, dtype).view(np.uint8).reshape(-1)
 
 
-def _marker(number: int, marker: Marker, header: Any) -> Any:
+def _marker(number: int, marker: Marker, head: Any) -> Any:
     """visualization_msgs/Marker without lifetime: it is shown until it is replaced."""
     points = np.asarray(marker.points_m, np.float64).reshape(-1, 3).tolist()
     no_texture = new("sensor_msgs/CompressedImage", header(0, ""), "", np.empty(0, np.uint8))
     no_mesh = new("visualization_msgs/MeshFile", "", np.empty(0, np.uint8))
     return new(
         "visualization_msgs/Marker",
-        header,
+        head,
         marker.name,
         number,
         _MARKER_TYPES[marker.kind],
