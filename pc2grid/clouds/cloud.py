@@ -1,11 +1,8 @@
-"""A cloud that is collected block by block, with one point a voxel: memory grows with the surfaces it shows.
+"""Operations on the points of a cloud: deskewing, random subsets, and a voxel filter for clouds of any
+length.
 
-Points of a voxel are replaced by their mean, so a wall keeps its place however often it was seen. Open3D's
-voxel_down_sample does the same for a cloud that is in memory as a whole.
-
-Removal of the robot's motion from the points of one scan.
-
-Random subsets of a cloud, the same in every run.
+`VoxelCloud` keeps the mean of the points of each voxel, so memory grows with the surfaces and not with the
+number of scans. Open3D's voxel_down_sample does the same for a cloud that is in memory as a whole.
 """
 
 from __future__ import annotations
@@ -18,25 +15,50 @@ from numpy.typing import NDArray
 from pc2grid.errors import LimitExceeded
 from pc2grid.geometry import F32, F64, I64, rotation_vector
 
+
+def deskew(points_m: F32, offsets_s: F32, motion: F64, motion_s: float) -> F32:
+    """Return the points as if all of them had been measured at the stamp of the scan.
+
+    points_m : (N, 3) in the base frame at the time of each point. offsets_s : (N,) that time relative to
+    the stamp. motion : (4, 4) T_before_now over `motion_s` seconds around the scan; velocity and angular
+    velocity are taken as constant.
+    Returns (N, 3) float32 in the base frame at the stamp.
+    """
+    if motion_s <= 0 or not len(points_m):
+        return points_m
+    turn_rad = rotation_vector(motion)
+    angle_rad = float(np.linalg.norm(turn_rad))
+    share = (offsets_s / np.float32(motion_s)).astype(np.float32)
+    moved: F32 = points_m + share[:, None] * motion[:3, 3].astype(np.float32)
+    if angle_rad < 1e-9:
+        return moved
+    # Rodrigues' formula about one axis: p + sin(a) k x p + (1 - cos(a)) k x (k x p), with k x p = K p.
+    x, y, z = turn_rad / angle_rad
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angles = share * np.float32(angle_rad)
+    moved += np.sin(angles)[:, None] * (points_m @ K.T.astype(np.float32))
+    moved += (1.0 - np.cos(angles))[:, None] * (points_m @ (K @ K).T.astype(np.float32))
+    return moved
+
+
+def random_subset(length: int, count: int) -> NDArray[np.intp]:
+    """Return at most `count` of the indices below `length`, random and in increasing order.
+
+    The seed is `length`, so that equal input gives equal output. The choice is random because a regular
+    one, every n-th pixel of a camera or beam of a lidar, moves with the sensor and pulls ICP towards
+    standing still.
+    """
+    if length <= count:
+        return np.arange(length)
+    return np.sort(np.random.default_rng(length).choice(length, count, replace=False, shuffle=False))
+
+
 _AXIS_BITS = 21
 _HALF = 1 << (_AXIS_BITS - 1)  # voxels on either side of the first point: 52 km with an edge of 5 cm
 _MERGED_POINTS = 1_000_000
 """Voxels that are collected before each is reduced to one entry; chosen by hand: 40 MB."""
 MAX_VOXELS = 200_000_000
 """Voxels of the largest cloud: 100,000 m2 of floor at 5 cm with what stands on it; 4 GB of memory."""
-
-
-@dataclass(frozen=True, slots=True)
-class _Voxels:
-    """Voxels, each once, by increasing code.
-
-    code : (V,) the three indices in one number. sum_m : (V, 3) sums of the points' offsets from the voxel's
-    lowest corner. count : (V,) how many points.
-    """
-
-    code: I64 = field(default_factory=lambda: np.empty(0, np.int64))
-    sum_m: F32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
-    count: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
 
 
 class VoxelCloud:
@@ -85,17 +107,19 @@ class VoxelCloud:
             self._merge()
 
     def __len__(self) -> int:
-        """Voxels that hold points."""
+        """Return the number of voxels that hold points."""
         self._merge()
         return len(self._merged.code)
 
     @property
     def corner_m(self) -> F64:
-        """A corner (3,) of a voxel."""
+        """Return a corner (3,) of a voxel."""
         return np.zeros(3) if self._corner_m is None else self._corner_m
 
     def points_m(self) -> F64:
-        """The mean (V, 3) of each voxel that holds points, by increasing x, then y, then z of the voxels."""
+        """Return the mean (V, 3) of each voxel that holds points, by increasing x, then y, then z of the
+        voxels.
+        """
         self._merge()
         if self._corner_m is None:
             return np.empty((0, 3))
@@ -125,8 +149,21 @@ class VoxelCloud:
             )
 
 
+@dataclass(frozen=True, slots=True)
+class _Voxels:
+    """Voxels, each once, by increasing code.
+
+    code : (V,) the three indices in one number. sum_m : (V, 3) sums of the points' offsets from the voxel's
+    lowest corner. count : (V,) how many points.
+    """
+
+    code: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+    sum_m: F32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    count: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+
+
 def _reduced(code: I64, sum_m: F32, count: NDArray[np.int32]) -> _Voxels:
-    """Entries (N,), (N, 3), (N,) with those of the same code added up."""
+    """Add up the entries (N,), (N, 3), (N,) that have the same code."""
     order = np.argsort(code, kind="stable")
     code = code[order]
     starts = np.flatnonzero(np.diff(code, prepend=-1))
@@ -135,40 +172,3 @@ def _reduced(code: I64, sum_m: F32, count: NDArray[np.int32]) -> _Voxels:
         np.add.reduceat(sum_m[order], starts, axis=0),
         np.add.reduceat(count[order], starts),
     )
-
-
-def deskew(points_m: F32, offsets_s: F32, motion: F64, motion_s: float) -> F32:
-    """Return the points as if all of them had been measured at the stamp of the scan.
-
-    points_m : (N, 3) in the base frame at the time of each point. offsets_s : (N,) that time relative to
-    the stamp. motion : (4, 4) T_before_now over `motion_s` seconds around the scan; velocity and angular
-    velocity are taken as constant.
-    Returns (N, 3) float32 in the base frame at the stamp.
-    """
-    if motion_s <= 0 or not len(points_m):
-        return points_m
-    turn_rad = rotation_vector(motion)
-    angle_rad = float(np.linalg.norm(turn_rad))
-    share = (offsets_s / np.float32(motion_s)).astype(np.float32)
-    moved: F32 = points_m + share[:, None] * motion[:3, 3].astype(np.float32)
-    if angle_rad < 1e-9:
-        return moved
-    # Rodrigues' formula about one axis: p + sin(a) k x p + (1 - cos(a)) k x (k x p), with k x p = K p.
-    x, y, z = turn_rad / angle_rad
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    angles = share * np.float32(angle_rad)
-    moved += np.sin(angles)[:, None] * (points_m @ K.T.astype(np.float32))
-    moved += (1.0 - np.cos(angles))[:, None] * (points_m @ (K @ K).T.astype(np.float32))
-    return moved
-
-
-def random_subset(length: int, count: int) -> NDArray[np.intp]:
-    """Return at most `count` of the indices below `length`, random and in increasing order.
-
-    The seed is `length`, so that equal input gives equal output. The choice is random because a regular
-    one, every n-th pixel of a camera or beam of a lidar, moves with the sensor and pulls ICP towards
-    standing still.
-    """
-    if length <= count:
-        return np.arange(length)
-    return np.sort(np.random.default_rng(length).choice(length, count, replace=False, shuffle=False))

@@ -1,12 +1,12 @@
-"""The last metres in space as columns of cells, out of which planar scans are cut.
+"""A 2.5D map of the last metres: columns of evidence cells, out of which planar scans are cut.
 
-Where a surface is measured a cell is hit, and along the ray to it cells are free. What a column is follows
-from its cells between the floor and 1.8 m: a wall is occupied over most of the height that was observed; a
-table, a chair or a lintel only in a part of it, while rays pass over it. The planar scan of a place is what
-is visible from there: the walls, and how far the floor before them is known. So one view of a tilted camera
-shows the wall above it and the floor below it that other views have seen.
+A cell with a return is hit, the cells along its ray are free (Hornung et al., "OctoMap", 2013). A column is
+classified by its cells between the floor and 1.8 m. A wall is occupied over most of the height that was
+observed; a table, a chair or a lintel only in a part of it, while rays pass over it. The planar scan of a
+place consists of the walls that are visible from there and of the free floor before them. So one view of a
+tilted camera shows the wall above it together with the floor that other views have observed.
 
-Hornung et al., "OctoMap" (2013) for the evidence; memory is that of the window, whatever the length.
+Memory is that of the window, however long the recording is.
 """
 
 from __future__ import annotations
@@ -60,6 +60,8 @@ class ColumnParameters:
 COLUMNS = ColumnParameters()
 _STAMPS = 250
 """Scans after which the stamps of cells begin again; they are of one byte."""
+UNKNOWN, FREE, LOW, WALL = 0, 1, 2, 3
+"""What a column is."""
 
 
 class ColumnMap:
@@ -124,7 +126,8 @@ class ColumnMap:
         )  # fmt: skip
 
     def cut(self, T_session_base: SE2, sensor_m: F64, stamp_ns: int) -> PlanarScan:
-        """The planar scan at a place: what a sensor at (3,), session frame, sees of walls and floor.
+        """Return the planar scan at a place: the walls and the floor that are visible from `sensor_m` (3,),
+        session frame.
 
         T_session_base : planar pose of the base, in whose frame the planar scan is.
         """
@@ -154,19 +157,19 @@ class ColumnMap:
         )
 
     def agreement(self, points_m: F64) -> tuple[float, float]:
-        """How points (N, 3), session frame, agree with surfaces and observed free space, -1..1.
+        """Return how well points (N, 3), session frame, agree with surfaces and observed free space, -1..1.
 
-        The share of points on surfaces less that in free space: of the points in observed cells, and of all
-        in the window.
+        It is the share of points on surfaces minus the share in free space: among the points in observed
+        cells, and among all points in the window.
         """
         if not self._stamp:
             return 0.0, 0.0
         cell = self._config.resolution_m, self._parameters.layer_m
-        met, against, inside = agreement(self._evidence, self._low, points_m, cell)
+        met, against, inside = agreement_counts(self._evidence, self._low, points_m, cell)
         return (met - against) / max(met + against, 1), (met - against) / max(inside, 1)
 
     def walls(self, sigma_m: float) -> tuple[F32, F64]:
-        """The likelihood field (H, W), 0..1, of what stands, rows along y, and the corner (2,) of it."""
+        """Return the likelihood field (H, W), 0..1, of all obstacles, rows along y, and its corner (2,)."""
         edge_m = self._config.resolution_m
         walls = np.roll(self._columns[0] >= LOW, (-self._low[:2] % self._columns.shape[1]).tolist(), (0, 1)).T
         away_m = edge_m * cv2.distanceTransform((~walls).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
@@ -174,7 +177,8 @@ class ColumnMap:
         return field, edge_m * self._low[:2].astype(np.float64)
 
     def _heights_at(self, points_m: F64) -> U8:
-        """The heights (N,) of the columns of points (N, 2), session frame; see `pc2grid.model.SLICES`."""
+        """Return the heights (N,) of the columns of points (N, 2), session frame; see `SLICES` of
+        `pc2grid.model`."""
         column, row = (
             np.floor(points_m.T / self._config.resolution_m).astype(np.int64) % self._columns.shape[1]
         )
@@ -199,8 +203,7 @@ class ColumnMap:
             self._floor_m = math.nan  # states are made again
 
 
-UNKNOWN, FREE, LOW, WALL = 0, 1, 2, 3
-"""What a column is."""
+# Compiled functions.
 
 
 @njit(cache=True)
@@ -299,13 +302,6 @@ def observe_rays(
 
 
 @njit(cache=True)
-def _within(low: I64, size: int, i: int, j: int) -> bool:
-    """Whether the column (i, j) of the map is one of the window."""
-    inside: bool = low[0] <= i < low[0] + size and low[1] <= j < low[1] + size
-    return inside
-
-
-@njit(cache=True)
 def classify(
     evidence: NDArray[np.int8],
     state: NDArray[np.uint8],
@@ -321,13 +317,13 @@ def classify(
     least: int,
     over: int,
 ) -> None:
-    """Write the state (W, W) of the columns that carry a stamp; 0: of all. And of those with an obstacle the
-    heights (W, W), see `pc2grid.model.SLICES`.
+    """Write the state (W, W) of the columns with a stamp (0: of all), and the heights (W, W) of those with an
+    obstacle.
 
-    ground, band : of the first and behind the last layer of the floor, and of an obstacle.
-    borders : of the first layer of each slice but the lowest. A wall is occupied in at least `least` layers,
-    and in so large a `share` of those that were observed, and less than `over` layers above it were observed
-    to be free.
+    ground, band : first layer, and the layer behind the last one, of the floor and of obstacles.
+    borders : first layer of each slice but the lowest, see `pc2grid.model.SLICES`. A wall is occupied in at
+    least `least` layers and in at least `share` of the observed ones, and fewer than `over` layers above it
+    were observed to be free.
     """
     size, layers = evidence.shape[0], evidence.shape[2]
     band = max(band[0], low[2]), min(band[1], low[2] + layers)
@@ -352,10 +348,10 @@ def _column(
     over: int,
     measured: bool,
 ) -> tuple[int, int]:
-    """State and heights of a column by the evidence (L,) in its cells.
+    """Return the state and the heights of a column from the evidence (L,) in its cells.
 
-    ground, band : the first and behind the last layer of the floor, and of an obstacle. measured : whether
-    points tell where a wall is.
+    ground, band : first layer, and the layer behind the last one, of the floor and of obstacles. measured :
+    True if points in the band locate the wall.
     """
     layers = len(evidence)
     occupied, free, passed_over = 0, 0, 0
@@ -390,13 +386,13 @@ def view(
     depth: tuple[float, float],
     bearings: int,
 ) -> tuple[F64, F64, F64]:
-    """What a place (2,) sees of the columns: the first wall along each bearing, and the floor before it.
+    """Cast a ray along each bearing from a place (2,): find the first wall and the floor before it.
 
     turn : direction of the first bearing, radians. gap : unknown ground wider than this ends what is free.
     depth : (d, q), walls behind the first one are part of it up to d + q * range^2.
 
-    Returns how far each bearing is free (0: not at all), for each wall the sums of x, y and 1 of its points
-    (S, 3), by increasing bearing, and the low columns passed (K, 2), each once, as their middles.
+    Returns the free range of each bearing (0: none), for each wall the sums of x, y and 1 of its points (S,
+    3), by increasing bearing, and the middles (K, 2) of the low columns that were passed, each once.
     """
     size = state.shape[0]
     free_m = np.zeros(bearings)
@@ -433,9 +429,10 @@ def _first_wall(
     lows: F64,
     count: int,
 ) -> tuple[float, float, int]:
-    """How far a bearing is free, the range of its first wall (-1: none), and how many low columns are passed.
+    """Return the free range of a bearing, the range of its first wall (-1: none), and the count of low
+    columns.
 
-    passed : (W, W), whether a low column was passed before. lows : gets the middles of those that were not.
+    passed : (W, W), 1 for low columns that were passed before. lows : gets the middles of the others.
     """
     size = state.shape[0]
     free, known = 0.0, False
@@ -476,7 +473,9 @@ def _wall(
     reach: float,
     edge: float,
 ) -> tuple[float, float, float]:
-    """The sums of x, y and 1 of the points of a wall that begins at the range `first` and is so thick."""
+    """Return the sums of x, y and 1 of the points of a wall of the thickness `thick` that begins at range
+    `first`.
+    """
     size = state.shape[0]
     sx = sy = total = 0.0
     last_a, last_b = -1, -1
@@ -498,11 +497,12 @@ def _wall(
 
 
 @njit(cache=True)
-def agreement(
+def agreement_counts(
     evidence: NDArray[np.int8], low: I64, points: F64, cell: tuple[float, float]
 ) -> tuple[int, int, int]:
-    """How many of points (N, 3) lie in or beside a cell with a surface, how many where rays have passed,
-    and how many lie in the window."""
+    """Count the points (N, 3) in or beside a cell with a surface, those in free cells, and those in the
+    window.
+    """
     size, layers = evidence.shape[0], evidence.shape[2]
     met, against, inside = 0, 0, 0
     for n in range(len(points)):
@@ -526,3 +526,10 @@ def agreement(
         elif here < 0:
             against += 1
     return met, against, inside
+
+
+@njit(cache=True)
+def _within(low: I64, size: int, i: int, j: int) -> bool:
+    """Return True if the column (i, j) of the map is in the window."""
+    inside: bool = low[0] <= i < low[0] + size and low[1] <= j < low[1] + size
+    return inside

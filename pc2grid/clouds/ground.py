@@ -1,20 +1,15 @@
-"""The floor and the ceiling in one scan.
+"""The floor, the ceiling and the vertical: in one scan, and from scan to scan for a sensor in the hand.
 
-The tf of a robot says where the floor should be; a hand-held sensor has no such knowledge. Both cases are
-treated alike: the floor is the lowest large, roughly level plane of a scan. Planes are found by Open3D.
+`find_ground` takes the lowest large, roughly level plane of a scan for the floor (planes by Open3D's RANSAC),
+whether tf gives the height of the sensor or not. `vertical_of` checks it: a slanting plane, such as the back
+of a chair, may be taken for a floor, but walls are upright, so the vertical is perpendicular to their
+normals.
 
-The floor in a map of surfaces, and how high it lies from scan to scan.
+A single view of a tilted camera may show a table only. `FloorBelow` therefore takes the lowest large level in
+the fused surfaces of several views and follows it. One recording is one floor, and a floor is level, so a
+floor that rises is drift of the pose.
 
-A single view of a tilted camera may show a table only. In what several views have shown together, walls
-stand, floors and table tops lie, and the floor is the lowest large level. From there it is followed: one
-recording is one floor, and a floor is level, so that what rises is the pose by which it is seen.
-
-Which way is up, by the walls that one scan shows.
-
-A plane that slants, such as the back of a chair, may be taken for a floor. Walls are upright: the vertical is
-the direction to which their normals are perpendicular.
-
-The numbers of the cloud stage. Where no other origin is given, a number was chosen by hand.
+Where no other origin is given, a number was chosen by hand.
 """
 
 from __future__ import annotations
@@ -29,217 +24,46 @@ from pc2grid.clouds.cloud import random_subset
 from pc2grid.geometry import F64, BoolGrid, leveling
 from pc2grid.model import SENSOR_MODELS, Scan
 
+Plane = tuple[F64, float]
+"""Unit normal (3,) that points up, and offset: height = normal . p + offset."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LevelParameters:
-    """Numbers of the search. Chosen by hand.
 
-    flat : least information along the vertical of a voxel of a level surface.
-    level : cosine of its normal with the vertical above which it lies.
-    least_m2 : smallest floor.
-    share : of the largest level that the floor must have: less below it are reflections.
-    radius_m : around the sensor. bin_m : height of a slab. below_m : the floor is so far below the sensor.
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """The floor plane of a scan and the ceiling above it, in the scan's frame.
 
-    Of the floor that is followed:
-
-    near_m : a level so near to where it is expected, beside three standard deviations, is the floor: a seat
-        lies higher.
-    seen_m : standard deviation of the height that one view tells.
-    drift_per_m : variance that the height of a pose gains on a metre of travel, m2: 2 cm on the first, 10 cm
-        on 25 m, where the odometry of a phone drifts by half a percent.
+    normal : (3,) unit vector that points up from the floor.
+    offset_m : height of the frame's origin above the floor, so that height = normal . p + offset_m.
+    ceiling_m : height of the ceiling above the floor, or None where none was seen.
+    seen : whether the floor was measured (False: assumed from the mounting).
     """
 
-    flat: float = 0.3
-    level: float = 0.97
-    least_m2: float = 0.4
-    share: float = 0.15
-    radius_m: float = 5.0
-    bin_m: float = 0.1
-    below_m: float = 0.3
-    near_m: float = 0.2
-    seen_m: float = 0.03
-    drift_per_m: float = 0.02**2
+    normal: F64
+    offset_m: float
+    ceiling_m: float | None = None
+    seen: bool = True
 
+    def heights(self, points_m: NDArray[np.floating]) -> NDArray[np.floating]:
+        """Return the heights (N,) of points (N, 3) above the floor, in metres and in the points' type."""
+        normal = self.normal.astype(points_m.dtype)
+        heights: NDArray[np.floating] = points_m @ normal + points_m.dtype.type(self.offset_m)
+        return heights
 
-LEVEL = LevelParameters()
+    def leveling(self) -> F64:
+        """Return T_level_base (4, 4): the smallest rotation that turns the normal upright."""
+        return leveling(self.normal)
 
+    def toward(self, other: Ground, gain: float) -> Ground:
+        """Return the mean of this ground and another one, weighted 1 - `gain` and `gain` (0..1)."""
+        normal = (1.0 - gain) * self.normal + gain * other.normal
+        offset = (1.0 - gain) * self.offset_m + gain * other.offset_m
+        ceiling = other.ceiling_m if other.ceiling_m is not None else self.ceiling_m
+        return Ground(normal / np.linalg.norm(normal), offset, ceiling, self.seen or other.seen)
 
-def floor_height(
-    shapes: F64, edge_m: float, sensor_m: F64, parameters: LevelParameters = LEVEL
-) -> float | None:
-    """z of the floor below a sensor at (3,), in a map whose z axis is up; None if it was not seen.
-
-    The floor is the lowest large level around the sensor: tables lie above it, reflections below are small.
-    """
-    p = parameters
-    heights = shapes[_lying_below(shapes, sensor_m, p), 2]
-    if not len(heights):
-        return None
-    slab = np.floor((heights - heights.min()) / p.bin_m).astype(np.int64)
-    counts = np.bincount(slab, minlength=2)
-    # A floor on the border of two slabs is in both.
-    pairs = np.append(counts[:-1] + counts[1:], counts[-1]) * edge_m**2
-    large = np.flatnonzero(pairs > max(p.least_m2, p.share * pairs.max()))
-    if not len(large):
-        return None
-    lowest = int(large[0])
-    if lowest + 1 < len(pairs) and pairs[lowest + 1] > pairs[lowest]:
-        lowest += 1
-    return float(np.median(heights[(slab == lowest) | (slab == lowest + 1)]))
-
-
-def _lying_below(shapes: F64, sensor_m: F64, p: LevelParameters) -> BoolGrid:
-    """The shapes (V, 9) of level surfaces around and below a sensor at (3,)."""
-    near = (np.abs(shapes[:, :2] - sensor_m[:2]) < p.radius_m).all(axis=1)
-    # Of a plane, each column of the information points along the normal.
-    _, _, xz, _, yz, zz = shapes[:, 3:].T
-    lying = (zz > p.flat) & (zz > p.level * np.sqrt(xz**2 + yz**2 + zz**2))
-    below: BoolGrid = near & lying & (shapes[:, 2] < sensor_m[2] - p.below_m)
-    return below
-
-
-class FloorBelow:
-    """z of the floor below a sensor in the hand, by poses whose height drifts.
-
-    z_m : None as long as none was seen. sigma_m : its standard deviation.
-    risen_m : how far the poses have risen since the floor was first seen.
-    """
-
-    def __init__(self, parameters: LevelParameters = LEVEL) -> None:
-        self._parameters = parameters
-        self.z_m: float | None = None
-        self.sigma_m = self.risen_m = 0.0
-
-    def follow(self, travel_m: float, view: F64, surfaces: F64, edge_m: float, sensor_m: F64) -> float | None:
-        """Go on after some travel; returns z of the floor by a view alone, None if that does not show it.
-
-        view : (V, 9) the shapes that it shows by itself; surfaces : (W, 9) those of all views.
-        """
-        p = self._parameters
-        variance = self.sigma_m**2 + p.drift_per_m * travel_m
-        self.sigma_m = math.sqrt(variance)
-        near_m = p.near_m + 3.0 * self.sigma_m
-        # A view may show a reflection, and all views the floor of another pass; a lower floor is in both.
-        if self.z_m is None or self._lower(view, near_m, edge_m, sensor_m) is not None:
-            lowest_m = self._lower(surfaces, near_m, edge_m, sensor_m)
-            if lowest_m is not None:
-                self.z_m, self.sigma_m = lowest_m, p.seen_m
-        if self.z_m is None:
-            return None
-        heights_m = view[_lying_below(view, sensor_m, p), 2]
-        heights_m = heights_m[np.abs(heights_m - self.z_m) < near_m]
-        if len(heights_m) * edge_m**2 < p.least_m2:
-            return None
-        seen_m = float(np.median(heights_m))
-        gain = variance / (variance + p.seen_m**2)
-        rise_m = gain * (seen_m - self.z_m)
-        self.z_m, self.risen_m = self.z_m + rise_m, self.risen_m + rise_m
-        self.sigma_m = math.sqrt((1.0 - gain) * variance)
-        return seen_m
-
-    def _lower(self, surfaces: F64, near_m: float, edge_m: float, sensor_m: F64) -> float | None:
-        """z of the floor in surfaces (V, 9), if it lies far below what was taken for it, such as a table, or
-        none is known; else None."""
-        lowest_m = floor_height(surfaces, edge_m, sensor_m, self._parameters)
-        if lowest_m is not None and self.z_m is not None and lowest_m > self.z_m - near_m:
-            return None
-        return lowest_m
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UprightParameters:
-    """How the vertical is measured. Chosen by hand, on simulated scans of a 16-beam lidar.
-
-    points, voxel_m, normals : so many of a scan are used, of these one a voxel, so that near walls count no
-        more, and for so many of them a normal is estimated.
-    neighbours : points of which a normal is estimated. squeeze : their heights count this many times when
-        neighbours are looked for, so that they lie on several rings of a lidar.
-    flatness : largest ratio of the variances across a surface and along its shorter side.
-    breadth_m : least standard deviation along that side: points of a single ring have no normal.
-    steepest_rad : normals nearer to the vertical than 90 degrees minus this are not of walls.
-    scale : of the robust weight of a normal, sine of its angle with the horizontal.
-    rounds : of reweighting.
-    least_normals, least_share : with fewer normals, or with less weight on the second direction of walls,
-        the vertical is not determined.
-    side_share : weight, as a share of that of all normals, of the vertical being perpendicular to the y axis
-        of the base, about which a hand turns a camera most. So one wall ahead, which shows the pitch, is
-        enough.
-    """
-
-    points: int = 12_000
-    voxel_m: float = 0.07
-    normals: int = 700
-    neighbours: int = 40
-    squeeze: float = 0.4
-    flatness: float = 0.05
-    breadth_m: float = 0.12
-    steepest_rad: float = math.radians(37.0)
-    scale: float = 0.05
-    rounds: int = 8
-    least_normals: int = 30
-    least_share: float = 0.05
-    side_share: float = 0.0
-
-
-UPRIGHT = UprightParameters()
-CAMERA_UPRIGHT = UprightParameters(voxel_m=0.1, squeeze=0.7, side_share=0.1)
-"""Of a depth camera. It sees small patches densely: with the voxels of a lidar, the neighbours of a point
-span less than `breadth_m`. Chosen by hand; in a room by a phone (`depth/room`) 3 planes of 25, tilted by 14
-to 27 degrees, are told from the floor by it."""
-
-
-def level_floor(scan: Scan, points_m: NDArray[np.floating]) -> Ground | None:
-    """The floor in the points (N, 3) of a scan, base frame; None if it shows none.
-
-    What the walls of the scan do not stand on is no floor, but a slanting plane such as the back of a chair.
-    """
-    ground = find_ground(points_m, scan.T_base_sensor[:3, 3])
-    if ground is None:
-        return None
-    parameters = CAMERA_UPRIGHT if SENSOR_MODELS[scan.sensor].narrow else UPRIGHT
-    vertical = vertical_of(points_m, ground.normal, parameters)
-    return ground if vertical is None or float(vertical @ ground.normal) > LEVEL.level else None
-
-
-def vertical_of(
-    points_m: NDArray[np.floating], guess: F64, parameters: UprightParameters = UPRIGHT
-) -> F64 | None:
-    """The vertical (3,), a unit vector that points up, by the walls in a scan; None if they do not show it.
-
-    points_m : (N, 3) in the base frame, without the sensor's motion. guess : (3,) direction around which the
-    vertical is looked for: the one that is perpendicular to most normals.
-    """
-    p, normals = parameters, _normals(points_m, parameters)
-    walls = normals[np.abs(normals @ guess) < math.sin(p.steepest_rad)]
-    if len(walls) < p.least_normals:
-        return None
-    vertical, spread, weight = guess, np.zeros(3), np.zeros(1)
-    for _ in range(p.rounds):
-        weight = (1.0 + ((walls @ vertical) / p.scale) ** 2) ** -2
-        scatter = (walls * weight[:, None]).T @ walls
-        scatter[1, 1] += p.side_share * weight.sum()
-        spread, axes = np.linalg.eigh(scatter)
-        vertical = axes[:, 0] if axes[:, 0] @ guess > 0.0 else -axes[:, 0]
-    return vertical if spread[1] > p.least_share * float(weight.sum()) else None
-
-
-def _normals(points_m: NDArray[np.floating], p: UprightParameters) -> F64:
-    """Normals (K, 3) of flat surfaces."""
-    from scipy.spatial import cKDTree
-
-    points = points_m[random_subset(len(points_m), p.points)].astype(np.float64)
-    _, first = np.unique(np.floor(points / p.voxel_m).astype(np.int64), axis=0, return_index=True)
-    points = points[np.sort(first)]
-    if len(points) < p.neighbours:
-        return np.empty((0, 3))
-    squeezed = points * (1.0, 1.0, p.squeeze)
-    _, near = cKDTree(squeezed).query(squeezed[random_subset(len(points), p.normals)], k=p.neighbours)
-    around = points[near]
-    around -= around.mean(axis=1, keepdims=True)
-    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / p.neighbours)
-    flat = (variances[:, 0] < p.flatness * variances[:, 1]) & (variances[:, 1] > p.breadth_m**2)
-    normals: F64 = axes[flat, :, 0]
-    return normals
+    def moved(self, T_new_old: F64) -> Ground:
+        """Return the same ground in another frame; T_new_old (4, 4) is the old frame's pose in it."""
+        normal = T_new_old[:3, :3] @ self.normal
+        return Ground(normal, self.offset_m - float(normal @ T_new_old[:3, 3]), self.ceiling_m, self.seen)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -306,48 +130,6 @@ class CloudParameters:
 
 
 CLOUD_PARAMETERS = CloudParameters()
-
-
-Plane = tuple[F64, float]
-"""Unit normal (3,) that points up, and offset: height = normal . p + offset."""
-
-
-@dataclass(frozen=True, slots=True)
-class Ground:
-    """The floor plane of a scan and the ceiling above it, in the scan's frame.
-
-    normal : (3,) unit vector that points up from the floor.
-    offset_m : height of the frame's origin above the floor, so that height = normal . p + offset_m.
-    ceiling_m : height of the ceiling above the floor, or None where none was seen.
-    seen : whether the floor was measured (False: assumed from the mounting).
-    """
-
-    normal: F64
-    offset_m: float
-    ceiling_m: float | None = None
-    seen: bool = True
-
-    def heights(self, points_m: NDArray[np.floating]) -> NDArray[np.floating]:
-        """Return the heights (N,) of points (N, 3) above the floor, in metres and in the points' type."""
-        normal = self.normal.astype(points_m.dtype)
-        heights: NDArray[np.floating] = points_m @ normal + points_m.dtype.type(self.offset_m)
-        return heights
-
-    def leveling(self) -> F64:
-        """Return T_level_base (4, 4): the smallest rotation that turns the normal upright."""
-        return leveling(self.normal)
-
-    def toward(self, other: Ground, gain: float) -> Ground:
-        """Return the mean of this ground and another one, weighted 1 - `gain` and `gain` (0..1)."""
-        normal = (1.0 - gain) * self.normal + gain * other.normal
-        offset = (1.0 - gain) * self.offset_m + gain * other.offset_m
-        ceiling = other.ceiling_m if other.ceiling_m is not None else self.ceiling_m
-        return Ground(normal / np.linalg.norm(normal), offset, ceiling, self.seen or other.seen)
-
-    def moved(self, T_new_old: F64) -> Ground:
-        """Return the same ground in another frame; T_new_old (4, 4) is the old frame's pose in it."""
-        normal = T_new_old[:3, :3] @ self.normal
-        return Ground(normal, self.offset_m - float(normal @ T_new_old[:3, 3]), self.ceiling_m, self.seen)
 
 
 def find_ground(
@@ -479,3 +261,224 @@ def _find_ceiling(heights: F64) -> float | None:
         if counts[slab] > 2.0 * counts[max(slab - 6, 0) : max(slab - 2, 1)].mean():
             return float(edges[slab] + 0.5 * step_m)
     return None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelParameters:
+    """Parameters of `floor_height` and `FloorBelow`. Chosen by hand.
+
+    flat : least information along the vertical of a voxel of a level surface.
+    level : a surface is level if the cosine between its normal and the vertical is higher.
+    least_m2 : smallest floor.
+    share : least area of the floor, as a share of the largest level: smaller ones below it are reflections.
+    radius_m : of the search, around the sensor. bin_m : height of a slab. below_m : least distance of the
+    floor below the sensor.
+
+    To follow the floor:
+
+    near_m : largest distance of the floor from its predicted height, beside three standard deviations: a seat
+        lies higher.
+    seen_m : standard deviation of the height measured in one view.
+    drift_per_m : variance that the height of a pose gains on a metre of travel, m2: 2 cm on the first, 10 cm
+        on 25 m, where the odometry of a phone drifts by half a percent.
+    """
+
+    flat: float = 0.3
+    level: float = 0.97
+    least_m2: float = 0.4
+    share: float = 0.15
+    radius_m: float = 5.0
+    bin_m: float = 0.1
+    below_m: float = 0.3
+    near_m: float = 0.2
+    seen_m: float = 0.03
+    drift_per_m: float = 0.02**2
+
+
+LEVEL = LevelParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UprightParameters:
+    """Parameters of `vertical_of`. Chosen by hand, on simulated scans of a 16-beam lidar.
+
+    points, voxel_m, normals : a random sample of the scan, reduced to one point a voxel so that near walls
+    count no
+        more; a normal is estimated for so many of these.
+    neighbours : points for the estimate of a normal. squeeze : factor on heights in the search for
+    neighbours, so
+        that they lie on several rings of a lidar.
+    flatness : largest ratio of the variances across a surface and along its shorter side.
+    breadth_m : least standard deviation along that side: points of a single ring have no normal.
+    steepest_rad : normals nearer to the vertical than 90 degrees minus this are not of walls.
+    scale : of the robust weight of a normal, sine of its angle with the horizontal.
+    rounds : of reweighting.
+    least_normals, least_share : with fewer normals, or with less weight on the second direction of walls,
+        the vertical is not determined.
+    side_share : weight, as a share of that of all normals, of the vertical being perpendicular to the y axis
+        of the base, about which a hand turns a camera most. So one wall ahead, which shows the pitch, is
+        enough.
+    """
+
+    points: int = 12_000
+    voxel_m: float = 0.07
+    normals: int = 700
+    neighbours: int = 40
+    squeeze: float = 0.4
+    flatness: float = 0.05
+    breadth_m: float = 0.12
+    steepest_rad: float = math.radians(37.0)
+    scale: float = 0.05
+    rounds: int = 8
+    least_normals: int = 30
+    least_share: float = 0.05
+    side_share: float = 0.0
+
+
+UPRIGHT = UprightParameters()
+CAMERA_UPRIGHT = UprightParameters(voxel_m=0.1, squeeze=0.7, side_share=0.1)
+"""Of a depth camera. It sees small patches densely: with the voxels of a lidar, the neighbours of a point
+span less than `breadth_m`. Chosen by hand; in a room by a phone (`depth/room`) 3 planes of 25, tilted by 14
+to 27 degrees, are told from the floor by it."""
+
+
+def level_floor(scan: Scan, points_m: NDArray[np.floating]) -> Ground | None:
+    """Find the floor in the points (N, 3) of a scan, base frame; None if it shows none.
+
+    A plane that is not perpendicular to the walls of the scan is no floor, but for example the back of a
+    chair.
+    """
+    ground = find_ground(points_m, scan.T_base_sensor[:3, 3])
+    if ground is None:
+        return None
+    parameters = CAMERA_UPRIGHT if SENSOR_MODELS[scan.sensor].narrow else UPRIGHT
+    vertical = vertical_of(points_m, ground.normal, parameters)
+    return ground if vertical is None or float(vertical @ ground.normal) > LEVEL.level else None
+
+
+def vertical_of(
+    points_m: NDArray[np.floating], guess: F64, parameters: UprightParameters = UPRIGHT
+) -> F64 | None:
+    """Estimate the vertical (3,), a unit vector that points up, from the walls in a scan; None if they do not
+    fix it.
+
+    points_m : (N, 3) in the base frame, deskewed. guess : (3,) initial direction. The result is the direction
+    near it that is perpendicular to most normals.
+    """
+    p, normals = parameters, _normals(points_m, parameters)
+    walls = normals[np.abs(normals @ guess) < math.sin(p.steepest_rad)]
+    if len(walls) < p.least_normals:
+        return None
+    vertical, spread, weight = guess, np.zeros(3), np.zeros(1)
+    for _ in range(p.rounds):
+        weight = (1.0 + ((walls @ vertical) / p.scale) ** 2) ** -2
+        scatter = (walls * weight[:, None]).T @ walls
+        scatter[1, 1] += p.side_share * weight.sum()
+        spread, axes = np.linalg.eigh(scatter)
+        vertical = axes[:, 0] if axes[:, 0] @ guess > 0.0 else -axes[:, 0]
+    return vertical if spread[1] > p.least_share * float(weight.sum()) else None
+
+
+def _normals(points_m: NDArray[np.floating], p: UprightParameters) -> F64:
+    """Estimate normals (K, 3) of flat surfaces."""
+    from scipy.spatial import cKDTree
+
+    points = points_m[random_subset(len(points_m), p.points)].astype(np.float64)
+    _, first = np.unique(np.floor(points / p.voxel_m).astype(np.int64), axis=0, return_index=True)
+    points = points[np.sort(first)]
+    if len(points) < p.neighbours:
+        return np.empty((0, 3))
+    squeezed = points * (1.0, 1.0, p.squeeze)
+    _, near = cKDTree(squeezed).query(squeezed[random_subset(len(points), p.normals)], k=p.neighbours)
+    around = points[near]
+    around -= around.mean(axis=1, keepdims=True)
+    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / p.neighbours)
+    flat = (variances[:, 0] < p.flatness * variances[:, 1]) & (variances[:, 1] > p.breadth_m**2)
+    normals: F64 = axes[flat, :, 0]
+    return normals
+
+
+def floor_height(
+    shapes: F64, edge_m: float, sensor_m: F64, parameters: LevelParameters = LEVEL
+) -> float | None:
+    """Return z of the floor below a sensor at (3,), in a map whose z axis is up; None if none is visible.
+
+    The floor is the lowest large level around the sensor: tables lie above it, reflections below are small.
+    """
+    p = parameters
+    heights = shapes[_lying_below(shapes, sensor_m, p), 2]
+    if not len(heights):
+        return None
+    slab = np.floor((heights - heights.min()) / p.bin_m).astype(np.int64)
+    counts = np.bincount(slab, minlength=2)
+    # A floor on the border of two slabs is in both.
+    pairs = np.append(counts[:-1] + counts[1:], counts[-1]) * edge_m**2
+    large = np.flatnonzero(pairs > max(p.least_m2, p.share * pairs.max()))
+    if not len(large):
+        return None
+    lowest = int(large[0])
+    if lowest + 1 < len(pairs) and pairs[lowest + 1] > pairs[lowest]:
+        lowest += 1
+    return float(np.median(heights[(slab == lowest) | (slab == lowest + 1)]))
+
+
+def _lying_below(shapes: F64, sensor_m: F64, p: LevelParameters) -> BoolGrid:
+    """Select the shapes (V, 9) of level surfaces around and below a sensor at (3,); returns a mask (V,)."""
+    near = (np.abs(shapes[:, :2] - sensor_m[:2]) < p.radius_m).all(axis=1)
+    # Of a plane, each column of the information points along the normal.
+    _, _, xz, _, yz, zz = shapes[:, 3:].T
+    lying = (zz > p.flat) & (zz > p.level * np.sqrt(xz**2 + yz**2 + zz**2))
+    below: BoolGrid = near & lying & (shapes[:, 2] < sensor_m[2] - p.below_m)
+    return below
+
+
+class FloorBelow:
+    """Estimates z of the floor below a sensor in the hand, while the height of its poses drifts.
+
+    z_m : None until a floor was found. sigma_m : its standard deviation.
+    risen_m : drift of the height of the poses since then.
+    """
+
+    def __init__(self, parameters: LevelParameters = LEVEL) -> None:
+        self._parameters = parameters
+        self.z_m: float | None = None
+        self.sigma_m = self.risen_m = 0.0
+
+    def follow(self, travel_m: float, view: F64, surfaces: F64, edge_m: float, sensor_m: F64) -> float | None:
+        """Update the floor after some travel; returns z of the floor in this view alone, or None if it shows
+        none.
+
+        view : (V, 9) shapes of this view. surfaces : (W, 9) shapes of all views.
+        """
+        p = self._parameters
+        variance = self.sigma_m**2 + p.drift_per_m * travel_m
+        self.sigma_m = math.sqrt(variance)
+        near_m = p.near_m + 3.0 * self.sigma_m
+        # A view may show a reflection, and all views the floor of another pass; a lower floor is in both.
+        if self.z_m is None or self._lower(view, near_m, edge_m, sensor_m) is not None:
+            lowest_m = self._lower(surfaces, near_m, edge_m, sensor_m)
+            if lowest_m is not None:
+                self.z_m, self.sigma_m = lowest_m, p.seen_m
+        if self.z_m is None:
+            return None
+        heights_m = view[_lying_below(view, sensor_m, p), 2]
+        heights_m = heights_m[np.abs(heights_m - self.z_m) < near_m]
+        if len(heights_m) * edge_m**2 < p.least_m2:
+            return None
+        seen_m = float(np.median(heights_m))
+        gain = variance / (variance + p.seen_m**2)
+        rise_m = gain * (seen_m - self.z_m)
+        self.z_m, self.risen_m = self.z_m + rise_m, self.risen_m + rise_m
+        self.sigma_m = math.sqrt((1.0 - gain) * variance)
+        return seen_m
+
+    def _lower(self, surfaces: F64, near_m: float, edge_m: float, sensor_m: F64) -> float | None:
+        """Return z of the floor in surfaces (V, 9), or None.
+
+        A known floor is replaced only by one that lies far below it: what was taken for the floor may be a
+        table.
+        """
+        lowest_m = floor_height(surfaces, edge_m, sensor_m, self._parameters)
+        if lowest_m is not None and self.z_m is not None and lowest_m > self.z_m - near_m:
+            return None
+        return lowest_m
