@@ -1,11 +1,11 @@
-"""A planar pose refined in space, and checked there: points on points, where both sides have them.
+"""A planar pose refined and checked in space, by the points of the query and of the map.
 
-1. The two floors say how high the query lies in the map, and how it is tilted.
+1. The two floors give the height and the tilt of the query in the map.
 2. ICP, point to plane (Open3D), brings the points of the query on those of the map, in all six degrees of
    freedom, with ever smaller distances and Tukey's loss, so that what has changed does not pull.
 3. Each ray of the query is compared with the map: it ends on a surface of the map, or passes through one, or
-   ends before it. This does not use the occupancy grids, so it is a second opinion on a planar answer: a
-   shelf that stands like a wall, or a room that is higher.
+   ends before it. This does not use the occupancy grids, so it finds what a planar answer cannot: a shelf in
+   place of a wall, or a higher room.
 """
 
 from __future__ import annotations
@@ -76,15 +76,13 @@ class RegistrationParameters:
 class RayParameters:
     """How rays are compared with a map. All chosen by hand, tried in simulation.
 
-    views, rays : at most so many scans are compared, evenly spread, and of each so many rays.
-    bin_rad : size of the bins of directions in which surfaces hide each other.
-    near_m : a point so near to the map lies on it.
-    gap_m : a surface is passed, or not reached, if it is at least so far off along the ray.
-    floor_m : points this near to the floor say nothing: it is the same everywhere.
-    patch_m : rays that end within a cell of this size see one thing.
-    patch_rays : so many more rays of a patch must end on a surface of one place than of another for the patch
-        to speak for it.
-    above_m : what is higher above the floor is part of the building: it is seldom moved.
+    views, rays : at most so many scans are compared, evenly spread, and of each so many rays. bin_rad : size
+    of the bins of directions in which surfaces hide each other. near_m : a point so near to the map lies on
+    it. gap_m : a surface is passed, or not reached, if it is at least so far off along the ray. floor_m :
+    points this near to the floor are no evidence: it is the same everywhere. patch_m : rays that end within a
+    cell of this size hit one object. patch_rays : a patch counts for a place if so many more of its rays end
+    on surfaces of this place than of the other. above_m : surfaces higher above the floor belong to the
+    building: they are seldom moved.
     """
 
     views: int = 5
@@ -118,12 +116,12 @@ class SpatialView:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rays:
-    """The rays of a query compared with a map; the same rays in the same order whatever the place is.
+    """The rays of a query compared with a map; the same rays in the same order at each place.
 
-    end_m : (R, 3) where they end, in the query. height_m : (R,) above the floor, NaN if that was not found.
-    on, through, before : (R,) whether a ray ends on a surface of the map, behind one that should have stopped
-    it, or before one where the map shows no other; none of them for a ray to the floor or to where the map
-    shows nothing.
+    end_m : (R, 3) where they end, in the query. height_m : (R,) of the end above the floor, NaN if no floor
+    was found. on, through, before : (R,) True if a ray ends on a surface of the map, behind one that should
+    have stopped it, or before one where the map shows no other; none of them for a ray to the floor, or where
+    the map is empty.
     """
 
     end_m: F64
@@ -140,7 +138,7 @@ class Rays:
 
     @staticmethod
     def joined(parts: Sequence[Rays]) -> Rays:
-        """The rays of several views."""
+        """Join the rays of several views."""
         none = np.empty(0, bool)
         return Rays(
             end_m=np.concatenate([np.empty((0, 3)), *(part.end_m for part in parts)]),
@@ -152,15 +150,16 @@ class Rays:
 
     @property
     def counts(self) -> tuple[int, int, int]:
-        """How many are on, through and before."""
+        """Return the numbers of rays that are on, through and before."""
         on, through, before = (int(np.count_nonzero(k)) for k in (self.on, self.through, self.before))
         return on, through, before
 
     def patches_over(self, other: Rays, parameters: RayParameters = RAYS) -> int:
-        """Patches of the building that only this place explains, less those that only the other one does.
+        """Return the number of patches that only this place explains, minus those that only the other place
+        explains.
 
-        What one of the maps has not seen speaks for neither, nor does what stands on the floor: of two rooms
-        alike that which is furnished like the query need not be the right one.
+        Only patches of the building count: of two similar rooms, the one that is furnished like the query
+        need not be the right one. Patches that one of the maps has not observed count for neither.
         """
         contradicted = self.through | self.before, other.through | other.before
         balance = (self.on & contradicted[1]).astype(np.int64) - (other.on & contradicted[0])
@@ -185,7 +184,8 @@ class SpatialFit:
     T_map_query : (4, 4). information : (6, 6) inverse covariance of a small motion at `center_m` (3,), map
         frame: along x, y, z, then about x, y, z.
     rmse_m : of the distances of corresponding points from the surfaces of the map.
-    compared : all rays. rays : how many of them say something. on, through, before : shares of these; their
+    compared : all rays. rays : number of those that are on, through or before. on, through, before : shares
+    of these; their
         sum is 1.
     """
 
@@ -206,16 +206,19 @@ class SpatialFit:
 
     @property
     def held(self) -> float:
-        """0..1, three times the share of the information about the position that is along its least known
-        direction: surfaces that all face one way fit onto any wall."""
+        """Return the observability, 0..1, of the position: three times the share of information along the
+        least known axis.
+
+        Surfaces that all face one way fit onto any wall.
+        """
         position = self.information[:3, :3]
         return 3.0 * float(np.linalg.eigvalsh(position)[0] / np.trace(position))
 
     def covariance_at(self, T_query_base: F64) -> F64:
-        """Covariance (6, 6) of the pose of a base (4, 4) in the query.
+        """Return the covariance (6, 6) of the pose of a base (4, 4) in the query.
 
-        Of x, y, z of its origin in the map frame, then of the rotation about the axes of the map, as in
-        geometry_msgs/PoseWithCovariance.
+        It is of x, y, z of the origin of the base in the map frame, then of the rotation about the axes of
+        the map, as in geometry_msgs/PoseWithCovariance.
         """
         away = (self.T_map_query @ T_query_base)[:3, 3] - self.center_m
         motion = np.eye(6)
@@ -228,7 +231,8 @@ class SpatialFit:
 
 class MapSurface:
     """The points of a map in space, (V, 3) `points_m`, and the normals of its surfaces: each is estimated
-    once, when a query lies near it for the first time."""
+    once, for the first query near it.
+    """
 
     def __init__(self, points: PointMap, parameters: RegistrationParameters = REGISTRATION) -> None:
         self._parameters = parameters
@@ -241,8 +245,11 @@ class MapSurface:
         self._surfaces: dict[int, tuple[F64, F64]] = {}
 
     def near(self, at_m: F64) -> tuple[F64, F64]:
-        """The points (M, 3), one a voxel, and their normals (M, 3), of at least what is within reach of
-        points (N, 3)."""
+        """Return the points (M, 3), one a voxel, and the normals (M, 3) of the surfaces within reach of
+        points (N, 3).
+
+        Some lie farther away, because whole tiles are returned.
+        """
         reach_m = 2.0 * self._parameters.rounds_m[0]
         corners_m = np.array([(x, y) for x in (-reach_m, reach_m) for y in (-reach_m, reach_m)])
         tiles = np.unique(self._tiles_of((at_m[:, None, :2] + corners_m).reshape(-1, 2)))
@@ -251,12 +258,12 @@ class MapSurface:
         return np.concatenate(points), np.concatenate(normals)
 
     def _tiles_of(self, points_m: F64) -> I64:
-        """The number of the tile that each point (N, 2 or more) lies in."""
+        """Return the number of the tile of each point (N, 2 or more)."""
         x, y = np.floor(points_m[:, :2] / self._parameters.tile_m).astype(np.int64).T
         return np.asarray(x * _TILES + y)
 
     def _surface(self, tile: int) -> tuple[F64, F64]:
-        """The points and normals of a tile."""
+        """Return the points and normals of a tile."""
         from pc2grid.open3d_core import o3d
 
         p = self._parameters
@@ -320,7 +327,7 @@ def register_in_space(
 
 
 def _around(points: F64, query: F64, margin_m: float) -> F64:
-    """The points of a map (V, 3) within the horizontal extent of a query (N, 3) in the map."""
+    """Return the points of a map (V, 3) within the horizontal extent of a query (N, 3) in the map."""
     low, high = query[:, :2].min(axis=0) - margin_m, query[:, :2].max(axis=0) + margin_m
     inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
     around: F64 = points[inside]
@@ -328,10 +335,10 @@ def _around(points: F64, query: F64, margin_m: float) -> F64:
 
 
 def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None:
-    """The pose (4, 4) `lifted` of a query in the map, tilted and raised so that the two floors are one.
+    """Tilt and raise `lifted`, the pose (4, 4) of a query in the map, so that the two floors are one.
 
-    The odom frame of a query without tf is as level as its first scan showed it to be. None if the floor near
-    the sensor (3,), odom frame, is not seen on both sides.
+    The odom frame of a query without tf is only as level as the floor in its first scan. None if the floor
+    near the sensor (3,), odom frame, is not visible on both sides.
     """
     at_m = transform_points(lifted, sensor_m[None])[0]
     normals, heights_m = [], []
@@ -359,7 +366,7 @@ def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None
 def _icp(
     query: F64, surface: tuple[F64, F64], start: F64, p: RegistrationParameters
 ) -> tuple[F64, F64, F64, float] | Unfit:
-    """The pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m.
+    """Register a query; returns the pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m.
 
     surface : points (M, 3) and normals (M, 3) of the map.
     """
@@ -399,8 +406,9 @@ def _icp(
 
 
 def _has_left(center_m: F64, start: F64, T: F64, p: RegistrationParameters) -> bool:
-    """Whether a pose (4, 4) moves or turns a query about its centre (3,) farther from where it began than a
-    planar pose can be off."""
+    """Return True if a pose (4, 4) moves or turns a query about its centre (3,) farther than a planar pose
+    can be off.
+    """
     turn_rad = rotation_vector(invert_pose(start) @ T)
     before_m, after_m = (transform_points(pose, center_m[None])[0] for pose in (start, T))
     return (
@@ -455,7 +463,7 @@ def compare_rays(
 
 
 def _directions(away: F64, bin_rad: float) -> tuple[NDArray[np.int64], F64]:
-    """The bin of directions (N,) and the range (N,) of points (N, 3) around the origin."""
+    """Return the bin of directions (N,) and the range (N,) of points (N, 3) around the origin."""
     range_m: F64 = np.linalg.norm(away, axis=1)
     azimuth = np.arctan2(away[:, 1], away[:, 0]) + math.pi
     elevation = np.arcsin(np.clip(away[:, 2] / np.maximum(range_m, 1e-9), -1.0, 1.0)) + math.pi / 2
@@ -465,6 +473,6 @@ def _directions(away: F64, bin_rad: float) -> tuple[NDArray[np.int64], F64]:
 
 
 def _cross(vector: F64) -> F64:
-    """The matrix (3, 3) that takes the cross product with a vector (3,) from the left."""
+    """Return the matrix (3, 3) of the cross product with a vector (3,) from the left."""
     x, y, z = vector
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,35 +1,24 @@
-"""Scores a pose both ways: the query's walls against the map, and the map's walls against the query.
+"""Scores a pose both ways, the query's walls against the map and the map's walls against the query; refines
+it.
 
-One way alone is not enough. The walls of a small query fit into many places; but at the wrong ones the map
-has walls where the query has seen free space.
+The walls of a small query fit into many places. At a wrong one the map has walls where the query has observed
+free space, so both directions count. What each side must have observed is defined by `Walls.facing`: a laser
+passes under tables, so obstacles at some heights only explain its returns, and do not contradict its free
+space. Two lasers at different heights are compared on what both can observe: the walls of the higher one
+stand on the floor, but those of the lower one need not reach up, so they count as on unknown ground where the
+higher one observes free space.
 
-What each side must have seen of the other's walls is told by `pc2grid.matching.walls.Walls.facing`. A laser
-passes under tables: what stands at some heights only explains what the laser sees, and does not contradict
-its free space.
+Walls are thin: a wall that the map has observed from its other side only, where it does not know the ground
+in front, may be the right one. But a query along the outer wall of a building also fits the rooms behind it.
+So such a wall counts in the score, which ranks places, but not as evidence of a place (`compared`). The walls
+of the map are not treated so, because a single scan knows the ground along thin rays only. Within a session,
+and between two of one building, both have observed the same side: there `Walls.before_m` are the walls.
 
-A wall that the map has seen from its other side only, as it does not know the ground in front of it, may be
-the right one: walls are thin. But a query along the outer wall of a building fits the rooms behind it, too.
-So such a wall counts in the score, by which places are ranked, and not as evidence of a place (`compared`).
-Not the other way round: what a single scan knows of the ground are thin rays. Within a session, and between
-two of one building, both sides are of one wall: there `Walls.before_m` are the walls.
-
-Two lasers at different heights are compared on what both can see. The walls of the higher one stand on the
-floor; what the lower one has seen need not reach up, so it counts as on unknown ground where the higher one
-sees free space.
-
-Improves a pose below the cell size: Gauss-Newton on the interpolated likelihood field.
-
-As Hector SLAM does it (Kohlbrecher et al. 2011, "A flexible and scalable SLAM system", section IV-B): the sum
-over the points of (1 - field)^2 is minimised, with the bilinear interpolation's gradient.
-
-What supports and what contradicts a query at a pose, wall point by wall point.
-
-A `Fit` is a mean over wall points; a picture that shows why it is high or low needs the points themselves.
-
-How well a map fits onto itself, slid along: high in a bare corridor, low among rooms.
-
-What fits onto itself elsewhere fits into other places of its kind as well: the walls that agree then say "a
-corridor", not which one or where in it.
+`refine` improves a pose below the cell size as Hector SLAM does (Kohlbrecher et al. 2011, "A flexible and
+scalable SLAM system", section IV-B): Gauss-Newton minimises the sum over the points of (1 - field)^2, with
+the gradient of the bilinear interpolation. `agreement` lists the wall points behind a score. The
+`self_similarity` of a map is how well it fits onto itself, shifted: high in a bare corridor, low among rooms.
+A map that fits onto itself elsewhere also fits other places of its kind.
 """
 
 from __future__ import annotations
@@ -39,27 +28,26 @@ import math
 from dataclasses import dataclass, replace
 
 import cv2
+import numba
 import numpy as np
 from numpy import fft
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F32, F64, SE2, U8, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, U8, BoolGrid, wrap_angle
 from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField, Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """How well a query agrees with a map at one pose. Means and shares are weighted by `walls.steadiness`.
+    """The agreement of a query with a map at one pose. Means and shares are weighted by `walls.permanence`.
 
-    T_map_query : pose of the query's frame in the map.
-    forward : 0..1, mean likelihood of the query's walls; neutral where the map is unknown.
-    backward : 0..1, mean likelihood of the map's walls on ground that the query knows.
-    overlap : 0..1, share of the query's walls on ground that the map knows.
-    compared : number of the query's wall points on ground that the map knows, as it does the ground in front
-        of them, by weight.
-    looked_at : number of the map's wall points on ground that the query knows, by weight.
-    score : 0..1, geometric mean of forward and backward; hypotheses are ranked by it.
-    covariance : (3, 3) of x, y, yaw from the refinement: wide along a corridor, narrow across it.
+    T_map_query : pose of the query's frame in the map. forward : 0..1, mean likelihood of the query's walls;
+    neutral where the map is unknown. backward : 0..1, mean likelihood of the map's walls on ground known to
+    the query. overlap : 0..1, share of the query's walls on ground known to the map. compared : number of the
+    query's wall points that, with the ground in front of them, are known to the map, by weight. looked_at :
+    number of the map's wall points on ground known to the query, by weight. score : 0..1, geometric mean of
+    forward and backward; hypotheses are ranked by it. covariance : (3, 3) of x, y, yaw from the refinement:
+    wide along a corridor, narrow across it.
     """
 
     T_map_query: SE2
@@ -80,7 +68,9 @@ class Fit:
 
     @property
     def known_agreement(self) -> float:
-        """0..1, mean likelihood of the query's walls on ground that the map knows; 0 if it knows none."""
+        """Return the mean likelihood, 0..1, of the query's walls on ground known to the map; 0 if there is
+        none.
+        """
         if not self.overlap:
             return 0.0
         known = (self.forward - LIKELIHOOD.neutral * (1.0 - self.overlap)) / self.overlap
@@ -88,7 +78,7 @@ class Fit:
 
     @property
     def known_agreement_both_ways(self) -> float:
-        """0..1, the smaller of `known_agreement` and `backward`: how well each fits what the other knows."""
+        """Return the smaller of `known_agreement` and `backward`, 0..1: the worse of the two directions."""
         return min(self.known_agreement, self.backward)
 
 
@@ -116,9 +106,7 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
 
 
 def _sums(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> F64:
-    """(3,) what `_kernels.known_sums` says of walls on a field."""
-    from pc2grid.matching.search import known_sums
-
+    """Return `known_sums` (3,) of walls on a field."""
     least = LIKELIHOOD.neutral_value + 1 if walls.only_explain else 0
     pose = T_field_walls.x, T_field_walls.y, T_field_walls.yaw
     on = field.values, field.known, field.resolution_m, field.origin_m
@@ -165,14 +153,14 @@ def refine(
     center_m: tuple[float, float],
     parameters: RefinementParameters = REFINEMENT,
 ) -> tuple[SE2, F64]:
-    """Improve the pose of points (M, 2) of the query's frame; returns it and its covariance (3, 3).
+    """Refine the pose of points (M, 2) of the query's frame; returns it and its covariance (3, 3).
 
-    center_m : the point of the query's frame that the rotation turns about; the covariance, of x, y and yaw
-    in the map, is that of the query's pose at this point.
+    center_m : centre of rotation in the query's frame; the covariance, of x, y and yaw in the map, is that of
+    the query's pose at this point.
 
     The covariance is the inverse of the Gauss-Newton Hessian, scaled for the correlation of neighbouring
-    points, with a prior as wide as the neighbourhood that the field can see: a direction that the walls do
-    not constrain gets that width, not infinity.
+    points, with a prior as wide as the reach of the field: a direction that the walls do not constrain gets
+    that width, not infinity.
     """
     res = field.resolution_m
     center = np.asarray(center_m, np.float64)
@@ -198,12 +186,11 @@ def refine(
 def gauss_newton(
     values: U8, x: F64, y: F64, pose: F64, parameters: RefinementParameters = REFINEMENT
 ) -> tuple[F64, F64, float]:
-    """The pose (tx, ty, yaw; cells) of points improved, the Hessian (3, 3) and the mean squared misfit.
+    """Improve the pose (tx, ty, yaw; cells) of points; returns it, the Hessian (3, 3) and the mean squared
+    misfit.
 
     values : likelihood field (H, W). x, y : (M,) of the points.
     """
-    from pc2grid.matching.search import normal_equations
-
     pose, misfit = pose.copy(), 1.0
     hessian = np.zeros((3, 3))
     for _ in range(parameters.steps):
@@ -223,10 +210,10 @@ def gauss_newton(
 
 
 class Support(enum.IntEnum):
-    """What a map says about a wall point of a query.
+    """How a map explains a wall point of a query.
 
-    FITS : there is a wall of the map so near that the point raises the score. CONTRADICTED : the map knows
-    free ground there. UNKNOWN : the map knows nothing there.
+    FITS : a wall of the map is so near that the point raises the score. CONTRADICTED : the map is free there.
+    UNKNOWN : the map is unknown there.
     """
 
     UNKNOWN = 0
@@ -236,12 +223,11 @@ class Support(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """The wall points behind a `two_way_score.Fit`.
+    """The wall points behind a `Fit`.
 
-    points_m : (K, 2) float32, the query's wall points, in the query's frame.
-    support : (K,) uint8, the `Support` of each.
-    weights : (K,) float32, 0..1, how much each counts, see `walls.steadiness`.
-    missed_m : (M, 2) float32, wall points of the map, in the map frame, where the query saw free ground.
+    points_m : (K, 2) float32, the query's wall points, in the query's frame. support : (K,) uint8, the
+    `Support` of each. weights : (K,) float32, 0..1, see `walls.permanence`. missed_m : (M, 2) float32, wall
+    points of the map, in the map frame, where the query observed free ground.
     """
 
     points_m: F32
@@ -250,7 +236,7 @@ class Agreement:
     missed_m: F32
 
     def share(self, kind: Support) -> float:
-        """The share of the query's wall points of this kind, 0..1, by weight; 0 without points.
+        """Return the share of the query's wall points of this kind, 0..1, by weight; 0 without points.
 
         The shares that fit and that are contradicted add up to `Fit.overlap`.
         """
@@ -263,8 +249,8 @@ def agreement(target: Walls, query: Walls, T_map_query: SE2) -> Agreement:
     """Compare a query with the map `target` at a pose.
 
     A point fits if its likelihood is not below `LikelihoodParameters.neutral`, the likelihood of a point on
-    unknown ground: then it supports the pose, otherwise it speaks against it. With the usual numbers that is
-    a wall of the map within 0.14 m.
+    unknown ground: it then supports the pose, otherwise it contradicts it. With the usual numbers a point
+    fits if a wall of the map lies within 0.14 m.
     """
     query, target = query.facing(target), target.facing(query)
     fits, known = _fits(query, target, T_map_query)
@@ -279,20 +265,23 @@ def agreement(target: Walls, query: Walls, T_map_query: SE2) -> Agreement:
 
 
 def _fits(walls: Walls, other: Walls, T_other_walls: SE2) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Which wall points (N,) have a wall of the other side near, and which lie on ground that it knows."""
+    """Return a mask (N,) of the wall points near a wall of the other side, and one (N,) of those on ground
+    known to it.
+    """
     likelihood, known = other.field.at(T_other_walls.apply(walls.points_m), above=walls.only_explain)
     return likelihood >= LIKELIHOOD.neutral, known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LikenessParameters:
-    """Which slides are compared. All chosen by hand.
+class SelfSimilarityParameters:
+    """Which shifts are compared. All chosen by hand.
 
-    nearest_m, farthest_m : lengths of a slide, in any direction: farther than two hypotheses that are one,
+    nearest_m, farthest_m : lengths of a shift, in any direction: farther than two hypotheses that are one,
         and about as far as a robot sees.
-    cell_m : slides are multiples of about this, the spacing of wall points.
-    overlap : at least this share of the walls lies on known ground, by weight, slid there and slid back. What
-        a single scan knows hardly overlaps with itself, and is compared with nothing.
+    cell_m : shifts are multiples of about this, the spacing of wall points.
+    overlap : least share of the walls, by weight, on known ground, shifted forward and back. The known ground
+    of
+        a single scan hardly overlaps with itself, so it is compared with nothing.
     """
 
     nearest_m: float = 1.0
@@ -301,14 +290,15 @@ class LikenessParameters:
     overlap: float = 0.5
 
 
-LIKENESS = LikenessParameters()
+SELF_SIMILARITY = SelfSimilarityParameters()
 
 
-def self_likeness(walls: Walls, parameters: LikenessParameters = LIKENESS) -> float:
-    """The best agreement of a map with itself, 0..1, over all slides; 0 if none overlaps enough.
+def self_similarity(walls: Walls, parameters: SelfSimilarityParameters = SELF_SIMILARITY) -> float:
+    """Return the best agreement of a map with itself, 0..1, over all shifts; 0 if none overlaps enough.
 
-    As of two maps (`two_way_score`): the geometric mean, forward and backward, of the mean likelihood of the
-    wall points on known ground. All slides at once, as correlations by the fast Fourier transform.
+    As between two maps (`score_fit`), it is the geometric mean, forward and backward, of the mean likelihood
+    of the wall points on known ground. All shifts are computed at once, as correlations by the fast Fourier
+    transform.
     """
     total = walls.weight
     if total <= 0.0:
@@ -333,8 +323,11 @@ def self_likeness(walls: Walls, parameters: LikenessParameters = LIKENESS) -> fl
 
 
 def _drawn(walls: Walls, n: int) -> tuple[F64, F64, F64]:
-    """(H, W) each, in squares of n by n cells: weight of the wall points, mean likelihood of the known
-    ground, and whether at least half of it is known."""
+    """Rasterise walls in squares of n by n cells (H, W): weight of the wall points, mean likelihood, known
+    ground.
+
+    The likelihood is that of the known cells; a square is known if at least half of it is.
+    """
     field = walls.field
     height, width = (-(-side // n) for side in field.values.shape)
 
@@ -352,3 +345,89 @@ def _drawn(walls: Walls, n: int) -> tuple[F64, F64, F64]:
     weights = np.zeros((height, width))
     np.add.at(weights, (cells[:, 1], cells[:, 0]), walls.weights)
     return weights, likelihood, known.astype(np.float64)
+
+
+# Compiled functions.
+
+
+@numba.njit(cache=True, nogil=True)
+def known_sums(
+    values: U8,
+    known: BoolGrid,
+    resolution_m: float,
+    origin_m: tuple[float, float],
+    points_m: F32,
+    before_m: F32,
+    weights: F32,
+    pose: tuple[float, float, float],
+    least: int,
+) -> tuple[float, float, float]:
+    """Return the weight of the wall points on known ground, their weighted sum of likelihoods, and the weight
+    of those whose front is unknown.
+
+    Likelihoods are 0..1. Points with a likelihood below `least` do not count.
+    """
+    height, width = values.shape
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    x, y = pose[0] - origin_m[0], pose[1] - origin_m[1]
+    seen, likelihood, behind = 0.0, 0.0, 0.0
+    for p in range(len(points_m)):
+        j = math.floor((c * points_m[p, 0] - s * points_m[p, 1] + x) / resolution_m)
+        i = math.floor((s * points_m[p, 0] + c * points_m[p, 1] + y) / resolution_m)
+        if j < 0 or i < 0 or j >= width or i >= height or not known[i, j] or values[i, j] < least:
+            continue
+        seen += weights[p]
+        likelihood += weights[p] * (values[i, j] / 255.0)
+        j = math.floor((c * before_m[p, 0] - s * before_m[p, 1] + x) / resolution_m)
+        i = math.floor((s * before_m[p, 0] + c * before_m[p, 1] + y) / resolution_m)
+        if j < 0 or i < 0 or j >= width or i >= height or not known[i, j]:
+            behind += weights[p]
+    return seen, likelihood, behind
+
+
+@numba.njit(cache=True, nogil=True, fastmath=True)
+def normal_equations(
+    field: U8, x: F64, y: F64, tx: float, ty: float, yaw: float
+) -> tuple[F64, F64, float, float]:
+    """Return the Hessian (3, 3), gradient (3,), sum of squared misfits and number of the points that count.
+
+    A point counts if the interpolation has its four cells within the field and is at least
+    `LEAST_LIKELIHOOD`; the value of a cell is that of its centre.
+    """
+    height, width = field.shape
+    c, s = math.cos(yaw), math.sin(yaw)
+    right, top, unit = width - 1 - 1e-6, height - 1 - 1e-6, 1.0 / 255.0
+    g0, g1, g2 = 0.0, 0.0, 0.0
+    h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    misfit, count = 0.0, 0.0
+    for p in range(len(x)):
+        rx, ry = c * x[p] - s * y[p], s * x[p] + c * y[p]
+        u, v = rx + tx - 0.5, ry + ty - 0.5
+        inside_u, inside_v = min(max(u, 0.0), right), min(max(v, 0.0), top)
+        j, i = int(inside_u), int(inside_v)
+        a, b = inside_u - j, inside_v - i
+        f00, f01 = field[i, j] * unit, field[i, j + 1] * unit
+        f10, f11 = field[i + 1, j] * unit, field[i + 1, j + 1] * unit
+        f = (1 - b) * ((1 - a) * f00 + a * f01) + b * ((1 - a) * f10 + a * f11)
+        # Branchless: a point that does not count has weight 0.
+        w = 1.0 if (inside_u == u) & (inside_v == v) & (f >= LEAST_LIKELIHOOD) else 0.0
+        du = w * ((1 - b) * (f01 - f00) + b * (f11 - f10))
+        dv = w * ((1 - a) * (f10 - f00) + a * (f11 - f01))
+        r, dyaw = w * (1.0 - f), dv * rx - du * ry
+        misfit += r * r
+        count += w
+        g0 += du * r
+        g1 += dv * r
+        g2 += dyaw * r
+        h00 += du * du
+        h01 += du * dv
+        h02 += du * dyaw
+        h11 += dv * dv
+        h12 += dv * dyaw
+        h22 += dyaw * dyaw
+    H, g = np.empty((3, 3)), np.empty(3)
+    H[0, 0], H[0, 1], H[0, 2] = h00, h01, h02
+    H[1, 0], H[1, 1], H[1, 2] = h01, h11, h12
+    H[2, 0], H[2, 1], H[2, 2] = h02, h12, h22
+    g[0], g[1], g[2] = g0, g1, g2
+    return H, g, misfit, count

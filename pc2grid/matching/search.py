@@ -1,23 +1,16 @@
-"""Finds where points fit on a map: correlative scan matching with bounds.
+"""Correlative scan matching by branch and bound: where points fit on a map.
 
-This is the one coarse search. It is used twice:
-
-- around each place that retrieval proposes, in boxes of 0.8 m and 16 degrees (`localization.hypotheses`);
-- over a whole map, in squares side by side on all free ground at all headings, when retrieval did not settle
-  the question.
-
-Poses lie on a lattice: squares of `SQUARE` x `SQUARE` cells, at headings two steps apart. A square has a
-bound that none of its poses exceeds: each point on the maximum of the likelihood field within the distance
-that the square and the heading can move it (Olson 2015, "M3RSM: many-to-many multi-resolution scan
-matching"; Hess et al. 2016). At a fixed heading a point moves over neighbouring squares as over the cells of
-an image, so all squares of a tile are summed at once, with vector instructions. Tiles are taken in the order
-of their highest bound, and squares that can hold nothing worth reporting are left out; the others are halved,
-first in heading, then in position, until the poses are single cells and half a step of heading around them.
+This is the one coarse search, around proposed poses (`signature.localization.hypotheses`) as over whole maps.
+Poses lie on a lattice: squares of `SQUARE` x `SQUARE` cells, at headings two steps apart. A square has an
+upper bound for the score of its poses: each point on the maximum of the likelihood field within the distance
+that the square and the heading can move it (Olson 2015, "M3RSM: many-to-many multi-resolution scan matching";
+Hess et al. 2016). At a fixed heading a point moves over neighbouring squares as over the cells of an image,
+so all squares of a tile are summed at once, with vector instructions. Tiles are taken in the order of their
+highest bound. Squares whose bound is too low are left out; the others are halved, first in heading, then in
+position, down to single cells and half a step of heading.
 
 A score is the mean over the points of the highest likelihood within half a cell and half a step of heading,
 so a wall of one cell cannot be missed between two poses.
-
-How the poses of a search lie: squares of cells, in tiles that are summed at once.
 """
 
 from __future__ import annotations
@@ -30,7 +23,7 @@ import cv2
 import numba
 import numpy as np
 
-from pc2grid.geometry import F32, F64, I64, U8, U16, BoolGrid
+from pc2grid.geometry import F32, F64, I64, U8, U16
 from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField, Walls
 from pc2grid.model import OccupancyGrid
 
@@ -45,6 +38,13 @@ MOST_POINTS = 256
 BOUND_SLACK = 0.98
 """A pose may exceed the bound of its square, because `levels_for` neglects half a cell. A square is left out
 only if its bound is below this share of the best score found. Chosen by hand."""
+SQUARE = 4
+"""Side of a square of the lattice, in cells."""
+TILE = 16, 64
+"""Rows and columns of squares that are summed at once. A row of sums of 16 bits fills two of the widest
+vector registers; shorter rows of a fixed length are not compiled to vector instructions (measured)."""
+BLOCK = 4
+"""Of a block of so many by so many squares, the best pose at a heading is reported."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,9 +55,9 @@ class SearchParameters:
         than the likelihood field is wide; chosen by hand.
     floor, keep : poses scoring below `floor`, or below `keep` times the best, are not reported.
     most : poses reported at most.
-    apart_m, apart_rad : two reported poses differ by more than one of these; what is nearer to a better pose
-        is the shoulder of its peak and tells nothing of other places. Of 0.5 m and 10 degrees to 1.5 m and 30
-        the one with the least log loss on real recordings.
+    apart_m, apart_rad : two reported poses differ by more than one of these; a pose nearer to a better one
+    lies on the shoulder of its peak. The pair with the least log loss on real recordings, of 0.5 m and 10
+    degrees to 1.5 m and 30.
     """
 
     step_rad: float = math.radians(1.7)
@@ -86,9 +86,10 @@ class SearchMap:
 
     @staticmethod
     def of(grid: OccupancyGrid, *, from_below: bool = False, drawn: bool = False) -> SearchMap:
-        """Prepare a map. Everything outside it counts as unknown.
+        """Prepare a map for the search. Everything outside it counts as unknown.
 
-        from_below : for queries in a lower plane, to which its free space is as unknown ground.
+        from_below : for queries of a sensor that is mounted lower: the free space of the map is as unknown
+        ground for them.
         drawn : see `Walls.of`.
         """
         walls = Walls.of(grid, margin_m=MARGIN_M, drawn=drawn)
@@ -100,12 +101,12 @@ class SearchMap:
 
     @property
     def field(self) -> LikelihoodField:
-        """The likelihood field of the map."""
+        """Return the likelihood field of the map."""
         return self.walls.field
 
 
 def _images(field: U8, resolution_m: float) -> U8:
-    """`SearchMap.images` of a field (H, W)."""
+    """Return `SearchMap.images` of a field (H, W)."""
     reaches = [math.ceil(reach_m / resolution_m - 1e-6) for reach_m in REACHES_M]
     height, width = (-(-side // SQUARE) for side in field.shape)
     above, left = TILE
@@ -132,14 +133,14 @@ def search_windows(
     half_a_rad: float,
     parameters: SearchParameters = SEARCH,
 ) -> F64:
-    """The best distinct poses of a point set in boxes of poses, best first.
+    """Search boxes of poses; returns the best distinct poses of a point set, best first.
 
-    points_m : (M, 2) at most `MOST_POINTS` points, relative to the point that they rotate about.
-    boxes : (B, 3) x, y, yaw of the centres of the boxes, with half widths `half_t_m` and `half_a_rad`; all
-    squares of the lattice that one touches are searched. Many are searched faster if they have one heading.
+    points_m : (M, 2) at most `MOST_POINTS` points, relative to their centre of rotation. boxes : (B, 3) x, y,
+    yaw of the centres of the boxes, with half widths `half_t_m` and `half_a_rad`; all squares of the lattice
+    that one touches are searched. Many are searched faster if they have one heading.
 
-    Returns (H, 4): x, y, yaw, and the score, which no pose within half a cell and half a step of heading
-    exceeds. Raises ValueError for too many points.
+    Returns (H, 4): x, y, yaw, and the score, an upper bound of the poses within half a cell and half a step
+    of heading. Raises ValueError for too many points.
     """
     if len(points_m) > MOST_POINTS:
         raise ValueError(f"{len(points_m)} points; at most {MOST_POINTS}")
@@ -172,7 +173,9 @@ class Tiles:
 
     @staticmethod
     def of(boxes: F64, half_t: float) -> Tiles:
-        """The squares that boxes (B, 3) touch; lengths in cells. Boxes of one heading share their tiles."""
+        """Return the tiles of all squares that boxes (B, 3) touch; lengths in cells. Boxes of one heading
+        share their tiles.
+        """
         yaws, group = np.unique(boxes[:, 2], return_inverse=True)
         low = np.floor((boxes[:, 1::-1] - half_t) / SQUARE).astype(np.int64)
         high = np.ceil((boxes[:, 1::-1] + half_t) / SQUARE).astype(np.int64)
@@ -201,9 +204,10 @@ def _best(
     floor: float,
     keep: float,
 ) -> F64:
-    """(N, 4) the best pose of each block that reaches `floor` and the share `keep` of the best; in cells.
+    """Return (N, 4) the best pose of each block with at least `floor` and the share `keep` of the best score;
+    in cells.
 
-    turns : (K,) headings relative to those of the tiles. half_a_rad : each stands for those so far beside it.
+    turns : (K,) headings relative to those of the tiles. half_a_rad : half width of each of them.
     """
 
     images, shape = target.images.reshape(-1), target.images.shape[-2:]
@@ -228,8 +232,11 @@ def _best(
 
 
 def levels_of(points: F64, half_a_rad: float, target: SearchMap) -> I64:
-    """(4, N) the images that each point is looked up in: by a square, by its half in heading, by a quarter of
-    that, by a cell. -1 where a point is moved farther than any covers, so that it may be on a wall."""
+    """Return (4, N) the image for each point: for a square, for its half in heading, for a quarter of that,
+    for a cell.
+
+    It is -1 where a point can move farther than any image covers; it then counts as on a wall.
+    """
     res = target.field.resolution_m
     away = np.hypot(points[:, 0], points[:, 1])
     halves = ((0.5 * SQUARE, 1.0), (0.5 * SQUARE, 0.5), (0.25 * SQUARE, 0.5), (0.5, 0.5))
@@ -238,24 +245,26 @@ def levels_of(points: F64, half_a_rad: float, target: SearchMap) -> I64:
     return np.where(covered, levels_for(reach, res), -1)
 
 
-def headings(half_a_rad: float, step_rad: float) -> F64:
-    """Headings (T,) at most `step_rad` apart that divide -half_a_rad .. half_a_rad into equal steps."""
-    count = max(1, math.ceil(2.0 * half_a_rad / step_rad))
-    return np.asarray((np.arange(count) - 0.5 * (count - 1)) * (2.0 * half_a_rad / count), np.float64)
-
-
 def levels_for(reach_cells: F64, resolution_m: float) -> I64:
-    """The first of the sliding maxima that covers each of the reaches, or the last one; in their shape.
+    """Return the first of the sliding maxima that covers each of the reaches, or the last one; in their
+    shape.
 
-    Half a cell is neglected: it is less than the field is wide, and covering it would blur the smallest
+    Half a cell is neglected: it is less than the width of the field, and covering it would blur the smallest
     squares.
     """
     reaches = np.asarray(REACHES_M) / resolution_m
     return np.asarray(np.searchsorted(reaches, reach_cells - 0.5).clip(max=len(reaches) - 1), np.int64)
 
 
+def headings(half_a_rad: float, step_rad: float) -> F64:
+    """Return headings (T,) at most `step_rad` apart that divide -half_a_rad .. half_a_rad into equal
+    parts."""
+    count = max(1, math.ceil(2.0 * half_a_rad / step_rad))
+    return np.asarray((np.arange(count) - 0.5 * (count - 1)) * (2.0 * half_a_rad / count), np.float64)
+
+
 def _distinct(found: F64, parameters: SearchParameters) -> F64:
-    """The first `most` of the poses (N, 4), best first, without those that are near one before them."""
+    """Return the first `most` of the poses (N, 4), best first, without those near a better one."""
     kept: list[F64] = []
     while len(found) and len(kept) < parameters.most:
         kept.append(found[0])
@@ -266,147 +275,13 @@ def _distinct(found: F64, parameters: SearchParameters) -> F64:
     return np.array(kept).reshape(-1, 4)
 
 
-SQUARE = 4
-"""Side of a square of the lattice, in cells."""
-TILE = 16, 64
-"""Rows and columns of squares that are summed at once. A row of sums of 16 bits fills two of the widest
-vector registers; shorter rows of a fixed length are not compiled to vector instructions (measured)."""
-BLOCK = 4
-"""Of a block of so many by so many squares, the best pose at a heading is reported."""
-
+# Compiled functions.
 
 _ROWS, _COLUMNS = TILE
 _NEUTRAL = LIKELIHOOD.neutral_value
-
-
-@numba.njit(cache=True, nogil=True)
-def _turn(points: F64, yaw: float, turned: F64) -> None:
-    """Set `turned` (2, N), rows y and x, to the points turned by `yaw`."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    for p in range(len(points)):
-        turned[0, p] = s * points[p, 0] + c * points[p, 1]
-        turned[1, p] = c * points[p, 0] - s * points[p, 1]
-
-
-@numba.njit(cache=True, nogil=True)
-def _place(
-    turned: F64,
-    level: I64,
-    down: float,
-    right: float,
-    shape: tuple[int, int],
-    corner: I64,
-    at: I64,
-    counted: I64,
-) -> None:
-    """Where the points are looked up if the pose lies `down` and `right` of the corner of its square.
-
-    Sets the first of `at` to the places for the first square of the tile at `corner`, in all images flat, and
-    `counted` (2,) to their number, and to the sum of the others: they lie beyond the map for all squares of
-    the tile, or have no level.
-    """
-    height, width = shape
-    count, rest = 0, 0
-    for p in range(turned.shape[1]):
-        if level[p] < 0:
-            rest += 255
-            continue
-        i, j = math.floor(turned[0, p] + down), math.floor(turned[1, p] + right)
-        row, column = corner[0] + i // SQUARE + _ROWS, corner[1] + j // SQUARE + _COLUMNS
-        if row < 0 or column < 0 or row > height - _ROWS or column > width - _COLUMNS:
-            rest += _NEUTRAL
-            continue
-        image = (level[p] * SQUARE + i % SQUARE) * SQUARE + j % SQUARE
-        at[count] = (image * height + row) * width + column
-        count += 1
-    counted[0], counted[1] = count, rest
-
-
-@numba.njit(cache=True, nogil=True)
-def _sum_tile(flat: U8, at: I64, rest: int, width: int, inside: U16, sums: U16) -> int:
-    """Set `sums` (TILE) to those of a tile, 0 where nothing is `inside`; returns the highest."""
-    top = 0
-    for r in range(_ROWS):
-        for k in range(_COLUMNS):
-            sums[r, k] = rest
-    for p in range(len(at)):
-        for r in range(_ROWS):
-            first = at[p] + r * width
-            window, row = flat[first : first + _COLUMNS], sums[r]
-            for k in range(_COLUMNS):
-                row[k] += window[k]
-    for r in range(_ROWS):
-        for k in range(_COLUMNS):
-            sums[r, k] &= inside[r, k]
-            top = max(top, sums[r, k])
-    return top
-
-
-@numba.njit(cache=True, nogil=True)
-def _sum(flat: U8, at: I64, rest: int, move: int) -> int:
-    """The sum for one square of a tile, `move` behind the first in all images flat."""
-    total = rest
-    for p in range(len(at)):
-        total += flat[at[p] + move]
-    return total
-
-
 _HALF = SQUARE // 2
 _PARTS = 1 + 4 + SQUARE * SQUARE
 """Parts of a square: all of it, its quarters, and the cells, those of one quarter after the other."""
-
-
-@numba.njit(cache=True, nogil=True)
-def _place_parts(
-    turned: F64, levels: I64, shape: tuple[int, int], corner: I64, at: I64, counted: I64
-) -> None:
-    """Set `at` (_PARTS, N) and `counted` (_PARTS, 2) to what `_place` says of each part of a square."""
-    _place(turned, levels[1], _HALF, _HALF, shape, corner, at[0], counted[0])
-    for q in range(4):
-        down, right = q // 2 * _HALF, q % 2 * _HALF
-        middle = 0.5 * _HALF
-        _place(turned, levels[2], down + middle, right + middle, shape, corner, at[1 + q], counted[1 + q])
-        for c in range(_HALF**2):
-            part = 5 + q * _HALF**2 + c
-            i, j = down + c // _HALF, right + c % _HALF
-            _place(turned, levels[3], i + 0.5, j + 0.5, shape, corner, at[part], counted[part])
-
-
-@numba.njit(cache=True, nogil=True)
-def _best_cell(flat: U8, at: I64, counted: I64, move: int, least: float) -> tuple[int, int]:
-    """The highest sum of a cell of a square, and its part; -1 where it is below `least`."""
-    best, part = -1, 0
-    if _sum(flat, at[0, : counted[0, 0]], counted[0, 1], move) < least:
-        return best, part
-    for q in range(4):
-        if _sum(flat, at[1 + q, : counted[1 + q, 0]], counted[1 + q, 1], move) < least:
-            continue
-        for c in range(5 + q * _HALF**2, 5 + (q + 1) * _HALF**2):
-            total = _sum(flat, at[c, : counted[c, 0]], counted[c, 1], move)
-            if total >= least and total > best:
-                best, part = total, c
-    return best, part
-
-
-@numba.njit(cache=True, nogil=True)
-def _best_in_block(
-    flat: U8, width: int, at: I64, counted: I64, sums: U16, down: int, right: int, least: float
-) -> tuple[int, int, int, int]:
-    """The highest sum in the block of squares at `down`, `right` of a tile, -1 where it is below `least`; and
-    where it is: square, half of the heading, part. at, counted : of both halves of the heading."""
-    best, best_square, best_side, best_part = -1, 0, 0, 0
-    # The most promising square first: what it reaches excludes most of the others.
-    first = int(sums[down : down + BLOCK, right : right + BLOCK].argmax())
-    for visit in range(BLOCK**2):
-        square = (first + visit) % BLOCK**2
-        r, c = down + square // BLOCK, right + square % BLOCK
-        for side in range(2):
-            needed = max(least, best + 1.0)
-            if sums[r, c] >= needed:
-                total, part = _best_cell(flat, at[side], counted[side], r * width + c, needed)
-                if total > best:
-                    best, best_square, best_side, best_part = total, r * _COLUMNS + c, side, part
-    return best, best_square, best_side, best_part
 
 
 @numba.njit(cache=True, nogil=True)
@@ -420,10 +295,11 @@ def tile_bounds(
     inside: U16,
     turns: F64,
 ) -> I64:
-    """(T, K) the highest sum over the points at the centres of the squares of each tile, at each heading.
+    """Return (T, K) the highest sum over the points at the centres of the squares of each tile, at each
+    heading.
 
-    flat, shape : images, and the size of one. level : (N,) the image that each point is looked up in, -1: it
-    counts as on a wall. points : (N, 2). corner, yaw_rad, inside : as of `Tiles`. turns : (K,).
+    flat, shape : images, and the size of one. level : (N,) the image for each point, -1: it counts as on a
+    wall. points : (N, 2). corner, yaw_rad, inside : as of `Tiles`. turns : (K,).
     """
     bounds = np.empty((len(corner), len(turns)), np.int64)
     turned, at = np.empty((2, len(points))), np.empty(len(points), np.int64)
@@ -452,10 +328,10 @@ def best_in_tiles(
     floor: float,
     keep: float,
 ) -> F64:
-    """(N, 4) the best pose of each block of squares at each heading, and its score, without blocks that do
-    not reach `floor` or the share `keep` of the best so far.
+    """Return (N, 4) the best pose of each block of squares at each heading, and its score.
 
-    All cells of the squares count, at half a step of heading, `half_a_rad` / 2, to both sides.
+    Blocks below `floor` or below the share `keep` of the best score so far are left out. All cells of the
+    squares count, at half a step of heading, `half_a_rad` / 2, to both sides.
 
     corners, yaws, tile, bounds : (B,) each tile at each heading, the highest bound first. tile : its number
     in `inside`.
@@ -496,80 +372,128 @@ def best_in_tiles(
 
 
 @numba.njit(cache=True, nogil=True)
-def known_sums(
-    values: U8,
-    known: BoolGrid,
-    resolution_m: float,
-    origin_m: tuple[float, float],
-    points_m: F32,
-    before_m: F32,
-    weights: F32,
-    pose: tuple[float, float, float],
-    least: int,
-) -> tuple[float, float, float]:
-    """Of the wall points on known ground: their weight, the weighted sum of their likelihoods, 0..1, and the
-    weight of those seen from unknown ground. Points with a likelihood below `least` do not count."""
-    height, width = values.shape
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    x, y = pose[0] - origin_m[0], pose[1] - origin_m[1]
-    seen, likelihood, behind = 0.0, 0.0, 0.0
-    for p in range(len(points_m)):
-        j = math.floor((c * points_m[p, 0] - s * points_m[p, 1] + x) / resolution_m)
-        i = math.floor((s * points_m[p, 0] + c * points_m[p, 1] + y) / resolution_m)
-        if j < 0 or i < 0 or j >= width or i >= height or not known[i, j] or values[i, j] < least:
-            continue
-        seen += weights[p]
-        likelihood += weights[p] * (values[i, j] / 255.0)
-        j = math.floor((c * before_m[p, 0] - s * before_m[p, 1] + x) / resolution_m)
-        i = math.floor((s * before_m[p, 0] + c * before_m[p, 1] + y) / resolution_m)
-        if j < 0 or i < 0 or j >= width or i >= height or not known[i, j]:
-            behind += weights[p]
-    return seen, likelihood, behind
+def _best_in_block(
+    flat: U8, width: int, at: I64, counted: I64, sums: U16, down: int, right: int, least: float
+) -> tuple[int, int, int, int]:
+    """Return the highest sum in a block of squares at `down`, `right` of a tile, and its square, side and
+    part.
 
-
-@numba.njit(cache=True, nogil=True, fastmath=True)
-def normal_equations(
-    field: U8, x: F64, y: F64, tx: float, ty: float, yaw: float
-) -> tuple[F64, F64, float, float]:
-    """Hessian (3, 3), gradient (3,), sum of squared misfits and number of the points that count.
-
-    A point counts if the interpolation has its four cells within the field and gives at least
-    `LEAST_LIKELIHOOD`; the value of a cell is that of its centre.
+    The sum is -1 where all are below `least`. side : half of the heading. at, counted : of both sides.
     """
-    height, width = field.shape
+    best, best_square, best_side, best_part = -1, 0, 0, 0
+    # The most promising square first: what it reaches excludes most of the others.
+    first = int(sums[down : down + BLOCK, right : right + BLOCK].argmax())
+    for visit in range(BLOCK**2):
+        square = (first + visit) % BLOCK**2
+        r, c = down + square // BLOCK, right + square % BLOCK
+        for side in range(2):
+            needed = max(least, best + 1.0)
+            if sums[r, c] >= needed:
+                total, part = _best_cell(flat, at[side], counted[side], r * width + c, needed)
+                if total > best:
+                    best, best_square, best_side, best_part = total, r * _COLUMNS + c, side, part
+    return best, best_square, best_side, best_part
+
+
+@numba.njit(cache=True, nogil=True)
+def _best_cell(flat: U8, at: I64, counted: I64, move: int, least: float) -> tuple[int, int]:
+    """Return the highest sum of a cell of a square, and its part; -1 where it is below `least`."""
+    best, part = -1, 0
+    if _sum(flat, at[0, : counted[0, 0]], counted[0, 1], move) < least:
+        return best, part
+    for q in range(4):
+        if _sum(flat, at[1 + q, : counted[1 + q, 0]], counted[1 + q, 1], move) < least:
+            continue
+        for c in range(5 + q * _HALF**2, 5 + (q + 1) * _HALF**2):
+            total = _sum(flat, at[c, : counted[c, 0]], counted[c, 1], move)
+            if total >= least and total > best:
+                best, part = total, c
+    return best, part
+
+
+@numba.njit(cache=True, nogil=True)
+def _place_parts(
+    turned: F64, levels: I64, shape: tuple[int, int], corner: I64, at: I64, counted: I64
+) -> None:
+    """Set `at` (_PARTS, N) and `counted` (_PARTS, 2), see `_place`, for each part of a square."""
+    _place(turned, levels[1], _HALF, _HALF, shape, corner, at[0], counted[0])
+    for q in range(4):
+        down, right = q // 2 * _HALF, q % 2 * _HALF
+        middle = 0.5 * _HALF
+        _place(turned, levels[2], down + middle, right + middle, shape, corner, at[1 + q], counted[1 + q])
+        for c in range(_HALF**2):
+            part = 5 + q * _HALF**2 + c
+            i, j = down + c // _HALF, right + c % _HALF
+            _place(turned, levels[3], i + 0.5, j + 0.5, shape, corner, at[part], counted[part])
+
+
+@numba.njit(cache=True, nogil=True)
+def _place(
+    turned: F64,
+    level: I64,
+    down: float,
+    right: float,
+    shape: tuple[int, int],
+    corner: I64,
+    at: I64,
+    counted: I64,
+) -> None:
+    """Look up the cells of the points for a pose `down` and `right` of the corner of its square.
+
+    Sets the first entries of `at` to the cells for the first square of the tile at `corner`, as indices into
+    all images, flat. Sets `counted` (2,) to their number, and to the sum of all other points: those without a
+    level, and those beyond the map for all squares of the tile.
+    """
+    height, width = shape
+    count, rest = 0, 0
+    for p in range(turned.shape[1]):
+        if level[p] < 0:
+            rest += 255
+            continue
+        i, j = math.floor(turned[0, p] + down), math.floor(turned[1, p] + right)
+        row, column = corner[0] + i // SQUARE + _ROWS, corner[1] + j // SQUARE + _COLUMNS
+        if row < 0 or column < 0 or row > height - _ROWS or column > width - _COLUMNS:
+            rest += _NEUTRAL
+            continue
+        image = (level[p] * SQUARE + i % SQUARE) * SQUARE + j % SQUARE
+        at[count] = (image * height + row) * width + column
+        count += 1
+    counted[0], counted[1] = count, rest
+
+
+@numba.njit(cache=True, nogil=True)
+def _turn(points: F64, yaw: float, turned: F64) -> None:
+    """Set `turned` (2, N), rows y and x, to the points rotated by `yaw`."""
     c, s = math.cos(yaw), math.sin(yaw)
-    right, top, unit = width - 1 - 1e-6, height - 1 - 1e-6, 1.0 / 255.0
-    g0, g1, g2 = 0.0, 0.0, 0.0
-    h00, h01, h02, h11, h12, h22 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    misfit, count = 0.0, 0.0
-    for p in range(len(x)):
-        rx, ry = c * x[p] - s * y[p], s * x[p] + c * y[p]
-        u, v = rx + tx - 0.5, ry + ty - 0.5
-        inside_u, inside_v = min(max(u, 0.0), right), min(max(v, 0.0), top)
-        j, i = int(inside_u), int(inside_v)
-        a, b = inside_u - j, inside_v - i
-        f00, f01 = field[i, j] * unit, field[i, j + 1] * unit
-        f10, f11 = field[i + 1, j] * unit, field[i + 1, j + 1] * unit
-        f = (1 - b) * ((1 - a) * f00 + a * f01) + b * ((1 - a) * f10 + a * f11)
-        # Branchless: a point that does not count has weight 0.
-        w = 1.0 if (inside_u == u) & (inside_v == v) & (f >= 0.05) else 0.0
-        du = w * ((1 - b) * (f01 - f00) + b * (f11 - f10))
-        dv = w * ((1 - a) * (f10 - f00) + a * (f11 - f01))
-        r, dyaw = w * (1.0 - f), dv * rx - du * ry
-        misfit += r * r
-        count += w
-        g0 += du * r
-        g1 += dv * r
-        g2 += dyaw * r
-        h00 += du * du
-        h01 += du * dv
-        h02 += du * dyaw
-        h11 += dv * dv
-        h12 += dv * dyaw
-        h22 += dyaw * dyaw
-    H, g = np.empty((3, 3)), np.empty(3)
-    H[0, 0], H[0, 1], H[0, 2] = h00, h01, h02
-    H[1, 0], H[1, 1], H[1, 2] = h01, h11, h12
-    H[2, 0], H[2, 1], H[2, 2] = h02, h12, h22
-    g[0], g[1], g[2] = g0, g1, g2
-    return H, g, misfit, count
+    for p in range(len(points)):
+        turned[0, p] = s * points[p, 0] + c * points[p, 1]
+        turned[1, p] = c * points[p, 0] - s * points[p, 1]
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum_tile(flat: U8, at: I64, rest: int, width: int, inside: U16, sums: U16) -> int:
+    """Set `sums` (TILE) to the sums of a tile, 0 for squares that are not `inside`; returns the highest."""
+    top = 0
+    for r in range(_ROWS):
+        for k in range(_COLUMNS):
+            sums[r, k] = rest
+    for p in range(len(at)):
+        for r in range(_ROWS):
+            first = at[p] + r * width
+            window, row = flat[first : first + _COLUMNS], sums[r]
+            for k in range(_COLUMNS):
+                row[k] += window[k]
+    for r in range(_ROWS):
+        for k in range(_COLUMNS):
+            sums[r, k] &= inside[r, k]
+            top = max(top, sums[r, k])
+    return top
+
+
+@numba.njit(cache=True, nogil=True)
+def _sum(flat: U8, at: I64, rest: int, move: int) -> int:
+    """Return the sum of one square of a tile, `move` cells behind the first one in all images, flat."""
+    total = rest
+    for p in range(len(at)):
+        total += flat[at[p] + move]
+    return total

@@ -1,20 +1,16 @@
-"""A grid as what two maps are compared by: wall points, how surely they stay, and a likelihood field.
+"""A grid prepared for matching: its likelihood field, and wall points with a weight for their permanence.
 
-What one side has seen is explained by what stands on the other side at any height: that is the field. It is
-contradicted only by what it must have seen itself, and has not: these are the points, which depend on how
-much the other side sees (`Walls.facing`).
+The field is of obstacles at any height; a point scores by its distance to the nearest occupied cell, exp(-d^2
+/ 2 sigma^2) (Thrun, Burgard and Fox, "Probabilistic Robotics", section 6.4), so no correspondences are
+needed. The points are what the other side must have observed if the pose is right; they depend on the heights
+that it observes (`Walls.facing`).
 
-Small things that stand alone may have been moved between two visits, walls stay. So a wall point counts by
-the size of the connected object that it belongs to.
+Small objects that stand alone may have been moved between two visits, walls stay: the weight of a wall point
+grows with the size of its connected object.
 
 A wall has two sides. The outer wall of a building, mapped from its rooms and seen from the street, is one
-line in both grids, but nothing that both have seen. So the walls of a query keep the ground in front of them,
-on the side that they were seen from (`seen_from`).
-
-The likelihood field of a grid: how well a point of an obstacle fits at each cell.
-
-Thrun, Burgard and Fox, "Probabilistic Robotics", section 6.4: a point scores by its distance to the nearest
-occupied cell, exp(-d^2 / 2 sigma^2). Scan matching on it needs no correspondences.
+line in both grids, although the two recordings have observed nothing in common. So the walls of a query keep
+the ground in front of them, on the side from which they were observed (`seen_from`).
 """
 
 from __future__ import annotations
@@ -45,7 +41,7 @@ class LikelihoodParameters:
 
     @property
     def neutral_value(self) -> int:
-        """`neutral` in the units of `LikelihoodField.values`."""
+        """Return `neutral` in the units of `LikelihoodField.values`."""
         return int(self.neutral * 255.0)
 
 
@@ -71,7 +67,7 @@ class LikelihoodField:
     def of(
         grid: OccupancyGrid, parameters: LikelihoodParameters = LIKELIHOOD, *, margin_m: float = 0.0
     ) -> LikelihoodField:
-        """The field of a grid, with `margin_m` of unknown cells added on each side."""
+        """Return the field of a grid, with `margin_m` of unknown cells added on each side."""
         padded = padded_grid(grid, margin_m)
         occupied = padded.occupied
         return LikelihoodField.around(
@@ -86,7 +82,7 @@ class LikelihoodField:
         origin_m: tuple[float, float],
         parameters: LikelihoodParameters = LIKELIHOOD,
     ) -> LikelihoodField:
-        """The field of a mask (H, W) of occupied cells, `known` (H, W) being those observed at all."""
+        """Return the field of a mask (H, W) of occupied cells; `known` (H, W) are all observed cells."""
         values = np.zeros(occupied.shape, np.uint8)
         if occupied.any():
             distance = cv2.distanceTransform((~occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
@@ -98,10 +94,10 @@ class LikelihoodField:
         return LikelihoodField(values=values, known=known, resolution_m=resolution_m, origin_m=origin_m)
 
     def at(self, points_m: NDArray[np.floating], *, above: bool = False) -> tuple[F32, NDArray[np.bool_]]:
-        """Likelihood (N,) 0..1 in the cells of points (N, 2), and whether these cells are known (N,).
+        """Return the likelihood (N,) 0..1 in the cells of points (N, 2), and a mask (N,) of the known cells.
 
         Both are 0 outside the field. above : the field is of a higher plane than the points. Its walls stand
-        on the floor, but its free space passes over things, so that only ground near walls is known.
+        on the floor, but its free space passes over low obstacles, so only ground near walls counts as known.
         """
         height, width = self.values.shape
         cells = np.floor((points_m - np.asarray(self.origin_m)) / self.resolution_m).astype(np.int64)
@@ -116,7 +112,7 @@ class LikelihoodField:
 
 
 def padded_grid(grid: OccupancyGrid, margin_m: float) -> OccupancyGrid:
-    """The grid with `margin_m`, rounded to whole cells, of unknown cells on each side."""
+    """Return the grid with `margin_m`, rounded to whole cells, of unknown cells on each side."""
     n = round(margin_m / grid.resolution_m)
     if not n:
         return grid
@@ -133,12 +129,13 @@ class WallParameters:
     """How wall points are chosen and weighted.
 
     spacing_m : one point is kept in each square of this side; chosen by hand, twice the usual cell.
-    grain_cells : things are smoothed by a median over squares of so many cells. Chosen by hand.
-    plane_m : planes so far above each other show different things: one a table, the other what is over it.
-        Chosen by hand.
+    grain_cells : low obstacles are smoothed by a median over squares of so many cells. Chosen by hand.
+    plane_m : planes so far above each other show different objects, one for example a table that the other
+    passes over. Chosen by hand.
     fixed_m : an object at least this long is taken to stay where it is: longer than furniture that is moved
         about. Chosen by hand.
-    movable : weight of a thing beside that of a wall. Chosen by hand: with a quarter, and with 1, one or two
+    movable : weight of a low obstacle, relative to a wall. Chosen by hand: with a quarter, and with 1, one or
+    two
         windows less are located of a room whose chairs have been moved, and none is wrong.
     """
 
@@ -156,16 +153,18 @@ WALLS = WallParameters()
 class Walls:
     """A grid prepared for alignment.
 
-    field : likelihood field of what stands at any height.
-    points_m : (K, 2) float32 centres of the cells that something stands in, of what is solid those along its
-        edges, one per square of `WallParameters.spacing_m`, in the grid's frame.
-    before_m : (K, 2) float32, points on the ground in front of them, on which the other side is asked for
-        what it knows; `points_m` themselves if it does not matter which side of a wall was seen.
-    weights : (K,) float32, 0..1, how surely each of them stays where it is, see `steadiness`.
+    field : likelihood field of obstacles at any height.
+    points_m : (K, 2) float32 centres of occupied cells, of solid obstacles those along the edges, one per
+    square
+        of `WallParameters.spacing_m`, in the grid's frame.
+    before_m : (K, 2) float32, points on the ground in front of them, where the other side must know the
+    ground;
+        `points_m` themselves if it does not matter from which side a wall was observed.
+    weights : (K,) float32, 0..1, the permanence of each point, see `permanence`.
     height_m : see `OccupancyGrid.height_m`.
-    at_all_heights : with the points of what no ray was seen to pass, at any height; None if the grid does not
-        tell heights.
-    only_explain : whether the other side need not have seen these points, wherever it sees free space.
+    at_all_heights : the same walls, with only those points that block every observed height; None for a grid
+        without heights.
+    only_explain : True if the other side need not have observed these points wherever it observes free space.
     """
 
     field: LikelihoodField
@@ -186,7 +185,8 @@ class Walls:
     ) -> Walls:
         """Prepare a grid; the field gets `margin_m` of unknown cells on each side.
 
-        drawn : of a map that somebody else made, without what no ray can have ended in, see `_seen`.
+        drawn : True for a map that was not built here: cells that no ray can have ended in are left out, see
+        `_seen`.
         """
         grid = padded_grid(grid, margin_m)
         if grid.heights is None:
@@ -201,11 +201,13 @@ class Walls:
 
     @staticmethod
     def _of(grid: OccupancyGrid, stands: BoolGrid, shown: BoolGrid, parameters: WallParameters) -> Walls:
-        """stands, shown : (H, W) the cells of the field, and those of the points."""
+        """Prepare a grid with `stands` (H, W) as the cells of the field, and `shown` (H, W) as those of the
+        points.
+        """
         cells = cells_of(shown)
         cells = cells[thin_evenly(grid.to_point(cells), parameters.spacing_m)]
         points_m = grid.to_point(cells).astype(np.float32)
-        weights = steadiness(shown, cells, grid.resolution_m, parameters)
+        weights = permanence(shown, cells, grid.resolution_m, parameters)
         weights[grid.things[cells[:, 0], cells[:, 1]]] *= parameters.movable
         return Walls(
             field=LikelihoodField.around(
@@ -218,23 +220,24 @@ class Walls:
         )
 
     def facing(self, other: Walls) -> Walls:
-        """The walls as they are compared with the other side.
+        """Return the walls as they are compared with the other side.
 
-        A side that tells heights has looked at all of them, and must have seen all that stands. One that does
-        not tell them may be a laser, which sees a single plane: it must have seen what stands at all heights,
-        and of a table nothing. If that plane is known to be clearly above the one of these walls, it need not
-        have seen any of them. It is not known of a laser that tf does not lift above its base.
+        A side with heights has observed all of them, and must have observed all obstacles. One without
+        heights may be a laser, which observes a single plane: it must have observed obstacles that block all
+        heights, and of a table nothing. If that plane is known to be clearly above the one of these walls, it
+        need not have observed any of them. The height is not known for a laser that tf does not lift above
+        its base.
         """
         walls = self.at_all_heights if other.at_all_heights is None else self
         above_m = (other.height_m or math.nan) - (self.height_m or math.nan)
         return replace(walls or self, only_explain=above_m > WALLS.plane_m)
 
     def seen_from(self, free: F32) -> Walls:
-        """The walls with the ground in front of them, on the side that they were seen from.
+        """Return the walls with the ground in front of them, on the side from which they were observed.
 
-        free : (H, W) where the ground is free, 0..1, on the cells of the field. Blurred, because that of a
-        single scan consists of thin rays, its gradient points to that side. The points lie two standard
-        deviations of the field from the wall, so that one drawn a little off does not hide them.
+        free : (H, W) share of free ground, 0..1, on the cells of the field. It is blurred, because the free
+        ground of a single scan consists of thin rays; its gradient points to that side. The points lie two
+        standard deviations of the field from the wall, so that a slightly displaced wall does not cover them.
         """
         cells = np.floor((self.points_m - np.asarray(self.field.origin_m)) / self.field.resolution_m)
         column, row = cells.astype(np.int64).T
@@ -249,21 +252,22 @@ class Walls:
 
     @property
     def weight(self) -> float:
-        """The number of wall points, by weight."""
+        """Return the number of wall points, by weight."""
         return float(self.weights.sum(dtype=np.float64))
 
 
 def _things(grid: OccupancyGrid, parameters: WallParameters) -> BoolGrid:
-    """(H, W) the things of a grid without grains of noise: the middle value around each cell."""
+    """Return the low obstacles (H, W) of a grid, without grains of noise: the median around each cell."""
     things: BoolGrid = cv2.medianBlur(grid.things.astype(np.uint8), parameters.grain_cells) > 0
     return things
 
 
 def _seen(grid: OccupancyGrid) -> BoolGrid:
-    """The occupied cells (H, W) that a ray can have ended in: no deeper behind the face of a wall than the
-    field's standard deviation. In the thick walls of a drawn map, whatever a query has seen would fit.
+    """Return the occupied cells (H, W) in which a ray can have ended.
 
-    A wall that no free ground is known before has no face, and stays as it is.
+    These lie no deeper behind the face of a wall than the field's standard deviation. The thick walls of a
+    drawn map would otherwise fit any query. A wall without known free ground before it has no face, and is
+    kept.
     """
     cells = cv2.distanceTransform((~grid.free).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     near = grid.occupied & (cells - 1.0 < LIKELIHOOD.sigma_m / grid.resolution_m)
@@ -275,19 +279,19 @@ def _seen(grid: OccupancyGrid) -> BoolGrid:
 
 
 def _edges(stands: BoolGrid) -> BoolGrid:
-    """The cells (H, W) of what stands without those that have all their neighbours in it: nothing sees
-    these."""
+    """Remove the obstacle cells (H, W) whose neighbours are all obstacles: they are invisible."""
     inside: BoolGrid = cv2.erode(stands.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
     return stands & ~inside
 
 
-def steadiness(
+def permanence(
     occupied: BoolGrid, cells: I64, resolution_m: float, parameters: WallParameters = WALLS
 ) -> F32:
-    """How surely the objects in `cells` (K, 2; row, column) stay where they are: (K,) 0..1.
+    """Return the permanence (K,) 0..1 of the objects in `cells` (K, 2; row, column): how likely they stay in
+    place.
 
-    The longer side of the connected object that a cell belongs to, as a share of `fixed_m`, at most 1. Gaps
-    of up to two cells are closed first.
+    It is the longer side of the connected object of a cell, as a share of `fixed_m`, at most 1. Gaps of up to
+    two cells are closed first.
     """
     closed = cv2.dilate(occupied.astype(np.uint8), np.ones((3, 3), np.uint8))
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
@@ -297,7 +301,7 @@ def steadiness(
 
 
 def thin_evenly(points_m: NDArray[np.floating], spacing_m: float) -> NDArray[np.intp]:
-    """Indices (K,), ascending, of the first of the points (N, 2) in each square of `spacing_m`."""
+    """Return the indices (K,), ascending, of the first of the points (N, 2) in each square of `spacing_m`."""
     squares = np.floor(np.asarray(points_m) / spacing_m).astype(np.int64)
     if not len(squares):
         return np.empty(0, np.intp)

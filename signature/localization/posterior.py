@@ -277,7 +277,7 @@ class Evidence:
 
     forward : `pc2grid.matching.score.Fit.known_agreement`. walls : wall points of the query that lie
     on ground known to the map and were seen from a side that it knows, weighted by
-    `pc2grid.matching.walls.steadiness`. backward, looked_at : the other way round, from whichever side.
+    `pc2grid.matching.walls.permanence`. backward, looked_at : the other way round, from whichever side.
     lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
     likeness : `pc2grid.matching.score` of the query.
     tail : r_k, log-likelihood of the scans from the k-th one on, the last one first, without the first scan

@@ -20,7 +20,7 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import F64, SE2, cells_of, transform_points
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.matching.icp_in_space import SpatialView
-from pc2grid.matching.score import self_likeness
+from pc2grid.matching.score import self_similarity
 from pc2grid.matching.walls import Walls
 from pc2grid.model import SENSOR_MODELS, Health, OccupancyGrid, RegisteredScan
 from pc2grid.submaps.junction_graph import sample_evenly, skeleton_of
@@ -91,7 +91,7 @@ class QueryMap:
     @cached_property
     def likeness(self) -> float:
         """`pc2grid.matching.score` of the walls."""
-        return self_likeness(self.walls)
+        return self_similarity(self.walls)
 
 
 class ViewSpacing:

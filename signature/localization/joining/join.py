@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from pc2grid.geometry import F32, F64, SE2, BoolGrid, freeze, wrap_angle
-from pc2grid.matching.score import Fit, refine, score_fit, self_likeness
+from pc2grid.matching.score import Fit, refine, score_fit, self_similarity
 from pc2grid.matching.search import SearchMap
 from pc2grid.matching.walls import LIKELIHOOD, Walls
 from pc2grid.model import UNKNOWN, OccupancyGrid
@@ -354,7 +354,7 @@ def _judged(
     part = known_part(source.grid, target.grid, candidate.T_target_source)
     common_m2 = free_in_both(part, target.grid, candidate.T_target_source)
     forward, backward, scores = fits.of_part(number)
-    evidence = replace(evidence, likeness=self_likeness(Walls.of(part)))
+    evidence = replace(evidence, likeness=self_similarity(Walls.of(part)))
     # The part was chosen: of so many parts of the smaller session, this one fits best.
     share = min(common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9), 1.0)
     odds = prior * max(share, 1e-9)

@@ -13,9 +13,10 @@ from pc2grid.matching.score import (
     REFINEMENT,
     RefinementParameters,
     gauss_newton,
+    normal_equations,
     refine,
 )
-from pc2grid.matching.search import SearchMap, normal_equations
+from pc2grid.matching.search import SearchMap
 from pc2grid.matching.walls import Walls
 from pc2grid.model import OccupancyGrid
 from tests.helpers.simulated_drives import office, office_part, plan
