@@ -462,7 +462,7 @@ class Consistency:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class UncertainStretch:
+class UncertainSegment:
     """A stretch of a trajectory whose place relative to the rest of the map is known only roughly.
 
     from_ns, to_ns : stamps of its ends. length_m : planar distance driven.
@@ -493,7 +493,7 @@ class Precision:
 
     stamps_ns: tuple[int, ...] = ()
     sigma_m: tuple[float, ...] = ()
-    loose: tuple[UncertainStretch, ...] = ()
+    loose: tuple[UncertainSegment, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.stamps_ns) != len(self.sigma_m):
@@ -516,7 +516,7 @@ class Precision:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Overruled:
+class OdometryOutlier:
     """A stretch of time in which the scans showed another motion than odometry.
 
     from_ns, to_ns : stamps of its first and last scan. distance_m, turn_rad : the largest difference between
@@ -543,7 +543,7 @@ class OdometryCheck:
 
     compared: int = 0
     overruled: int = 0
-    stretches: tuple[Overruled, ...] = ()
+    stretches: tuple[OdometryOutlier, ...] = ()
 
 
 def _empty_graph() -> nx.Graph:

@@ -1,1 +1,2 @@
-"""Following a robot from scan to scan: KISS-ICP, wheel odometry, refinement in the plane, health."""
+"""Tracking from scan to scan: KISS-ICP, matching with a local map in the plane or in space, and one
+smoother."""

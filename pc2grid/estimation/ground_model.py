@@ -1,4 +1,4 @@
-"""The floor under a base on wheels, and whether a base is on wheels at all."""
+"""The floor under a base on wheels, and the test whether a base is on wheels."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ By hand."""
 
 
 class GroundModel:
-    """The floor in the base frame, which is the mean of what the scans show of it.
+    """The floor in the base frame, averaged over the scans that show it.
 
-    ground : the floor; None for a planar laser, which sees none.
+    ground : the floor; None for a planar laser, which measures none.
     """
 
     def __init__(self, ground: Ground | None, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
         self.ground = ground
         self._parameters = parameters
         self._scans = 0
-        self._looks = int(ground is not None and ground.seen)  # that have shown the floor
+        self._observations = int(ground is not None and ground.seen)  # that have shown the floor
 
     @classmethod
     def start(
@@ -38,8 +38,8 @@ class GroundModel:
     ) -> GroundModel:
         """Find the floor in the first scan.
 
-        It is looked for where the mounting of the sensor puts it, then as the lowest level plane; else it
-        is assumed. points_m : (N, 3) points of the scan that are used, base frame.
+        It is searched for at the height given by the mounting of the sensor, then as the lowest level plane;
+        else it is assumed. points_m : (N, 3) points of the scan that are used, base frame.
         """
         if SENSOR_MODELS[scan.sensor].planar:
             return cls(None, parameters)
@@ -49,7 +49,7 @@ class GroundModel:
         return cls(found or find_ground(points_m, sensor_m) or assumed, parameters)
 
     def follow(self, points_m: F32, scan: Scan) -> None:
-        """Update the floor by the points (N, 3) of a scan; it is looked for in some of the scans only.
+        """Update the floor by the points (N, 3) of a scan; only every `rolling_every`th scan is used.
 
         Wheels do not tilt against the floor, and a ramp ahead soon passes.
         """
@@ -59,11 +59,11 @@ class GroundModel:
         if self._scans % self._parameters.rolling_every == 0:
             found = find_ground(points_m, scan.T_base_sensor[:3, 3], self.ground)
             if found is not None:
-                self._looks += 1
-                self.ground = self.ground.toward(found, 1.0 / self._looks)
+                self._observations += 1
+                self.ground = self.ground.toward(found, 1.0 / self._observations)
 
     def remove(self, points_m: F32) -> F32:
-        """The points (N, 3) that KISS-ICP is given, without floor and ceiling."""
+        """Remove floor and ceiling from points (N, 3), for KISS-ICP."""
         if self.ground is None or not len(points_m):
             return points_m
         slack_m = self._parameters.floor_slack_m
@@ -74,7 +74,7 @@ class GroundModel:
         return points_m[keep]
 
     def T_level_base(self) -> F64:
-        """Tilt and height (4, 4) of the base over the floor. The heading of the base stays."""
+        """Return tilt and height (4, 4) of the base over the floor. The heading of the base stays."""
         if self.ground is None:
             return np.eye(4)
         level = self.ground.leveling()
@@ -85,10 +85,9 @@ class GroundModel:
 
 
 def is_rolling(scan: Scan, first: Scan | None = None) -> bool:
-    """Whether the base stays upright: by its odometry, or without odometry by the mounting.
+    """Return True if the base stays upright: by its odometry, or without odometry by the mounting.
 
-    first : the first scan; a base on wheels has its height still, whatever that is. A planar laser is taken
-    to be on wheels.
+    first : the first scan, whose height is that of a base on wheels. A planar laser is taken to be on wheels.
     """
     T = scan.T_odom_base
     if SENSOR_MODELS[scan.sensor].planar:

@@ -1,19 +1,17 @@
 """Scan matching in the plane: point-to-line Gauss-Newton against a local map, with a prior.
 
-The map is a grid of moments: each cell keeps number, sum and second moments of the points that fell into
-it, separately for each direction of the surface normal, so that the two faces of a wall stay two. The line
-at a place is the principal axis of the cells around it. The accuracy is therefore not bound by the cell
-size, and adding a scan costs one pass over its points.
+The map is a grid of moments: each cell keeps number, sum and second moments of its points, separately for
+each direction of the surface normal, so that the two faces of a wall stay two. The line at a place is the
+principal axis of the cells around it. The accuracy is therefore not bound by the cell size, and adding a scan
+costs one pass over its points. Point-to-line is as in Censi, "An ICP variant using a point-to-line metric"
+(2008); the moments are those of Biber and Strasser's normal distributions transform (2003).
 
-Point-to-line as in Censi, "An ICP variant using a point-to-line metric" (2008); the moments are those of
-Biber and Strasser's normal distributions transform (2003).
+`steps` and `moved` treat poses as unknowns of least squares. A pose changes by a vector (6,) in its own axes,
+translation (m) and rotation vector (rad): the translation is added, the rotation multiplied (Sola et al., "A
+micro Lie theory for state estimation in robotics", 2018).
 
-Poses as unknowns of least squares: many at once, with the derivatives of the steps between them.
-
-A pose changes by a vector (6,) in its own axes, translation (m) and rotation vector (rad): the translation is
-added, the rotation multiplied (Sola et al., "A micro Lie theory for state estimation in robotics", 2018).
-
-The numbers of tracking and scan matching. Where no other origin is given, a number was chosen by hand.
+`MatchingParameters` and `TrackingParameters` are those of matching and of tracking as a whole. Where no other
+origin is given, a number was chosen by hand.
 """
 
 from __future__ import annotations
@@ -30,326 +28,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from pc2grid.geometry import F32, F64, SE2, SUBPIXEL_BITS, BoolGrid, polygon_corners, wrap_angle
 
-_DAMPING = 1e-6  # so that directions that no point measures can be solved for
-
-
-@njit(cache=True, error_model="numpy")
-def _line_at(
-    index: NDArray[np.int32], moments: F64, row: int, column: int, radius: int, sector: int, line: F64
-) -> bool:
-    """Write mean, normal and straightness of the points around a cell; False if they make no line.
-
-    The inner part of `normal_equations`.
-    """
-    sectors = moments.shape[1]
-    n = sx = sy = sxx = sxy = syy = 0.0
-    for r in range(row - radius, row + radius + 1):
-        for c in range(column - radius, column + radius + 1):
-            cell = index[r, c]
-            if cell < 0:
-                continue
-            for beside in (-1, 0, 1):
-                m = moments[cell, (sector + beside) % sectors]
-                n += m[0]
-                sx += m[1]
-                sy += m[2]
-                sxx += m[3]
-                sxy += m[4]
-                syy += m[5]
-    if n < 3.0:
-        return False
-    mx, my = sx / n, sy / n
-    a, b, d = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
-    middle = 0.5 * (a + d)
-    spread = math.sqrt(max(0.25 * (a - d) * (a - d) + b * b, 0.0))
-    large, small = middle + spread, max(middle - spread, 0.0)
-    if large < 1e-4:
-        return False
-    angle = 0.5 * math.atan2(2.0 * b, a - d)  # of the line; its normal is a quarter turn on
-    line[0], line[1] = mx, my
-    line[2], line[3] = -math.sin(angle), math.cos(angle)
-    line[4] = 1.0 - small / large
-    return True
-
-
-@njit(cache=True, error_model="numpy")
-def normal_equations(
-    index: NDArray[np.int32],
-    moments: F64,
-    points: F64,
-    normal_rad: F64,
-    pose: F64,
-    cell_m: float,
-    radius: int,
-    scale_m: float,
-) -> tuple[F64, F64, int]:
-    """Linearise the point-to-line distances at a pose.
-
-    index : (H, W) row of `moments` (K, sectors, 6) for each cell, or -1. points : (N, 2) and normal_rad :
-    (N,) in their frame. pose : (3,) x, y, yaw of that frame from the corner of cell (0, 0).
-    radius : half width in cells of the neighbourhood. scale_m : scale of the Cauchy weight.
-
-    Returns H (3, 3) and g (3,) of the Gauss-Newton step H d = -g for points of unit variance, and the
-    number of points that found a line.
-
-    Measured: 0.03 ms instead of 7 ms for 290 points of a planar laser.
-    """
-    height, width = index.shape
-    sectors = moments.shape[1]
-    H, g, line = np.zeros((3, 3)), np.zeros(3), np.empty(5)
-    c, s = math.cos(pose[2]), math.sin(pose[2])
-    found, last, is_line = 0, (-1, -1, -1), False
-    for k in range(points.shape[0]):
-        rx = c * points[k, 0] - s * points[k, 1]
-        ry = s * points[k, 0] + c * points[k, 1]
-        x, y = rx + pose[0], ry + pose[1]
-        column, row = math.floor(x / cell_m), math.floor(y / cell_m)
-        if row < radius or column < radius or row >= height - radius or column >= width - radius:
-            continue
-        at = row, column, round((normal_rad[k] + pose[2]) * (sectors / (2.0 * math.pi))) % sectors
-        if at != last:  # neighbours on a wall share it
-            last, is_line = at, _line_at(index, moments, row, column, radius, at[2], line)
-        if not is_line:
-            continue
-        nx, ny = line[2], line[3]
-        r = nx * (x - line[0]) + ny * (y - line[1])
-        found += 1
-        w = line[4] * line[4] / (1.0 + (r / scale_m) ** 2)
-        j2 = ny * rx - nx * ry
-        H[0, 0] += w * nx * nx
-        H[0, 1] += w * nx * ny
-        H[0, 2] += w * nx * j2
-        H[1, 1] += w * ny * ny
-        H[1, 2] += w * ny * j2
-        H[2, 2] += w * j2 * j2
-        g[0] += w * nx * r
-        g[1] += w * ny * r
-        g[2] += w * j2 * r
-    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
-    return H, g, found
-
-
-@njit(cache=True, error_model="numpy")
-def _solve(A: F64, b: F64, x: F64) -> None:
-    """Write the solution of A x = b, with a positive definite matrix A (3, 3), by its factors L D L^T."""
-    l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
-    d1 = A[1, 1] - l10 * A[1, 0]
-    l21 = (A[2, 1] - l20 * A[1, 0]) / d1
-    d2 = A[2, 2] - l20 * A[2, 0] - l21 * l21 * d1
-    y1 = b[1] - l10 * b[0]
-    x[2] = (b[2] - l20 * b[0] - l21 * y1) / d2
-    x[1] = y1 / d1 - l21 * x[2]
-    x[0] = b[0] / A[0, 0] - l10 * x[1] - l20 * x[2]
-
-
-@njit(cache=True, error_model="numpy")
-def aligned(
-    index: NDArray[np.int32],
-    moments: F64,
-    points: F64,
-    normal_rad: F64,
-    guess: F64,
-    prior: F64,
-    prior_information: F64,
-    cell_m: float,
-    radii: NDArray[np.int64],
-    residual_scale_m: float,
-    prior_scale: float,
-    converged: float,
-) -> tuple[F64, F64, F64, int]:
-    """Gauss-Newton of the point-to-line distances, held to a prior, one radius of `radii` an iteration.
-
-    index, moments, points, normal_rad, cell_m : as of `normal_equations`. guess, prior : (3,) poses from the
-    corner of cell (0, 0). prior_information : (3, 3). residual_scale_m, prior_scale, converged : see
-    `MatchingParameters`.
-
-    Returns the pose (3,); that by the points alone (3,), linearised where the last iteration began, with its
-    information (3, 3); and the number of points that found a line there.
-    """
-    unit, pose, alone = cell_m**-2.0, guess.copy(), guess.copy()
-    information, A, b, step, away = np.zeros((3, 3)), np.empty((3, 3)), np.empty(3), np.zeros(3), np.empty(3)
-    found = 0
-    for radius in radii:
-        H, g, found = normal_equations(
-            index, moments, points, normal_rad, pose, cell_m, radius, residual_scale_m * radius
-        )
-        for i in range(3):
-            alone[i], away[i] = pose[i], pose[i] - prior[i]
-            for j in range(3):
-                information[i, j] = unit * H[i, j]
-        away[2] -= 2.0 * math.pi * math.floor(away[2] / (2.0 * math.pi) + 0.5)
-        chi2 = 0.0
-        for i in range(3):
-            for j in range(3):
-                chi2 += away[i] * prior_information[i, j] * away[j]
-        # Cauchy weight: wheels slip, so a prior that disagrees with the points counts less.
-        weight = 1.0 / (1.0 + chi2 / prior_scale**2)
-        for i in range(3):
-            b[i] = -unit * g[i]
-            for j in range(3):
-                A[i, j] = information[i, j] + weight * prior_information[i, j]
-                b[i] -= weight * prior_information[i, j] * away[j]
-            A[i, i] += _DAMPING
-        _solve(A, b, step)
-        for i in range(3):
-            pose[i] += step[i]
-        if radius == radii[-1] and abs(step[0]) + abs(step[1]) + abs(step[2]) < converged:
-            break
-    for i in range(3):
-        b[i] = -unit * g[i]
-        for j in range(3):
-            A[i, j] = information[i, j]
-        A[i, i] += unit * _DAMPING
-    _solve(A, b, step)
-    for i in range(3):
-        alone[i] += step[i]
-    return pose, alone, information, found
-
-
-@njit(cache=True)
-def placement_scores(
-    field: F32, points: F64, origin: F64, yaws: F64, first: int, step: int, count: int
-) -> F32:
-    """Score all placements of a window. All in cells.
-
-    points : (N, 2) x, y. origin : (2,) middle of the window. yaws : (A,) radians. Shifts are
-    `first` + `step` * k for k below `count`, in x and in y. Returns the means (A, count (y), count (x)) of
-    the field at the points, 0 outside.
-
-    Measured: 6 ms instead of 290 ms for 400 points and 20 000 placements.
-    """
-    height, width = field.shape
-    scores = np.zeros((len(yaws), count, count), dtype=np.float32)
-    for a in range(len(yaws)):
-        cos, sin = math.cos(yaws[a]), math.sin(yaws[a])
-        for k in range(points.shape[0]):
-            column = math.floor(cos * points[k, 0] - sin * points[k, 1] + origin[0]) + first
-            row = math.floor(sin * points[k, 0] + cos * points[k, 1] + origin[1]) + first
-            for r in range(count):
-                at_row = row + r * step
-                if at_row < 0 or at_row >= height:
-                    continue
-                for c in range(count):
-                    at_column = column + c * step
-                    if 0 <= at_column < width:
-                        scores[a, r, c] += field[at_row, at_column]
-    return scores / np.float32(max(points.shape[0], 1))
-
-
-@njit(cache=True)
-def _compiled_steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
-    """The steps between poses (N, 4, 4) and their Jacobians, see `manifold.Steps`."""
-    count = first.shape[0]
-    step, by_first, by_second = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
-    turn, right = np.empty((3, 3)), np.empty((3, 3))
-    for n in range(count):
-        A, B = first[n], second[n]
-        for i in range(3):
-            for k in range(3):
-                step[n, i] += A[k, i] * (B[k, 3] - A[k, 3])
-                turn[i, k] = A[0, i] * B[0, k] + A[1, i] * B[1, k] + A[2, i] * B[2, k]
-        x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
-        twice_sine = math.sqrt(x * x + y * y + z * z)
-        angle = math.atan2(twice_sine, turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)
-        ratio = 0.5 if twice_sine < 1e-9 else angle / twice_sine
-        rx, ry, rz = ratio * x, ratio * y, ratio * z
-        step[n, 3], step[n, 4], step[n, 5] = rx, ry, rz
-        right[0, 0] = right[1, 1] = right[2, 2] = 1.0
-        right[1, 0], right[2, 0], right[2, 1] = 0.5 * rz, -0.5 * ry, 0.5 * rx
-        right[0, 1], right[0, 2], right[1, 2] = -0.5 * rz, 0.5 * ry, -0.5 * rx
-        tx, ty, tz = step[n, 0], step[n, 1], step[n, 2]
-        J = by_first[n]
-        J[0, 0] = J[1, 1] = J[2, 2] = -1.0
-        J[0, 4], J[0, 5], J[1, 5] = -tz, ty, -tx
-        J[1, 3], J[2, 3], J[2, 4] = tz, -ty, tx
-        for i in range(3):
-            for k in range(3):
-                by_second[n, i, k] = turn[i, k]
-                by_second[n, 3 + i, 3 + k] = right[i, k]
-                J[3 + i, 3 + k] = -(
-                    right[i, 0] * turn[k, 0] + right[i, 1] * turn[k, 1] + right[i, 2] * turn[k, 2]
-                )
-    return step, by_first, by_second
-
-
-@njit(cache=True)
-def _compiled_moved(poses: F64, changes: F64) -> F64:
-    """Poses (N, 4, 4) after changes (N, 6) in their own axes, see `manifold.moved`."""
-    result, turn = poses.copy(), np.empty((3, 3))
-    for n in range(len(poses)):
-        x, y, z = changes[n, 3], changes[n, 4], changes[n, 5]
-        square = x * x + y * y + z * z
-        angle = math.sqrt(square)
-        # Rodrigues' formula, by its series near no turn.
-        s = math.sin(angle) / angle if angle > 1e-9 else 1.0
-        c = (1.0 - math.cos(angle)) / square if angle > 1e-4 else 0.5
-        turn[0, 0], turn[1, 1] = 1.0 - c * (y * y + z * z), 1.0 - c * (x * x + z * z)
-        turn[2, 2] = 1.0 - c * (x * x + y * y)
-        turn[0, 1], turn[1, 0] = c * x * y - s * z, c * x * y + s * z
-        turn[0, 2], turn[2, 0] = c * x * z + s * y, c * x * z - s * y
-        turn[1, 2], turn[2, 1] = c * y * z - s * x, c * y * z + s * x
-        for i in range(3):
-            for k in range(3):
-                result[n, i, 3] += poses[n, i, k] * changes[n, k]
-                result[n, i, k] = 0.0
-                for j in range(3):
-                    result[n, i, k] += poses[n, i, j] * turn[j, k]
-    return result
-
-
-class Steps(NamedTuple):
-    """The steps from poses to others, in the axes of the first.
-
-    step : (N, 6). by_first, by_second : (N, 6, 6) its Jacobians with respect to changes of both.
-    """
-
-    step: F64
-    by_first: F64
-    by_second: F64
-
-
-def moved(poses: F64, changes: F64) -> F64:
-    """Poses (N, 4, 4) after changes (N, 6) in their own axes."""
-    result: F64 = _compiled_moved(*_for_compiled(poses, changes))
-    return result
-
-
-def steps(first: F64, second: F64) -> Steps:
-    """The steps from poses (N, 4, 4) to others."""
-    return Steps(*_compiled_steps(*_for_compiled(first, second)))
-
-
-def carried_on(motion: F64) -> F64:
-    """How a change of a pose changes the pose after a motion (4, 4), a matrix (6, 6)."""
-    R = motion[:3, :3].T
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = R
-    result[:3, 3:] = -R @ _skew(motion[None, :3, 3])[0]
-    return result
-
-
-def weakest(information: F64, position: int) -> float:
-    """Information (N, N) on the position, the first 2 or 3 directions, in its weakest one.
-
-    The rotation, which follows, is eliminated (Schur complement).
-    """
-    mixed, turn = information[:position, position:], information[position:, position:]
-    turn = turn + 1e-9 * np.eye(len(turn))
-    across = information[:position, :position] - mixed @ np.linalg.solve(turn, mixed.T)
-    return float(np.linalg.eigvalsh(across)[0])
-
-
-def _for_compiled(*arrays: F64) -> Iterator[F64]:
-    """Arrays in one order of memory, writable: for any other, the same code would be compiled once more."""
-    return (np.require(array, requirements=("C", "W")) for array in arrays)
-
-
-def _skew(vectors: F64) -> F64:
-    """The matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
-    result = np.zeros((len(vectors), 3, 3))
-    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
-    return result - result.transpose(0, 2, 1)
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MatchingParameters:
@@ -357,14 +35,14 @@ class MatchingParameters:
 
     cell_m : edge of a cell of moments. It is also the standard deviation that one point counts with, far
         above the noise of a range: the errors of neighbours on one wall are not independent.
-    sectors : number of directions by which surfaces are distinguished; a point uses its own and the two
-        beside it.
-    least_points : with fewer points (sum of their weights) across it, a direction of the position counts as
-        not measured.
+    sectors : number of directions of normals that are kept apart; a point uses its own and the two beside it.
+    least_points : a direction of the position counts as not measured with fewer points (sum of their weights)
+    across it.
     residual_scale_m : scale of the Cauchy weight of a point, times the radius of its neighbourhood in cells.
     prior_scale : scale of the Cauchy weight of the prior, in standard deviations.
     near_sigma_m : the same of a point that KISS-ICP has brought near.
-    radii_cells : half width of the neighbourhood that gives each point its line, one entry an iteration:
+    radii_cells : half width of the neighbourhood in which the line of a point is fitted, one entry an
+    iteration:
         wide first for a large basin of convergence, then narrow for accuracy.
     converged : the iterations end when x, y (m) and yaw (rad) change by less than this in sum.
     """
@@ -385,41 +63,39 @@ class TrackingParameters:
 
     Points:
 
-    max_points : of a scan, chosen at random; a depth image has 300 000.
-    floor_slack_m : height up to which points count as floor.
+    max_points : of a scan, chosen at random; a depth image has 300 000. floor_slack_m : height up to which
+    points count as floor.
 
     Ground:
 
-    rolling_every : scans from one look at the floor to the next. The floor under wheels is the mean of all.
+    rolling_every : scans between two estimates of the floor. The floor under wheels is the mean of all.
 
     Odometry:
 
-    gap : odometry does not go on over a time of more than so many usual intervals between scans.
-    fastest : in m/s and in rad/s; odometry that reports a faster motion is not believed, with an allowance of
-        `jump`, m and rad, for noise.
+    gap : odometry does not continue over more than so many usual intervals between scans. fastest : in m/s
+    and in rad/s; a faster motion reported by odometry is rejected, with an allowance of `jump`, m and rad,
+    for noise.
 
     Refinement in the plane:
 
-    matched_hits : hits of a scan that are matched, at most, evenly chosen.
-    followed : last scans that a scan is matched with which does not fit the local map.
-    hit_weight : what a hit tells as a share of one that is independent of its neighbours.
-    sure_overlap : least overlap of a placement that alone decides between odometry and the motion before;
-        with less, placements are searched for if the prediction leaves enough open.
-    search_above_m, search_above_rad : it is made only if its half width, `KERNEL` standard deviations,
-        exceeds one of these; a refinement alone converges over less.
-    search_most_m : largest half width.
-    search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
+    matched_hits : hits of a scan that are matched, at most, evenly chosen. followed : number of last scans
+    with which a scan is matched that does not fit the local map. hit_weight : information of a hit, as a
+    share of one that is independent of its neighbours. sure_overlap : least overlap of a match that alone
+    decides between odometry and constant velocity; with less, a search follows if the prediction is vague
+    enough. search_above_m, search_above_rad : the search is made only if its half width, `KERNEL` standard
+    deviations, exceeds one of these; a refinement alone converges over less. search_most_m : largest half
+    width. search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
 
     Local maps and keyframes:
 
-    keyframe_travel_m, keyframe_turn_rad : a scan joins the local maps after this motion.
-    map_travel_m : travel after which a new local map is begun.
+    keyframe_travel_m, keyframe_turn_rad : a scan joins the local maps after this motion. map_travel_m :
+    travel after which a new local map is begun.
 
     Health:
 
     min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
     known_m, known_rad : a scan of a sensor in the hand without odometry is lost if a standard deviation of
-        its pose on the local map is larger. The first is half of what a right answer may be off.
+    its pose on the local map is larger. The first is half of the tolerance of a right answer.
     give_up_scans : lost scans in a row after which tracking starts again.
     standing_m, standing_rad : a base stands while its odometry changes by no more.
     changed_s : time for which no scan of a standing base fits well, after which the walls have changed; a
@@ -472,21 +148,19 @@ Weights that fall with the square of the range were tried there, and made the he
 0.044 m): the noise of a hit is small beside the shape of walls, and far hits determine the heading.
 """
 TRACKING_PARAMETERS = TrackingParameters()
-
-
 _BORDER_CELLS = 5
 """Width of the border of free ground that may be a wall: a neighbourhood of the matching on either side."""
 
 
 @dataclass(frozen=True, slots=True)
-class Match:
-    """Placement of a point set on a map.
+class LineMatch:
+    """A point set matched with a map.
 
-    pose : T_map_points. by_points : the same by the points alone, without the prior; where they measure
-    nothing that is anywhere. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
-    overlap : share of the points that found a line. contradicted : share that found none where the map is
-    free; the others lie where it knows nothing.
-    measured : whether the points fix every direction of the position.
+    pose : T_map_points. by_points : the pose by the points alone, without the prior; arbitrary in directions
+    that they do not measure. information : (3, 3) of x, y, yaw in the map frame, from the points alone.
+    overlap : share of the points with a line. contradicted : share without one where the map is free; the
+    others lie on unknown ground.
+    measured : True if the points fix every direction of the position.
     """
 
     pose: SE2
@@ -522,7 +196,7 @@ class PointGrid:
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows (y) and columns (x)."""
+        """Return the numbers of rows (y) and columns (x)."""
         return self._index.shape[0], self._index.shape[1]
 
     def add(self, points_m: NDArray[np.floating], normal_rad: NDArray[np.floating]) -> None:
@@ -554,12 +228,12 @@ class PointGrid:
         self._free |= inside
 
     def free(self, points_m: F64) -> float:
-        """The share of points (N, 2), in the map frame, that lie on free ground."""
+        """Return the share of points (N, 2), in the map frame, on free ground."""
         row, column, inside = self._cells(points_m)
         return float(self._free[row[inside], column[inside]].sum()) / max(len(points_m), 1)
 
     def _cells(self, points_m: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], BoolGrid]:
-        """Rows (N,) and columns (N,) of points (N, 2), and whether they lie on the map."""
+        """Return rows (N,) and columns (N,) of points (N, 2), and a mask (N,) of those on the map."""
         column, row = np.floor((points_m - self.low_m) / self.cell_m).astype(np.int64).T
         inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
         return row, column, inside
@@ -579,7 +253,8 @@ class PointGrid:
         prior: SE2,
         prior_information: F64,
     ) -> SE2:
-        """A pose of KISS-ICP, weighed against a prior by how the walls there hold it: along them it slides.
+        """Weigh a pose of KISS-ICP against a prior by the information of the walls there: along them KISS-ICP
+        slides.
 
         Points, normals and prior are as of `match`.
         """
@@ -594,7 +269,7 @@ class PointGrid:
         return SE2(x, y, wrap_angle(yaw))
 
     def _equations(self, points_m: F64, normal_rad: F64, pose: F64, radius: int) -> tuple[F64, F64, int]:
-        """The normal equations of points (N, 2) at a pose (3,), see `_kernels.normal_equations`."""
+        """Return the normal equations of points (N, 2) at a pose (3,), see `normal_equations`."""
         corner = np.array([*self.low_m, 0.0])
         scale_m = self._parameters.residual_scale_m * radius
         return normal_equations(
@@ -610,11 +285,11 @@ class PointGrid:
         prior_information: F64,
         *,
         radii: tuple[int, ...] | None = None,
-    ) -> Match:
+    ) -> LineMatch:
         """Align points (N, 2) with the directions (N,) of their normals, in the points' frame, to the map.
 
-        The iterations start at `guess` and are held to `prior` by `prior_information` (3, 3) of x, y, yaw.
-        radii : half widths of the neighbourhood, as `MatchingParameters.radii_cells`, its default.
+        The iterations start at `guess`; the prior is a Gaussian at `prior` with `prior_information` (3, 3) of
+        x, y, yaw. radii : half widths of the neighbourhood, as `MatchingParameters.radii_cells`, its default.
         """
         p, (low_x, low_y) = self._parameters, self.low_m.tolist()
         points = np.asarray(points_m, np.float64)
@@ -636,7 +311,7 @@ class PointGrid:
             SE2(x + low_x, y + low_y, wrap_angle(yaw)) for x, y, yaw in (pose.tolist(), alone.tolist())
         )
         overlap = found / max(len(points), 1)
-        return Match(
+        return LineMatch(
             placed,
             by_points,
             information,
@@ -646,8 +321,21 @@ class PointGrid:
         )
 
 
+def weakest(information: F64, position: int) -> float:
+    """Return the least information on the position over its directions, from the information (N, N) on a
+    pose.
+
+    position : number of directions of the position, 2 or 3, which come first. The rotation is eliminated
+    (Schur complement).
+    """
+    mixed, turn = information[:position, position:], information[position:, position:]
+    turn = turn + 1e-9 * np.eye(len(turn))
+    across = information[:position, :position] - mixed @ np.linalg.solve(turn, mixed.T)
+    return float(np.linalg.eigvalsh(across)[0])
+
+
 def sector_of(normal_rad: F64, sectors: int) -> NDArray[np.int64]:
-    """Return the number (N,), 0..sectors - 1, of the sector that directions (N,) fall into."""
+    """Return the number (N,), 0..sectors - 1, of the sector of directions (N,)."""
     found: NDArray[np.int64] = np.rint(normal_rad * (sectors / (2.0 * np.pi))).astype(np.int64) % sectors
     return found
 
@@ -665,7 +353,8 @@ def best_placements(
     step_rad: float = math.radians(2.0),
     count: int = 3,
 ) -> list[tuple[float, SE2]]:
-    """Correlative scan matching (Olson 2009), exhaustive: placements of points (N, 2) on a likelihood field.
+    """Search the best placements of points (N, 2) on a likelihood field: exhaustive correlative matching
+    (Olson 2009).
 
     field : (H, W) in 0..1, cell (0, 0) at `low_m`. The window around `guess` is searched in equal steps.
     Returns the best `count` placements no two of which are neighbours, best first, each with the mean
@@ -695,3 +384,323 @@ def best_placements(
 def evenly(length: int, count: int) -> NDArray[np.intp]:
     """Return at most `count` of the indices below `length`, evenly spread."""
     return np.arange(length) if length <= count else np.linspace(0, length - 1, count).astype(np.intp)
+
+
+# Poses as unknowns.
+
+
+class Steps(NamedTuple):
+    """The steps from poses to others, in the axes of the first.
+
+    step : (N, 6). by_first, by_second : (N, 6, 6) its Jacobians with respect to changes of both.
+    """
+
+    step: F64
+    by_first: F64
+    by_second: F64
+
+
+def steps(first: F64, second: F64) -> Steps:
+    """Return the steps from poses (N, 4, 4) to others."""
+    return Steps(*compiled_steps(*_for_compiled(first, second)))
+
+
+def moved(poses: F64, changes: F64) -> F64:
+    """Return poses (N, 4, 4) after changes (N, 6) in their own axes."""
+    result: F64 = _compiled_moved(*_for_compiled(poses, changes))
+    return result
+
+
+def inverse_adjoint(motion: F64) -> F64:
+    """Return the adjoint (6, 6) of the inverse of a motion (4, 4).
+
+    It maps a change of a pose to the change of the pose after the motion.
+    """
+    R = motion[:3, :3].T
+    result = np.zeros((6, 6))
+    result[:3, :3] = result[3:, 3:] = R
+    result[:3, 3:] = -R @ _skew(motion[None, :3, 3])[0]
+    return result
+
+
+def _for_compiled(*arrays: F64) -> Iterator[F64]:
+    """Return arrays in one order of memory, writable: for any other, the same code would be compiled once
+    more.
+    """
+    return (np.require(array, requirements=("C", "W")) for array in arrays)
+
+
+def _skew(vectors: F64) -> F64:
+    """Return the matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
+    result = np.zeros((len(vectors), 3, 3))
+    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
+    return result - result.transpose(0, 2, 1)
+
+
+# Compiled functions.
+
+_DAMPING = 1e-6  # so that directions that no point measures can be solved for
+
+
+@njit(cache=True, error_model="numpy")
+def aligned(
+    index: NDArray[np.int32],
+    moments: F64,
+    points: F64,
+    normal_rad: F64,
+    guess: F64,
+    prior: F64,
+    prior_information: F64,
+    cell_m: float,
+    radii: NDArray[np.int64],
+    residual_scale_m: float,
+    prior_scale: float,
+    converged: float,
+) -> tuple[F64, F64, F64, int]:
+    """Minimise the point-to-line distances by Gauss-Newton with a prior, one radius of `radii` an iteration.
+
+    index, moments, points, normal_rad, cell_m : as of `normal_equations`. guess, prior : (3,) poses from the
+    corner of cell (0, 0). prior_information : (3, 3). residual_scale_m, prior_scale, converged : see
+    `MatchingParameters`.
+
+    Returns the pose (3,); the pose by the points alone (3,), linearised at the last iteration, with its
+    information (3, 3); and the number of points with a line there.
+    """
+    unit, pose, alone = cell_m**-2.0, guess.copy(), guess.copy()
+    information, A, b, step, away = np.zeros((3, 3)), np.empty((3, 3)), np.empty(3), np.zeros(3), np.empty(3)
+    found = 0
+    for radius in radii:
+        H, g, found = normal_equations(
+            index, moments, points, normal_rad, pose, cell_m, radius, residual_scale_m * radius
+        )
+        for i in range(3):
+            alone[i], away[i] = pose[i], pose[i] - prior[i]
+            for j in range(3):
+                information[i, j] = unit * H[i, j]
+        away[2] -= 2.0 * math.pi * math.floor(away[2] / (2.0 * math.pi) + 0.5)
+        chi2 = 0.0
+        for i in range(3):
+            for j in range(3):
+                chi2 += away[i] * prior_information[i, j] * away[j]
+        # Cauchy weight: wheels slip, so a prior that disagrees with the points counts less.
+        weight = 1.0 / (1.0 + chi2 / prior_scale**2)
+        for i in range(3):
+            b[i] = -unit * g[i]
+            for j in range(3):
+                A[i, j] = information[i, j] + weight * prior_information[i, j]
+                b[i] -= weight * prior_information[i, j] * away[j]
+            A[i, i] += _DAMPING
+        _solve(A, b, step)
+        for i in range(3):
+            pose[i] += step[i]
+        if radius == radii[-1] and abs(step[0]) + abs(step[1]) + abs(step[2]) < converged:
+            break
+    for i in range(3):
+        b[i] = -unit * g[i]
+        for j in range(3):
+            A[i, j] = information[i, j]
+        A[i, i] += unit * _DAMPING
+    _solve(A, b, step)
+    for i in range(3):
+        alone[i] += step[i]
+    return pose, alone, information, found
+
+
+@njit(cache=True, error_model="numpy")
+def normal_equations(
+    index: NDArray[np.int32],
+    moments: F64,
+    points: F64,
+    normal_rad: F64,
+    pose: F64,
+    cell_m: float,
+    radius: int,
+    scale_m: float,
+) -> tuple[F64, F64, int]:
+    """Linearise the point-to-line distances at a pose.
+
+    index : (H, W) row of `moments` (K, sectors, 6) for each cell, or -1. points : (N, 2) and normal_rad :
+    (N,) in their frame. pose : (3,) x, y, yaw of that frame from the corner of cell (0, 0). radius : half
+    width in cells of the neighbourhood. scale_m : scale of the Cauchy weight.
+
+    Returns H (3, 3) and g (3,) of the Gauss-Newton step H d = -g for points of unit variance, and the number
+    of points with a line.
+
+    Measured: 0.03 ms instead of 7 ms for 290 points of a planar laser.
+    """
+    height, width = index.shape
+    sectors = moments.shape[1]
+    H, g, line = np.zeros((3, 3)), np.zeros(3), np.empty(5)
+    c, s = math.cos(pose[2]), math.sin(pose[2])
+    found, last, is_line = 0, (-1, -1, -1), False
+    for k in range(points.shape[0]):
+        rx = c * points[k, 0] - s * points[k, 1]
+        ry = s * points[k, 0] + c * points[k, 1]
+        x, y = rx + pose[0], ry + pose[1]
+        column, row = math.floor(x / cell_m), math.floor(y / cell_m)
+        if row < radius or column < radius or row >= height - radius or column >= width - radius:
+            continue
+        at = row, column, round((normal_rad[k] + pose[2]) * (sectors / (2.0 * math.pi))) % sectors
+        if at != last:  # neighbours on a wall share it
+            last, is_line = at, _line_at(index, moments, row, column, radius, at[2], line)
+        if not is_line:
+            continue
+        nx, ny = line[2], line[3]
+        r = nx * (x - line[0]) + ny * (y - line[1])
+        found += 1
+        w = line[4] * line[4] / (1.0 + (r / scale_m) ** 2)
+        j2 = ny * rx - nx * ry
+        H[0, 0] += w * nx * nx
+        H[0, 1] += w * nx * ny
+        H[0, 2] += w * nx * j2
+        H[1, 1] += w * ny * ny
+        H[1, 2] += w * ny * j2
+        H[2, 2] += w * j2 * j2
+        g[0] += w * nx * r
+        g[1] += w * ny * r
+        g[2] += w * j2 * r
+    H[1, 0], H[2, 0], H[2, 1] = H[0, 1], H[0, 2], H[1, 2]
+    return H, g, found
+
+
+@njit(cache=True, error_model="numpy")
+def _line_at(
+    index: NDArray[np.int32], moments: F64, row: int, column: int, radius: int, sector: int, line: F64
+) -> bool:
+    """Write mean, normal and straightness of the points around a cell; return False if they make no line.
+
+    It is the inner part of `normal_equations`.
+    """
+    sectors = moments.shape[1]
+    n = sx = sy = sxx = sxy = syy = 0.0
+    for r in range(row - radius, row + radius + 1):
+        for c in range(column - radius, column + radius + 1):
+            cell = index[r, c]
+            if cell < 0:
+                continue
+            for beside in (-1, 0, 1):
+                m = moments[cell, (sector + beside) % sectors]
+                n += m[0]
+                sx += m[1]
+                sy += m[2]
+                sxx += m[3]
+                sxy += m[4]
+                syy += m[5]
+    if n < 3.0:
+        return False
+    mx, my = sx / n, sy / n
+    a, b, d = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+    middle = 0.5 * (a + d)
+    spread = math.sqrt(max(0.25 * (a - d) * (a - d) + b * b, 0.0))
+    large, small = middle + spread, max(middle - spread, 0.0)
+    if large < 1e-4:
+        return False
+    angle = 0.5 * math.atan2(2.0 * b, a - d)  # of the line; its normal is a quarter turn on
+    line[0], line[1] = mx, my
+    line[2], line[3] = -math.sin(angle), math.cos(angle)
+    line[4] = 1.0 - small / large
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _solve(A: F64, b: F64, x: F64) -> None:
+    """Solve A x = b for a positive definite matrix A (3, 3) by its factors L D L^T, and write x."""
+    l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
+    d1 = A[1, 1] - l10 * A[1, 0]
+    l21 = (A[2, 1] - l20 * A[1, 0]) / d1
+    d2 = A[2, 2] - l20 * A[2, 0] - l21 * l21 * d1
+    y1 = b[1] - l10 * b[0]
+    x[2] = (b[2] - l20 * b[0] - l21 * y1) / d2
+    x[1] = y1 / d1 - l21 * x[2]
+    x[0] = b[0] / A[0, 0] - l10 * x[1] - l20 * x[2]
+
+
+@njit(cache=True)
+def placement_scores(
+    field: F32, points: F64, origin: F64, yaws: F64, first: int, step: int, count: int
+) -> F32:
+    """Score all placements of a window. All in cells.
+
+    points : (N, 2) x, y. origin : (2,) middle of the window. yaws : (A,) radians. Shifts are
+    `first` + `step` * k for k below `count`, in x and in y. Returns the means (A, count (y), count (x)) of
+    the field at the points, 0 outside.
+
+    Measured: 6 ms instead of 290 ms for 400 points and 20 000 placements.
+    """
+    height, width = field.shape
+    scores = np.zeros((len(yaws), count, count), dtype=np.float32)
+    for a in range(len(yaws)):
+        cos, sin = math.cos(yaws[a]), math.sin(yaws[a])
+        for k in range(points.shape[0]):
+            column = math.floor(cos * points[k, 0] - sin * points[k, 1] + origin[0]) + first
+            row = math.floor(sin * points[k, 0] + cos * points[k, 1] + origin[1]) + first
+            for r in range(count):
+                at_row = row + r * step
+                if at_row < 0 or at_row >= height:
+                    continue
+                for c in range(count):
+                    at_column = column + c * step
+                    if 0 <= at_column < width:
+                        scores[a, r, c] += field[at_row, at_column]
+    return scores / np.float32(max(points.shape[0], 1))
+
+
+@njit(cache=True)
+def compiled_steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
+    """Return the steps between poses (N, 4, 4) and their Jacobians, see `Steps`."""
+    count = first.shape[0]
+    step, by_first, by_second = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
+    turn, right = np.empty((3, 3)), np.empty((3, 3))
+    for n in range(count):
+        A, B = first[n], second[n]
+        for i in range(3):
+            for k in range(3):
+                step[n, i] += A[k, i] * (B[k, 3] - A[k, 3])
+                turn[i, k] = A[0, i] * B[0, k] + A[1, i] * B[1, k] + A[2, i] * B[2, k]
+        x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+        twice_sine = math.sqrt(x * x + y * y + z * z)
+        angle = math.atan2(twice_sine, turn[0, 0] + turn[1, 1] + turn[2, 2] - 1.0)
+        ratio = 0.5 if twice_sine < 1e-9 else angle / twice_sine
+        rx, ry, rz = ratio * x, ratio * y, ratio * z
+        step[n, 3], step[n, 4], step[n, 5] = rx, ry, rz
+        right[0, 0] = right[1, 1] = right[2, 2] = 1.0
+        right[1, 0], right[2, 0], right[2, 1] = 0.5 * rz, -0.5 * ry, 0.5 * rx
+        right[0, 1], right[0, 2], right[1, 2] = -0.5 * rz, 0.5 * ry, -0.5 * rx
+        tx, ty, tz = step[n, 0], step[n, 1], step[n, 2]
+        J = by_first[n]
+        J[0, 0] = J[1, 1] = J[2, 2] = -1.0
+        J[0, 4], J[0, 5], J[1, 5] = -tz, ty, -tx
+        J[1, 3], J[2, 3], J[2, 4] = tz, -ty, tx
+        for i in range(3):
+            for k in range(3):
+                by_second[n, i, k] = turn[i, k]
+                by_second[n, 3 + i, 3 + k] = right[i, k]
+                J[3 + i, 3 + k] = -(
+                    right[i, 0] * turn[k, 0] + right[i, 1] * turn[k, 1] + right[i, 2] * turn[k, 2]
+                )
+    return step, by_first, by_second
+
+
+@njit(cache=True)
+def _compiled_moved(poses: F64, changes: F64) -> F64:
+    """Return poses (N, 4, 4) after changes (N, 6) in their own axes, see `moved`."""
+    result, turn = poses.copy(), np.empty((3, 3))
+    for n in range(len(poses)):
+        x, y, z = changes[n, 3], changes[n, 4], changes[n, 5]
+        square = x * x + y * y + z * z
+        angle = math.sqrt(square)
+        # Rodrigues' formula, by its series near no turn.
+        s = math.sin(angle) / angle if angle > 1e-9 else 1.0
+        c = (1.0 - math.cos(angle)) / square if angle > 1e-4 else 0.5
+        turn[0, 0], turn[1, 1] = 1.0 - c * (y * y + z * z), 1.0 - c * (x * x + z * z)
+        turn[2, 2] = 1.0 - c * (x * x + y * y)
+        turn[0, 1], turn[1, 0] = c * x * y - s * z, c * x * y + s * z
+        turn[0, 2], turn[2, 0] = c * x * z + s * y, c * x * z - s * y
+        turn[1, 2], turn[2, 1] = c * y * z - s * x, c * y * z + s * x
+        for i in range(3):
+            for k in range(3):
+                result[n, i, 3] += poses[n, i, k] * changes[n, k]
+                result[n, i, k] = 0.0
+                for j in range(3):
+                    result[n, i, k] += poses[n, i, j] * turn[j, k]
+    return result

@@ -1,9 +1,7 @@
-"""A sensor on wheels: KISS-ICP brings a scan near, point-to-line matching in the plane places it.
+"""Scan matching in the plane, for a base on wheels: KISS-ICP, then point-to-line matching with a local map.
 
-KISS-ICP in space has a wide reach. A scan in the plane knows the pose to millimetres, but only across the
-walls that it shows; how far it knows each direction is measured, and the smoother does the rest.
-
-The local maps that a scan is matched with: the last metres of travel, as grids of point moments.
+KISS-ICP in space has a wide reach. A scan in the plane fixes the pose to millimetres, but only across the
+walls that it shows. The information in each direction is measured, and the smoother fuses it with odometry.
 """
 
 from __future__ import annotations
@@ -20,23 +18,23 @@ from pc2grid.estimation.line_map import (
     CAMERA_MATCHING,
     MATCHING_PARAMETERS,
     TRACKING_PARAMETERS,
-    Match,
+    LineMatch,
     MatchingParameters,
     PointGrid,
     TrackingParameters,
     best_placements,
     evenly,
 )
-from pc2grid.estimation.placing import Estimate, Fit
 from pc2grid.estimation.registration import KissRegistration
-from pc2grid.estimation.smoother import KERNEL, PLANAR, Belief
+from pc2grid.estimation.scan_matching import Measurement, ScanMatch
+from pc2grid.estimation.smoother import KERNEL, PLANAR, PoseWithCovariance
 from pc2grid.geometry import F32, F64, SE2
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
 
 
-class SensorOnWheels:
-    """Places the scans of a sensor whose base stands on the floor."""
+class PlanarMatcher:
+    """Matches the scans of a sensor whose base stands on the floor; see `ScanMatcher`."""
 
     free = PLANAR
 
@@ -58,7 +56,7 @@ class SensorOnWheels:
         self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)
 
     def start(self, scan: Scan, points_m: F32) -> F64:
-        """See `PlacingSensor`."""
+        """Implement `ScanMatcher.start`."""
         self._floor = GroundModel.start(points_m, scan, self._parameters)
         narrow = SENSOR_MODELS[scan.sensor].narrow  # the sensor sees a part of its surroundings only
         self._matching = CAMERA_MATCHING if narrow else MATCHING_PARAMETERS
@@ -73,40 +71,43 @@ class SensorOnWheels:
         self._kiss = KissRegistration(self._registration)
 
     def levelled(self, pose: F64) -> F64:
-        """A pose (4, 4) in the plane with tilt and height from the floor: walls alone let them drift."""
+        """Return a planar pose (4, 4) with tilt and height from the floor: by walls alone they drift."""
         return pose @ self._floor.T_level_base()
 
     def __bool__(self) -> bool:
-        """Whether there is a local map."""
+        """Return True if there is a local map."""
         return bool(self._maps)
 
     def take(self, scan: Scan, points_m: F32) -> None:
-        """See `PlacingSensor`."""
+        """Implement `ScanMatcher.take`."""
         self._floor.follow(points_m, scan)
         self._points_m = self._floor.remove(points_m)
         self._planar_scan, self._unaided = self._project(scan, points_m), scan.T_odom_base is None
 
-    def match(self, belief: Belief) -> list[Fit]:
-        """See `PlacingSensor`. Along a corridor KISS-ICP tends to stand still, scan after scan, so what was
-        expected is always beside it."""
+    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
+        """Match from the pose of KISS-ICP and from the expected one: along a corridor KISS-ICP tends to stand
+        still.
+        """
         expected = self.levelled(belief.pose)
         starts = self._kiss.register(self._points_m, expected), expected
         return [self._matched(self._maps, SE2.from_matrix(start), belief) for start in starts]
 
-    def search(self, belief: Belief) -> Iterator[Fit]:
-        """See `PlacingSensor`."""
+    def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
+        """Search the window of the belief, and match the best placements."""
         p, (sigma_m, sigma_rad), prior = self._parameters, belief.sigmas, SE2.from_matrix(belief.pose)
         window = min(KERNEL * sigma_m, p.search_most_m), min(KERNEL * sigma_rad, math.pi)
         for guess in self._maps.search(self._planar_scan, prior, *window):
             yield self._matched(self._maps, guess, belief)
 
-    def held(self, fit: Fit) -> Fit:
-        """Lines hold what lies on them."""
+    def observable(self, fit: ScanMatch) -> ScanMatch:
+        """Return the match: points on a line provide the information that they seem to."""
         return fit
 
-    def follow(self, belief: Belief) -> Estimate | None:
-        """See `PlacingSensor`. Half of what a camera sees while it turns may be new to the map, but not to
-        the scans before. Odometry is trusted more."""
+    def follow(self, belief: PoseWithCovariance) -> Measurement | None:
+        """Match with the last scans, if there is no odometry, which is trusted more.
+
+        Half of the view of a turning camera may be new to the map, but not to the scans before.
+        """
         if not self._unaided:
             return None
         fit = self._matched_with_last(belief)
@@ -114,30 +115,30 @@ class SensorOnWheels:
         motion = self._last.inverse() @ SE2.from_matrix(at)
         return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible else None
 
-    def fits_last(self, belief: Belief) -> bool:
-        """See `PlacingSensor`."""
+    def fits_last(self, belief: PoseWithCovariance) -> bool:
+        """Return True if the scan fits the last scans and they fix its position."""
         fit = self._matched_with_last(belief)
         return fit.credible and fit.measured
 
-    def _matched_with_last(self, belief: Belief) -> Fit:
-        """The planar scan matched with a map of the last scans alone."""
+    def _matched_with_last(self, belief: PoseWithCovariance) -> ScanMatch:
+        """Match the planar scan with a map of the last scans alone."""
         last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         for before, pose in self._latest:
             last.extend(before, pose)
         return self._matched(last, SE2.from_matrix(belief.pose), belief)
 
-    def _matched(self, maps: MatchingMaps, guess: SE2, belief: Belief) -> Fit:
-        """The planar scan matched with local maps from a guess, held to a belief.
+    def _matched(self, maps: MatchingMaps, guess: SE2, belief: PoseWithCovariance) -> ScanMatch:
+        """Match the planar scan with local maps from a guess, with a belief as prior.
 
-        Ground that the map does not know speaks neither for nor against a placement: what lies there counts
-        as if it fitted no better than a scan must. Else a scan that shows much new ground, at a short range
-        or after a long step, would fit best where the scan before was taken.
+        Unknown ground neither supports nor contradicts a match: points there count as if they fitted no
+        better than a scan must. Otherwise a scan with much new ground, at a short range or after a long step,
+        would fit best at the pose of the scan before.
         """
         p, prior = self._parameters, SE2.from_matrix(belief.pose)
         information = _turned(belief.information, -prior.yaw)  # in the axes of the session frame
         match = maps.match(self._planar_scan, guess, prior, information)
         unknown = 1.0 - match.overlap - match.contradicted
-        return Fit(
+        return ScanMatch(
             pose=match.pose.lift(),
             alone=(match.by_points.lift(), _turned(match.information, match.by_points.yaw)),
             overlap=match.overlap,
@@ -148,17 +149,17 @@ class SensorOnWheels:
 
     @property
     def _last(self) -> SE2:
-        """The final pose of the scan before."""
+        """Return the final pose of the scan before."""
         return self._latest[-1][1]
 
     @property
     def _weight(self) -> float:
-        """What the scan taken last tells if it fits without any error."""
+        """Return the log likelihood ratio of the scan taken last if it fits without any error."""
         p = self._parameters
         return p.hit_weight * min(len(self._planar_scan.hits_m), p.matched_hits)
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
-        """The planar scan of the scan taken last."""
+        """Return the planar scan of the scan taken last."""
         del scan, points_m, lost
         self._latest.append((self._planar_scan, SE2.from_matrix(pose)))
         return self._planar_scan
@@ -194,7 +195,7 @@ class SensorOnWheels:
 
 
 def _turned(matrix: F64, yaw_rad: float) -> F64:
-    """A covariance or information (3, 3) of x, y, yaw in axes that are turned."""
+    """Rotate a covariance or information (3, 3) of x, y, yaw into other axes."""
     c, s = math.cos(yaw_rad), math.sin(yaw_rad)
     R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
     turned: F64 = R @ matrix @ R.T
@@ -204,7 +205,7 @@ def _turned(matrix: F64, yaw_rad: float) -> F64:
 class MatchingMaps:
     """Two overlapping local maps: scans are matched with the older one, and the younger replaces it in time.
 
-    reach_m : range of the hits of a scan. matching : numbers of the matching, which depend on the sensor.
+    reach_m : range of the hits of a scan. matching : parameters, which depend on the sensor.
     """
 
     def __init__(
@@ -231,10 +232,10 @@ class MatchingMaps:
         found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
         return [pose for _, pose in found]
 
-    def match(self, planar_scan: PlanarScan, near: SE2, prior: SE2, information: F64) -> Match:
-        """Match a planar scan that has been brought near where it fits, T_session_base.
+    def match(self, planar_scan: PlanarScan, near: SE2, prior: SE2, information: F64) -> LineMatch:
+        """Match a planar scan from a pose near the right one, T_session_base.
 
-        prior, information : pose that the result is held to, and its information (3, 3) of x, y, yaw.
+        prior, information : Gaussian prior of the pose, with its information (3, 3) of x, y, yaw.
         """
         grid = self._maps[0][0]
         chosen = evenly(len(planar_scan.hits_m), self._parameters.matched_hits)

@@ -28,8 +28,8 @@ _FEW = 50
 class KissRegistration:
     """KISS-ICP with a given initial guess, in one thread and hence repeatable.
 
-    voxel_m, max_range_m : where `config` does not say; None: as KISS-ICP has it. A refinement follows, so
-    coarse voxels are enough.
+    voxel_m, max_range_m : defaults for those that `config` leaves out; None: those of KISS-ICP. A refinement
+    follows, so coarse voxels are enough.
     """
 
     def __init__(
@@ -75,13 +75,13 @@ class KissRegistration:
             self._map.update(self._frame(points_m), _proper(T_session_base))
 
     def _frame(self, points_m: NDArray[np.floating]) -> F64:
-        """The points (N, 3) that are near enough, thinned for the local map."""
+        """Return the points (N, 3) within range, downsampled for the local map."""
         points = np.ascontiguousarray(points_m, dtype=np.float64)
         near = np.einsum("ij,ij->i", points, points) < self._kiss_config.data.max_range**2
         return self._downsample(points[near], 0.5)
 
     def _downsample(self, points: F64, voxels: float) -> F64:
-        """One point for each cube with an edge of so many voxels of the local map."""
+        """Return one point for each cube with an edge of so many voxels of the local map."""
         from kiss_icp.voxelization import voxel_down_sample
 
         sampled: F64 = voxel_down_sample(points, voxels * self._kiss_config.mapping.voxel_size)
@@ -124,7 +124,7 @@ class BareKissIcp:
 
 
 def _proper(pose: F64) -> F64:
-    """The pose (4, 4) with an exact rotation: KISS-ICP ends the whole process for any other matrix."""
+    """Return the pose (4, 4) with an exact rotation: KISS-ICP ends the whole process for any other matrix."""
     R = pose[:3, :3]
     off = np.abs(R @ R.T - np.eye(3)).max()
     if off < _EXACT or not np.isfinite(pose).all():

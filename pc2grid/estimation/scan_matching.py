@@ -1,10 +1,10 @@
-"""Where a scan lies on the local map of the last metres: the most probable of several matches.
+"""Scan matching with the local map: the most probable of several matches.
 
-A sensor matches (`PlacingSensor`: in the plane, or in space); what is made of its matches is the same with
-three and with six degrees of freedom. KISS-ICP brings the scan near, from where the base is expected; the
-matches begin there. If none fits, the scan is searched for. Each match has a posterior density: by how the
-scan fits, and by what was expected. The best one is taken, and the covariance of all says how far it is to be
-believed: of two places that fit alike neither is known.
+A sensor makes the matches (`ScanMatcher`: in the plane, or in space); their selection (`MatchSelector`) is
+the same with three and with six degrees of freedom. KISS-ICP brings the scan near from each expected pose,
+and the matches begin there. If none fits, the scan is searched for. The posterior density of a match is the
+product of the likelihood of the scan and of the density of the expected pose. The best match is taken. Its
+covariance is widened by the spread of all matches: where two places fit alike, neither is known.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ import numpy as np
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.estimation.line_map import TRACKING_PARAMETERS, TrackingParameters, steps
-from pc2grid.estimation.smoother import KERNEL, Belief
+from pc2grid.estimation.smoother import KERNEL, PoseWithCovariance
 from pc2grid.geometry import F32, F64
 from pc2grid.model import Scan
 
-Estimate = tuple[F64, F64]
+Measurement = tuple[F64, F64]
 """A pose or a motion (4, 4), with its information (D, D) in the axes of the base where it begins."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fit:
+class ScanMatch:
     """A scan matched with the local map; D directions of the pose are free.
 
-    pose : (4, 4) T_session_base, held to what was expected. alone : the pose by the points alone, with its
-    information (D, D) in the axes of the base.
-    overlap : share of the points that meet the map. measured : whether they fix every direction of the
+    pose : (4, 4) T_session_base, with the expected pose as prior. alone : the pose by the points alone, with
+    its information (D, D) in the axes of the base.
+    overlap : share of the points that meet the map. measured : True if they fix every direction of the
     position.
     evidence : logarithm of the likelihood of the scan at that pose, but for a constant.
-    credible : what is known there, free space included, speaks for the pose even if nothing else does.
+    credible : True if surfaces and free space there support the pose without any prior.
     """
 
     pose: F64
-    alone: Estimate
+    alone: Measurement
     overlap: float
     measured: bool
     evidence: float
     credible: bool
 
 
-class PlacingSensor(Protocol):
-    """Takes in the scans of a session, one after another, and matches them with a local map.
+class ScanMatcher(Protocol):
+    """Matches the scans of a session, one after another, with a local map.
 
     free : directions of the pose that can change, `PLANAR` or `SPATIAL` of `pc2grid.estimation.smoother`.
     points_m : (N, 3) deskewed points of a scan in the base frame.
@@ -58,128 +58,137 @@ class PlacingSensor(Protocol):
         """Begin with the first scan; returns its pose (4, 4): the session frame is its base, levelled."""
 
     def take(self, scan: Scan, points_m: F32) -> None:
-        """Take in a scan."""
+        """Prepare a scan for the following calls."""
 
     def __bool__(self) -> bool:
-        """Whether there is a local map."""
+        """Return True if there is a local map."""
 
-    def match(self, belief: Belief) -> list[Fit]:
-        """Match the scan taken last with the local map. KISS-ICP begins at the belief, and the first match
-        begins where KISS-ICP ends. All matches are held to the belief."""
+    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
+        """Match the scan taken last with the local map, from the pose of KISS-ICP and from others.
 
-    def search(self, belief: Belief) -> Iterator[Fit]:
-        """Match the scan taken last wherever a belief holds it possible."""
+        KISS-ICP begins at the belief, which is also the prior of all matches.
+        """
 
-    def held(self, fit: Fit) -> Fit:
-        """A match of the scan taken last, by what the map holds, and not only seems to."""
+    def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
+        """Search the scan taken last wherever the belief allows, and match it there."""
 
-    def follow(self, belief: Belief) -> Estimate | None:
-        """The motion, T_last_now, by the last scans alone; None if the scan taken last does not fit them."""
+    def observable(self, fit: ScanMatch) -> ScanMatch:
+        """Return the match with only the information that the surfaces really provide
+        (`SurfaceMap.observable`).
+        """
 
-    def fits_last(self, belief: Belief) -> bool:
-        """Whether the scan taken last fits the scans before it, whatever the local map holds."""
+    def follow(self, belief: PoseWithCovariance) -> Measurement | None:
+        """Match with the last scans alone; returns the motion T_last_now, or None if the scan does not fit
+        them.
+        """
+
+    def fits_last(self, belief: PoseWithCovariance) -> bool:
+        """Return True if the scan taken last fits the scans before it; the local map does not matter."""
 
     def levelled(self, pose: F64) -> F64:
-        """A pose (4, 4) in the free directions, with the tilt and the height that are known besides."""
+        """Return a pose (4, 4) in the free directions, with tilt and height where these are known besides."""
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
-        """The planar scan, in the levelled base frame, of the scan taken last at its final pose (4, 4)."""
+        """Return the planar scan, in the levelled base frame, of the scan taken last at its final pose (4,
+        4).
+        """
 
     def extend(self, pose: F64) -> None:
-        """The scan taken last is a keyframe, at its final pose (4, 4)."""
+        """Add the scan taken last, a keyframe, to the local map at its final pose (4, 4)."""
 
     def restart(self) -> None:
         """Forget the local map: the next scan that is not lost begins a new one."""
 
 
 @dataclass(frozen=True, slots=True)
-class Placed:
-    """A scan placed on the local map.
+class MatchedScan:
+    """The selected match of a scan with the local map.
 
-    pose : (4, 4) T_session_base, from which the smoother begins. alone : as of `Fit`; None if the scan fits
-    nowhere. motion : T_last_now, if the scan fits those before, but not the map: what it shows is new.
-    sure : it fits the map well. measured : its points fix every direction of the position.
-    first : there is no local map yet, nor any since tracking started again.
+    pose : (4, 4) initial T_session_base for the smoother. alone : as of `ScanMatch`; None if the scan fits
+    nowhere. motion : T_last_now, if the scan shows new ground and fits only the scans before.
+    sure : True if it fits the map well. measured : True if its points fix every direction of the position.
+    first : True if there is no local map yet, nor any since tracking started again.
     """
 
     pose: F64
-    alone: Estimate | None = None
-    motion: Estimate | None = None
+    alone: Measurement | None = None
+    motion: Measurement | None = None
     sure: bool = False
     measured: bool = False
     first: bool = False
 
 
 @dataclass(frozen=True, slots=True, order=True)
-class _Hypothesis:
-    """A match, and the logarithm of its posterior density but for a constant.
+class _Candidate:
+    """A match with the logarithm of its posterior density, but for a constant.
 
-    sure : the scan fits well there. near : it lies where it is expected, and was not searched for.
+    sure : True if the scan fits well there. near : True if it lies at an expected pose, False if it was
+    searched for.
     """
 
     score: float
-    fit: Fit = field(compare=False)
+    fit: ScanMatch = field(compare=False)
     sure: bool = field(compare=False)
     near: bool = field(compare=False)
 
 
-class Placer:
-    """Places the scans of a sensor."""
+class MatchSelector:
+    """Selects the most probable match of each scan of a sensor."""
 
-    def __init__(self, sensor: PlacingSensor, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+    def __init__(self, sensor: ScanMatcher, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
         self._sensor, self._parameters = sensor, parameters
 
-    def place(self, scan: Scan, points_m: F32, expected: Sequence[Belief]) -> Placed:
-        """Place the next scan.
+    def place(self, scan: Scan, points_m: F32, expected: Sequence[PoseWithCovariance]) -> MatchedScan:
+        """Match the next scan with the local map.
 
-        points_m : (N, 3) deskewed, base frame. expected : where the base may be, the most credible first. A
-        scan that fits nowhere, or shows nothing, is placed there.
+        points_m : (N, 3) deskewed, base frame. expected : predictions of the pose, the most credible first. A
+        scan that fits nowhere, or is empty, gets the first of them.
         """
         p, belief = self._parameters, expected[0]
         self._sensor.take(scan, points_m)
         if not self._sensor:
-            return Placed(belief.pose, sure=True, first=True)
-        found = self._hypotheses(expected)
+            return MatchedScan(belief.pose, sure=True, first=True)
+        found = self._candidates(expected)
         best = max(found)
         if best.fit.overlap < p.min_overlap or not (best.near or best.fit.credible):
-            return Placed(belief.pose, motion=self._sensor.follow(belief))
+            return MatchedScan(belief.pose, motion=self._sensor.follow(belief))
         spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
-        fit = self._sensor.held(best.fit)
+        fit = self._sensor.observable(best.fit)
         alone, information = fit.alone
         # The inverse of the sum of both covariances, also where a match tells nothing of a direction.
         believed = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
         estimate = alone, 0.5 * (believed + believed.T)
-        return Placed(fit.pose, estimate, sure=best.sure, measured=fit.measured)
+        return MatchedScan(fit.pose, estimate, sure=best.sure, measured=fit.measured)
 
-    def _hypotheses(self, expected: Sequence[Belief]) -> list[_Hypothesis]:
-        """Where the scan taken last may lie. If it fits nowhere that it is expected, it is searched for."""
-        found: list[_Hypothesis] = []
+    def _candidates(self, expected: Sequence[PoseWithCovariance]) -> list[_Candidate]:
+        """Return the matches at the expected poses and, if none of them fits, those of a search."""
+        found: list[_Candidate] = []
         first = expected[0]
         for belief in expected:
-            found += [self._hypothesis(fit, expected) for fit in self._sensor.match(belief)]
+            found += [self._candidate(fit, expected) for fit in self._sensor.match(belief)]
             if max(found).sure and max(found).near and not self._is_vague(belief):
                 return found
         if not max(found).sure and (self._is_vague(first) or not max(found).near):
             found += [
-                replace(self._hypothesis(fit, expected), near=False) for fit in self._sensor.search(first)
+                replace(self._candidate(fit, expected), near=False) for fit in self._sensor.search(first)
             ]
         return found
 
-    def _hypothesis(self, fit: Fit, expected: Sequence[Belief]) -> _Hypothesis:
-        """A match, weighed by the expectation that explains it best."""
+    def _candidate(self, fit: ScanMatch, expected: Sequence[PoseWithCovariance]) -> _Candidate:
+        """Weight a match by the expected pose that explains it best."""
         chi2 = [belief.chi2(fit.pose) for belief in expected]
         density = max(belief.log_density(c) for belief, c in zip(expected, chi2, strict=True))
         sure = fit.credible and fit.overlap >= self._parameters.sure_overlap
-        return _Hypothesis(fit.evidence + density, fit, sure, near=min(chi2) < KERNEL**2)
+        return _Candidate(fit.evidence + density, fit, sure, near=min(chi2) < KERNEL**2)
 
-    def _is_vague(self, belief: Belief) -> bool:
-        """Whether a match alone does not reach all that a belief holds possible."""
+    def _is_vague(self, belief: PoseWithCovariance) -> bool:
+        """Return True if a belief is wider than the reach of a match."""
         p, (sigma_m, sigma_rad) = self._parameters, belief.sigmas
         return KERNEL * max(sigma_m / p.search_above_m, sigma_rad / p.search_above_rad) > 1.0
 
 
-def _spread(found: Sequence[_Hypothesis], best: _Hypothesis) -> F64:
-    """The covariance (6, 6) of all hypotheses about the best one, in the axes of the base there."""
+def _spread(found: Sequence[_Candidate], best: _Candidate) -> F64:
+    """Return the covariance (6, 6) of all candidates about the best one, in the axes of the base there."""
     mass = np.exp([other.score - best.score for other in found])
     poses = np.array([other.fit.pose for other in found])
     away = steps(np.tile(best.fit.pose, (len(poses), 1, 1)), poses).step

@@ -1,16 +1,15 @@
-"""A carried sensor: followed in space, and reduced to the plane by the map of its last metres.
+"""Scan matching in space, for a sensor in the hand: registered to surfaces, reduced to the plane by its map.
 
-A narrow, tilted, noisy view shows neither where the floor is nor what is a wall. So each scan is registered
-to what was seen before, by KISS-ICP and then by the shapes of the surfaces, with the odometry of the device,
-where there is one, as what it is: six degrees of freedom that drift. The planar scan is cut out of the map
-(`SpaceMap`). A scan that does not fit is searched for in all headings, and what then agrees with the surfaces
-and the free space of the map is believed, else it is lost.
+A narrow, tilted, noisy view shows neither the floor nor which of its obstacles are walls. So each scan is
+registered to the local map, by KISS-ICP and then by the shapes of the surfaces. Odometry of the device, if
+there is any, has six degrees of freedom that drift. A scan that does not fit is searched for in all headings;
+a match that agrees with the surfaces and the free space of the map is accepted, else the scan is lost.
 
-The local map of a carried sensor in space: its surfaces, its columns, and the floor in them.
+The local map (`SpaceMap`) fuses the registered clouds of the last metres in two ways: as shapes to which
+scans are registered (`SurfaceMap`), and as columns of occupied and free cells out of which planar scans are
+cut (`ColumnMap`). Memory is that of the surroundings, however long the recording is.
 
-The registered clouds of the last metres are fused in two ways: as shapes that scans are registered to
-(`SurfaceMap`), and as columns of occupied and free cells that planar scans are cut out of (`ColumnMap`).
-Memory is that of the surroundings, whatever the length.
+`begin` decides from the first scans whether a sensor is in the hand.
 """
 
 from __future__ import annotations
@@ -34,26 +33,26 @@ from pc2grid.estimation.line_map import (
     moved,
     steps,
 )
-from pc2grid.estimation.placing import Estimate, Fit
-from pc2grid.estimation.smoother import KERNEL, SPATIAL, Belief
-from pc2grid.estimation.surface_map import SURFACES, Placement, SurfaceMap
+from pc2grid.estimation.scan_matching import Measurement, ScanMatch
+from pc2grid.estimation.smoother import KERNEL, SPATIAL, PoseWithCovariance
+from pc2grid.estimation.surface_map import SURFACES, SurfaceMap, SurfaceMatch
 from pc2grid.geometry import F32, F64, SE2, BoolGrid, invert_pose, leveling, motion_size
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CarriedParameters:
-    """Numbers of carried sensors. Chosen by hand.
+class SpatialParameters:
+    """Parameters of `SpatialMatcher` and `begin`. Chosen by hand.
 
-    least_agreement : of a pose with what is known where the points lie, -1..1, that is credible. In a hall,
-        right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
-    residual_weight_per_m : of two placements the one with the larger agreement - weight * residual is taken.
-    starts : placements that a search refines in space. turned_rad : by how much these may be turned, a
-        standard deviation: more than a step of the search.
-    most_waiting : scans that wait for one that shows the floor, or for a motion, at most: some 50 MB.
+    least_agreement : least agreement, -1..1, of a credible pose with the known cells at its points. In a
+    hall, right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
+    residual_weight_per_m : of two matches the one with the larger agreement - weight * residual is taken.
+    starts : placements that a search refines in space. turned_rad : standard deviation of their orientation:
+    more than a step of the search.
+    most_waiting : scans kept, at most, until one shows the floor or a motion: some 50 MB.
     standing_s : a base that stands level for so long is on wheels: a robot that waits to be located must not
-        wait for its own motion, and a hand has trembled by then.
+    wait for its own motion, and a hand has trembled by then.
     """
 
     least_agreement: float = 0.85
@@ -64,11 +63,11 @@ class CarriedParameters:
     standing_s: float = 5.0
 
 
-CARRIED = CarriedParameters()
+SPATIAL_PARAMETERS = SpatialParameters()
 
 
-class CarriedSensor:
-    """Places the scans of a sensor in the hand, one after another, in the session frame: z up."""
+class SpatialMatcher:
+    """Matches the scans of a sensor in the hand, in the session frame (z up); see `ScanMatcher`."""
 
     free = SPATIAL
 
@@ -76,7 +75,7 @@ class CarriedSensor:
         self,
         registration: RegistrationConfig,
         projection: ProjectionConfig,
-        parameters: CarriedParameters = CARRIED,
+        parameters: SpatialParameters = SPATIAL_PARAMETERS,
         tracking: TrackingParameters = TRACKING_PARAMETERS,
     ) -> None:
         self._registration, self._projection = registration, projection
@@ -87,7 +86,7 @@ class CarriedSensor:
 
     @property
     def map(self) -> SpaceMap | None:
-        """The local map in space; None before the first scan and after `restart`."""
+        """Return the local map in space; None before the first scan and after `restart`."""
         return self._map
 
     def restart(self) -> None:
@@ -95,47 +94,47 @@ class CarriedSensor:
         self._map = None
 
     def start(self, scan: Scan, points_m: F32) -> F64:
-        """See `PlacingSensor`."""
+        """Implement `ScanMatcher.start`."""
         self.take(scan, points_m)
         return first_pose(scan, points_m)
 
     def levelled(self, pose: F64) -> F64:
-        """A pose (4, 4) in space has its tilt and its height already."""
+        """Return the pose (4, 4): in space it includes tilt and height."""
         return pose
 
     def __bool__(self) -> bool:
-        """Whether there is a local map."""
+        """Return True if there is a local map."""
         return bool(self._map)
 
     def take(self, scan: Scan, points_m: F32) -> None:
-        """See `PlacingSensor`."""
+        """Implement `ScanMatcher.take`."""
         if self._map is None:
             self._map = SpaceMap(scan, points_m, self._registration, self._projection)
         self._thinned = self._map.thin(scan, points_m)
 
-    def match(self, belief: Belief) -> list[Fit]:
-        """See `PlacingSensor`."""
+    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
+        """Match from the expected pose."""
         return [self._matched(belief.pose, belief)]
 
-    def search(self, belief: Belief) -> Iterator[Fit]:
-        """Match in all headings around the last pose, with its height and tilt.
+    def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
+        """Search in all headings around the last pose, with its height and tilt, and match there.
 
-        A hand turns fast; then the predicted direction of the step says nothing.
+        A hand turns fast; then the direction of the predicted step is unreliable.
         """
         p, t = self._parameters, self._tracking
         step_m = float(np.linalg.norm(belief.pose[:3, 3] - self._last[:3, 3]))
         window_m = min(step_m + KERNEL * belief.sigmas[0], t.search_most_m)
         covariance = np.diag([window_m**2] * 3 + [p.turned_rad**2] * 3)
         for guess in self._space.search(self._thinned, self._last, window_m, p.starts):
-            yield self._matched(guess, Belief(guess, covariance, belief.free))
+            yield self._matched(guess, PoseWithCovariance(guess, covariance, belief.free))
 
-    def _matched(self, guess: F64, held: Belief) -> Fit:
-        """The scan taken last matched with the map from a guess (4, 4), held to a belief."""
+    def _matched(self, guess: F64, held: PoseWithCovariance) -> ScanMatch:
+        """Match the scan taken last with the map from a guess (4, 4), with a belief as prior."""
         space = self._space
         found = space.match(self._thinned, guess, held)
         of_known, of_all = space.agreement(self._thinned, found.pose)
         quality = of_all - self._parameters.residual_weight_per_m * found.residual_m
-        return Fit(
+        return ScanMatch(
             pose=found.pose,
             alone=_alone(found, held),
             overlap=found.overlap,
@@ -144,23 +143,23 @@ class CarriedSensor:
             credible=of_known >= self._parameters.least_agreement,
         )
 
-    def held(self, fit: Fit) -> Fit:
-        """See `PlacingSensor`."""
+    def observable(self, fit: ScanMatch) -> ScanMatch:
+        """Implement `ScanMatcher.observable`."""
         alone, information = fit.alone
-        placement = Placement(fit.pose, information, fit.overlap, 0.0, fit.measured)
-        held = self._space.held(self._thinned, placement)
+        placement = SurfaceMatch(fit.pose, information, fit.overlap, 0.0, fit.measured)
+        held = self._space.observable(self._thinned, placement)
         return replace(fit, alone=(alone, held.information), measured=held.measured)
 
-    def follow(self, belief: Belief) -> None:
-        """Nothing: the surfaces of the last scans are in the map."""
+    def follow(self, belief: PoseWithCovariance) -> None:
+        """Return None: the surfaces of the last scans are in the map."""
 
-    def fits_last(self, belief: Belief) -> bool:
-        """Not known: see `follow`."""
+    def fits_last(self, belief: PoseWithCovariance) -> bool:
+        """Return False: the last scans are not matched alone."""
         del belief
         return False
 
     def extend(self, pose: F64) -> None:
-        """Nothing: scans join the map in space oftener than keyframes begin, see `cut`."""
+        """Do nothing: `cut` adds scans to the map, more of them than there are keyframes."""
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
         """Add the scan taken last to the map at its final pose (4, 4), and cut its planar scan out of it.
@@ -174,43 +173,31 @@ class CarriedSensor:
 
     @property
     def _space(self) -> SpaceMap:
-        """The map, of which there is one as soon as a scan has been taken."""
+        """Return the map, which exists as soon as a scan has been taken."""
         if self._map is None:
             raise ValueError("no scan has been taken")
         return self._map
 
 
-def _alone(found: Placement, held: Belief) -> Estimate:
-    """The pose (4, 4) by the points alone, with its information (6, 6). held : what drew it aside."""
+def _alone(found: SurfaceMatch, held: PoseWithCovariance) -> Measurement:
+    """Return the pose (4, 4) by the points alone, with its information (6, 6). held : the prior to be
+    removed.
+    """
     away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], found.pose[None]))
     information = found.information + 1e-3 * np.eye(6)
     change = np.linalg.solve(information, J.T @ held.information @ away)
     return moved(found.pose[None], change[None])[0], information
 
 
-def first_pose(scan: Scan, points_m: F32) -> F64:
-    """T_session_base (4, 4) of the first scan of a carried sensor: the session frame is the base, levelled.
-
-    The vertical is that of the odometry, which has six degrees of freedom; else that of the floor in the
-    points (N, 3), unless an IMU contradicts it, which measures it less exactly; else that of the IMU, else
-    the z axis of the base.
-    """
-    if scan.T_odom_base is not None:
-        return leveling(scan.T_odom_base[2, :3])
-    ground = level_floor(scan, points_m)
-    if scan.T_level_base is not None:
-        up = scan.T_level_base[2, :3]
-        if ground is None or ground.normal @ up < LEVEL.level:
-            return leveling(up)
-    return np.eye(4) if ground is None else ground.leveling()
+# The beginning of a session.
 
 
 @dataclass(frozen=True, slots=True)
 class Beginning:
-    """The first scans of a session, of which none is missing but those `left_out`.
+    """The first scans of a session, all but those `left_out`.
 
-    in_hand : how the sensor is carried: in the hand, else on wheels. All stages are given this.
-    warning : what was left out, or assumed, as a sentence for the user; None: nothing.
+    in_hand : True for a sensor in the hand, False on wheels; given to all stages.
+    warning : a sentence for the user about scans that were left out, or about an assumption; None: nothing.
     """
 
     scans: Sequence[Scan]
@@ -219,11 +206,11 @@ class Beginning:
     warning: str | None = None
 
 
-def begin(scans: Iterator[Scan], parameters: CarriedParameters = CARRIED) -> Beginning:
-    """Look ahead until it is known how the sensor is carried, and in the hand, which way is up.
+def begin(scans: Iterator[Scan], parameters: SpatialParameters = SPATIAL_PARAMETERS) -> Beginning:
+    """Look ahead until the first scans decide between hand and wheels and, in the hand, which way is up.
 
-    A session in the hand begins with the first scan that shows which way is up. If none of the first scans
-    does, all of them are kept: the sensor is taken to be held level.
+    A session in the hand begins with the first scan that shows which way is up. If none does, all scans are
+    kept, and the sensor is assumed to be held level.
     """
     ahead = islice(scans, parameters.most_waiting)
     waiting, in_hand = _until_decided(ahead, parameters.standing_s)
@@ -242,10 +229,10 @@ def begin(scans: Iterator[Scan], parameters: CarriedParameters = CARRIED) -> Beg
 
 
 def _until_decided(scans: Iterator[Scan], standing_s: float) -> tuple[list[Scan], bool]:
-    """Take scans until they tell whether the sensor is in the hand; returns them, and whether it is.
+    """Take scans until they decide between hand and wheels; returns them, and True for a sensor in the hand.
 
-    A hand may be level for a moment. So only scans count after which the base has moved, or of which that is
-    not known; or a base that has stood for so long.
+    A hand may be level for a moment. So only scans count after which the base has moved, or may have moved;
+    or a base that has stood for so long.
     """
     waiting: list[Scan] = []
     moving = 0
@@ -261,7 +248,8 @@ def _until_decided(scans: Iterator[Scan], standing_s: float) -> tuple[list[Scan]
 
 
 def _has_moved(first: Scan, scan: Scan) -> bool:
-    """Whether a base has moved since the first scan as far as makes a keyframe, unless that is not known."""
+    """Return True if a base has moved since the first scan as far as makes a keyframe, or if that is
+    unknown."""
     if first.T_odom_base is None or scan.T_odom_base is None:
         return True
     distance_m, turn_rad = motion_size(invert_pose(first.T_odom_base) @ scan.T_odom_base)
@@ -270,9 +258,30 @@ def _has_moved(first: Scan, scan: Scan) -> bool:
 
 
 def _knows_vertical(scan: Scan) -> bool:
-    """Whether odometry, an IMU or a floor in view tells the vertical."""
+    """Return True if odometry, an IMU or a floor in view gives the vertical."""
     known = scan.T_odom_base is not None or scan.T_level_base is not None
     return known or level_floor(scan, scan.points_m) is not None
+
+
+def first_pose(scan: Scan, points_m: F32) -> F64:
+    """Return T_session_base (4, 4) of the first scan of a sensor in the hand: the session frame is the base,
+    levelled.
+
+    The vertical is that of the odometry, which has six degrees of freedom; else that of the floor in the
+    points (N, 3), unless an IMU, which is less exact, contradicts it; else that of the IMU, else the z axis
+    of the base.
+    """
+    if scan.T_odom_base is not None:
+        return leveling(scan.T_odom_base[2, :3])
+    ground = level_floor(scan, points_m)
+    if scan.T_level_base is not None:
+        up = scan.T_level_base[2, :3]
+        if ground is None or ground.normal @ up < LEVEL.level:
+            return leveling(up)
+    return np.eye(4) if ground is None else ground.leveling()
+
+
+# The local map.
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -303,7 +312,7 @@ So it is free, unless what was measured there says more."""
 
 @dataclass(frozen=True, slots=True)
 class ThinnedScan:
-    """The points of a scan that are registered.
+    """The downsampled points of a scan that are registered.
 
     points_m : (N, 3) about one for each half voxel, base frame. weights : (N,) 0..1, by their noise.
     """
@@ -312,16 +321,16 @@ class ThinnedScan:
     weights: F64
 
     def placed(self, pose: F64) -> F64:
-        """The points (N, 3) at a pose (4, 4)."""
+        """Return the points (N, 3) at a pose (4, 4)."""
         moved: F64 = self.points_m @ pose[:3, :3].T + pose[:3, 3]
         return moved
 
 
 class SpaceMap:
-    """What a carried sensor has seen around it, in the session frame (z up).
+    """The local map of a sensor in the hand, in the session frame (z up).
 
-    Its columns stand on their own floor: each scan is entered at its height above the floor that was seen
-    around it, so that the passes of a pose that rises or sinks lie over each other.
+    Its columns stand on their own floor: each scan is entered at its height above the floor around it, so
+    that the passes of a pose whose height drifts lie over each other.
     """
 
     def __init__(
@@ -332,7 +341,7 @@ class SpaceMap:
         projection: ProjectionConfig,
         parameters: SpaceMapParameters = SPACE_MAP,
     ) -> None:
-        """An empty map with voxels as the points (N, 3) of a scan, base frame, ask for."""
+        """Make an empty map, with voxels that suit the points (N, 3) of a scan, base frame."""
         self._projection, self._parameters = projection, parameters
         self._noise_per_m2 = SENSOR_MODELS[scan.sensor].noise_per_m2
         noise_range_m = SENSOR_MODELS[scan.sensor].range_of_noise_m(parameters.noise_m)
@@ -349,31 +358,34 @@ class SpaceMap:
 
     @property
     def surfaces(self) -> SurfaceMap:
-        """The shapes that scans are registered to."""
+        """Return the shapes to which scans are registered."""
         return self._surfaces
 
     def thin(self, scan: Scan, points_m: F32) -> ThinnedScan:
-        """The points (N, 3) of a deskewed scan, base frame, thinned."""
+        """Downsample the points (N, 3) of a deskewed scan, base frame."""
         thinned = self._surfaces.thinned(points_m[self._near(scan, points_m)])
         away = thinned - scan.T_base_sensor[:3, 3]
         sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
         return ThinnedScan(thinned, 1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2))
 
-    def match(self, thinned: ThinnedScan, guess: F64, prior: Belief) -> Placement:
-        """Register a scan from a guess (4, 4), by KISS-ICP and then exactly; it is held to a prior."""
+    def match(self, thinned: ThinnedScan, guess: F64, prior: PoseWithCovariance) -> SurfaceMatch:
+        """Register a scan from a guess (4, 4), by KISS-ICP and then by surfaces, with a prior."""
         near = self._surfaces.near(thinned.points_m, thinned.weights, guess, prior)
         return self._surfaces.match(thinned.points_m, thinned.weights, near, prior)
 
-    def held(self, thinned: ThinnedScan, placement: Placement) -> Placement:
-        """A placement of a scan with the information that surfaces give; see `SurfaceMap.held`."""
-        return self._surfaces.held(thinned.points_m, thinned.weights, placement)
+    def observable(self, thinned: ThinnedScan, placement: SurfaceMatch) -> SurfaceMatch:
+        """Return a match of a scan with the information that surfaces provide; see
+        `SurfaceMap.observable`."""
+        return self._surfaces.observable(thinned.points_m, thinned.weights, placement)
 
     def agreement(self, thinned: ThinnedScan, pose: F64) -> tuple[float, float]:
-        """How a scan at a pose (4, 4) agrees with surfaces and free space, see `ColumnMap.agreement`."""
+        """Return the agreement of a scan at a pose (4, 4) with surfaces and free space, see
+        `ColumnMap.agreement`.
+        """
         return self._columns.agreement(self._lowered(thinned.placed(pose)))
 
     def search(self, thinned: ThinnedScan, guess: F64, window_m: float, count: int) -> list[F64]:
-        """The best few poses (4, 4) in all headings, with the height and the tilt of a guess (4, 4).
+        """Search the best few poses (4, 4) in all headings, with the height and the tilt of a guess (4, 4).
 
         The points at the height of walls are searched for in the plane, within `window_m` along x and y.
         """
@@ -424,23 +436,23 @@ class SpaceMap:
         )
 
     def cut(self, scan: Scan, pose: F64) -> PlanarScan:
-        """The planar scan of a scan at its pose (4, 4), in the levelled base frame."""
+        """Return the planar scan of a scan at its pose (4, 4), in the levelled base frame."""
         planar = self._columns.cut(SE2.from_matrix(pose), (pose @ scan.T_base_sensor)[:3, 3], scan.stamp_ns)
         # Without a floor, heights above it are not known.
         heights = planar.heights[:0] if self._floor.z_m is None else planar.heights
         return replace(planar, heights=heights, above_floor_m=self._above_floor_m)
 
     def _floor_m(self, sensor_m: F64) -> float:
-        """z of the floor below a sensor at (3,)."""
+        """Return z of the floor below a sensor at (3,)."""
         assumed_m = float(sensor_m[2]) - self._parameters.assumed_m
         return assumed_m if self._floor.z_m is None else self._floor.z_m
 
     def _lowered(self, points_m: F64) -> F64:
-        """Points (..., 3), session frame, by as much lower as the poses have risen."""
+        """Lower points (..., 3), session frame, by the drift of the height of the poses."""
         return points_m - (0.0, 0.0, self._floor.risen_m)
 
     def _near(self, scan: Scan, points_m: F32) -> BoolGrid:
-        """The points (N, 3) that are near enough to be exact."""
+        """Return a mask (N,) of the points that are near enough to be exact."""
         away = points_m - scan.T_base_sensor[:3, 3].astype(np.float32)
         near: BoolGrid = np.einsum("ij,ij->i", away, away) < self._reach_m**2
         return near

@@ -1,12 +1,12 @@
-"""The surfaces around a carried sensor, in space, and the registration of scans to them.
+"""The surfaces around a sensor in the hand, as a map of voxels, and the registration of scans to them.
 
-The local map is a hash map of voxels. Each voxel keeps the moments of the points that fell into it, so
-adding a scan costs one pass over its points, and the shape of the surface in a voxel (plane, edge, neither)
-is known better with every scan. A scan is aligned by Gauss-Newton: each of its points is held by the voxel
-it falls into, in the directions in which that is thin (Biber and Strasser 2003; Koide et al., "Voxelized
-GICP", 2021). KISS-ICP brings a scan near, and this makes it exact.
+The local map is a hash map of voxels. Each voxel keeps the moments of its points, so adding a scan costs one
+pass over its points, and the shape of the surface in a voxel (plane, edge, neither) becomes more exact with
+every scan. A scan is aligned by Gauss-Newton: the shape of its voxel constrains each point in the directions
+in which the shape is thin (Biber and Strasser 2003; Koide et al., "Voxelized GICP", 2021), after KISS-ICP has
+brought the scan near.
 
-The pose comes with its information, the Hessian (6, 6) of the points, so that odometry or the motion before
+The pose comes with its information, the Hessian (6, 6) of the points, so that odometry or constant velocity
 decides in the directions that the points do not fix.
 """
 
@@ -23,7 +23,7 @@ from scipy.linalg import eigh
 from pc2grid.clouds.cloud import random_subset
 from pc2grid.estimation.line_map import moved, steps, weakest
 from pc2grid.estimation.registration import KissRegistration
-from pc2grid.estimation.smoother import Belief
+from pc2grid.estimation.smoother import PoseWithCovariance
 from pc2grid.geometry import F32, F64, I64, BoolGrid
 from pc2grid.settings import RegistrationConfig
 
@@ -36,21 +36,21 @@ class SurfaceParameters:
         these bounds: a room needs finer voxels than a hall.
     thinning : a scan is reduced to one point for each cube of this many edges.
     kiss : edge of a voxel of KISS-ICP over that of this map.
-    points : of a scan that are aligned, at most. few_points : of which it is asked what holds the scan.
-    least : points from which on a voxel has a shape. most : a voxel with more forgets the oldest in
+    points : of a scan that are aligned, at most. few_points : the same for the test of observability.
+    least : least number of points of a voxel with a shape. most : a voxel with more forgets the oldest in
         proportion.
-    noise_m : a voxel holds points in the directions in which its own have a deviation below this.
+    noise_m : a voxel constrains points in the directions in which its own have a deviation below this.
     point_sigma_m : standard deviation that one point counts with. It is far above the noise of a range, since
         the errors of neighbours on one surface are not independent (as `MatchingParameters.point_sigma_m`).
-    near_sigma_m : the same of one that KISS-ICP has brought near. near_scale : of the Cauchy weight there, in
-        edges.
+    near_sigma_m : the same for the pose of KISS-ICP. near_scale : of the Cauchy weight there, in edges.
     rounds : scale (m) of the Cauchy weight of a distance in each iteration.
     converged : the iterations end when a step, in rad and m, is smaller.
     least_points : with less information than that of so many points along it, a direction of the position is
         not measured.
-    aside, aside_scale : points are displaced by this many edges to see what holds them, with this scale of
-        the Cauchy weight, in edges.
-    least_kept : secant over tangent from which a direction is held. The least of the six has a median of 0.4
+    aside, aside_scale : points are displaced by this many edges to test which directions are observable, with
+    this scale of the Cauchy weight, in edges.
+    least_kept : secant over tangent of an observable direction, at least. The least of the six has a median
+    of 0.4
         to 0.6 in recordings of two rooms, a kitchen, an office and a hall, and of 0.15 to 0.2 in simulated
         flats in which scans slipped.
     """
@@ -75,7 +75,9 @@ class SurfaceParameters:
     least_kept: float = 0.2
 
     def independent(self, points: int) -> float:
-        """How many points of unit weight, with independent errors, so many points of a scan are worth."""
+        """Return the number of points with independent errors that are worth as much as so many points of a
+        scan.
+        """
         return (self.noise_m / self.point_sigma_m) ** 2 * min(points, self.points)
 
 
@@ -83,13 +85,13 @@ SURFACES = SurfaceParameters()
 
 
 @dataclass(frozen=True, slots=True)
-class Placement:
-    """A scan placed in the map in space.
+class SurfaceMatch:
+    """A scan matched with the map in space.
 
     pose : (4, 4) T_map_base. information : (6, 6), from the points alone, of a change of the pose as in
     `pc2grid.estimation.line_map`.
     overlap : share of the points that meet a surface of the map. residual_m : their mean distance from it.
-    measured : whether the points fix every direction of the position.
+    measured : True if the points fix every direction of the position.
     """
 
     pose: F64
@@ -103,8 +105,8 @@ class Placement:
 class _Rows:
     """The voxels of a map, one a row; `used` rows are in use.
 
-    codes : (V,) see `_surface_kernels.code_of`. moments : (V, 10). shapes : (V, 9), the mean of the points
-    and the upper triangle of their information, see `_surface_kernels.fit_shapes`.
+    codes : (V,) see `code_of`. moments : (V, 10). shapes : (V, 9), the mean of the points and the upper
+    triangle of their information, see `fit_shapes`.
     """
 
     codes: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -140,12 +142,12 @@ class VoxelShapes:
         self._slots: NDArray[np.int32] = np.full(1 << 15, -1, np.int32)
 
     def __len__(self) -> int:
-        """Voxels in use."""
+        """Return the number of voxels in use."""
         return self._rows.used
 
     @property
     def shapes(self) -> F64:
-        """(V, 9): mean of the points, m, and the upper triangle of their information, 0..1."""
+        """Return (V, 9): mean of the points, m, and the upper triangle of their information, 0..1."""
         return self._rows.shapes[: self._rows.used]
 
     def add(self, points_m: F64) -> None:
@@ -172,7 +174,10 @@ class VoxelShapes:
     def equations(
         self, points_m: F64, weights: F64, pose: F64, scale_m: float
     ) -> tuple[F64, F64, float, float]:
-        """What points (N, 3) say of a change of their pose (4, 4) in its own axes; see `normal_equations`."""
+        """Linearise the distances of points (N, 3) in a change of their pose (4, 4), in its own axes.
+
+        See `normal_equations` for the results.
+        """
         rows = self._rows
         H, g, found, distance_m = normal_equations(
             self._slots,
@@ -190,7 +195,7 @@ class VoxelShapes:
 
 
 class SurfaceMap:
-    """The surfaces that a carried sensor has seen within `reach_m` of where it is."""
+    """The surfaces within `reach_m` of a sensor in the hand."""
 
     def __init__(
         self,
@@ -213,7 +218,7 @@ class SurfaceMap:
         registration: RegistrationConfig,
         parameters: SurfaceParameters = SURFACES,
     ) -> SurfaceMap:
-        """An empty map whose voxels fit the surroundings that the ranges (N,) of a first scan show."""
+        """Return an empty map whose voxels suit the surroundings, by the ranges (N,) of a first scan."""
         p = parameters
         middle_m = float(np.percentile(ranges_m, 75)) if len(ranges_m) else 0.0
         return cls(float(np.clip(p.edge_per_range * middle_m, *p.edge_m)), reach_m, registration, p)
@@ -222,19 +227,19 @@ class SurfaceMap:
         return len(self.fine) > 0
 
     def thinned(self, points_m: F32) -> F64:
-        """The points (N, 3) of a scan that are used here, about one for each half voxel."""
+        """Downsample the points (N, 3) of a scan to about one for each half voxel."""
         chosen = first_per_voxel(points_m, self._parameters.thinning * self.fine.edge_m)
         return points_m[chosen].astype(np.float64)
 
     def alone(self, points_m: F64) -> F64:
-        """The shapes (V, 9) of the surfaces that points (N, 3) show by themselves."""
+        """Return the shapes (V, 9) of the surfaces in points (N, 3) alone."""
         p = self._parameters
         view = VoxelShapes(self.fine.edge_m, p.least, p.most, p.noise_m)
         view.add(points_m)
         return view.shapes
 
     def add(self, points_m: F64, pose: F64) -> None:
-        """Add thinned points (N, 3) at their pose (4, 4); what has become far is forgotten now and then."""
+        """Add thinned points (N, 3) at their pose (4, 4); voxels that are far by now are forgotten."""
         here = pose[:3, 3]
         self.fine.add(points_m @ pose[:3, :3].T + here)
         self._kiss.add(points_m, pose)
@@ -244,17 +249,20 @@ class SurfaceMap:
             self._cleared_at = here
             self.fine.forget_beyond(here, 1.25 * self._reach_m)
 
-    def match(self, points_m: F64, weights: F64, guess: F64, prior: Belief) -> Placement:
-        """Place thinned points (N, 3), base frame, from a guess (4, 4); they are held to a prior.
+    def match(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> SurfaceMatch:
+        """Register thinned points (N, 3), base frame, from a guess (4, 4), with a prior.
 
         weights : (N,) of the points, 0..1, by their noise.
         """
         chosen = random_subset(len(points_m), self._parameters.points)
         return self._align(points_m[chosen], weights[chosen], guess, prior)
 
-    def near(self, points_m: F64, weights: F64, guess: F64, prior: Belief) -> F64:
-        """Where KISS-ICP puts thinned points (N, 3) from a guess (4, 4), weighed against a prior by how the
-        surfaces there hold it: in the directions that they leave open it slides."""
+    def near(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> F64:
+        """Register thinned points (N, 3) by KISS-ICP from a guess (4, 4), and weigh the pose against a prior.
+
+        The weight is the information of the surfaces there: KISS-ICP slides in the directions that they leave
+        free.
+        """
         p, registered = self._parameters, self._kiss.register(points_m, guess)
         few = random_subset(len(points_m), p.few_points)
         H = self.fine.equations(points_m[few], weights[few], registered, p.near_scale * self.fine.edge_m)[0]
@@ -262,20 +270,20 @@ class SurfaceMap:
         near: F64 = moved(registered[None], step[None])[0]
         return near
 
-    def held(self, points_m: F64, weights: F64, placement: Placement) -> Placement:
-        """A placement of thinned points (N, 3), with the information that the surfaces truly give.
+    def observable(self, points_m: F64, weights: F64, placement: SurfaceMatch) -> SurfaceMatch:
+        """Return a match of thinned points (N, 3) with only the information that the surfaces really provide.
 
-        On surfaces that noise has made uneven, points find a neighbour wherever they are, and the tangent of
-        their distances says that they are held. Half a voxel aside nothing draws them back: the secant of the
+        On surfaces that noise has made uneven, points find a neighbour anywhere, and the tangent of their
+        distances suggests a constraint. Half a voxel aside no gradient draws them back: the secant of the
         gradients there is small beside the tangent. Both are compared along the six principal changes of the
-        pose, in metres by which these displace the points. What is not held tells nothing.
+        pose, in metres of displacement of the points. Directions that are not observable get no information.
         """
         p = self._parameters
         few = random_subset(len(points_m), p.few_points)
         points, own, aside_m = points_m[few], weights[few], p.aside * self.fine.edge_m
 
         def at(step: F64) -> tuple[F64, F64]:
-            """Hessian (6, 6) and gradient (6,) after a change (6,) of the pose."""
+            """Return the Hessian (6, 6) and gradient (6,) after a change (6,) of the pose."""
             pose = moved(placement.pose[None], step[None])[0]
             return self.fine.equations(points, own, pose, p.aside_scale * self.fine.edge_m)[:2]
 
@@ -285,16 +293,16 @@ class SurfaceMap:
             change @ (at(aside_m * change)[1] - at(-aside_m * change)[1]) / (2.0 * aside_m)
             for change in changes.T
         ]
-        loose = changes[:, secants < p.least_kept * tangents]
-        kept = np.eye(6) - loose @ loose.T @ displacement
+        unconstrained = changes[:, secants < p.least_kept * tangents]
+        kept = np.eye(6) - unconstrained @ unconstrained.T @ displacement
         return replace(
             placement,
             information=kept.T @ placement.information @ kept,
-            measured=placement.measured and not loose.size,
+            measured=placement.measured and not unconstrained.size,
         )
 
-    def _align(self, points_m: F64, weights: F64, guess: F64, prior: Belief) -> Placement:
-        """Gauss-Newton from a guess."""
+    def _align(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> SurfaceMatch:
+        """Align points by Gauss-Newton from a guess."""
         p = self._parameters
         unit = p.point_sigma_m**-2
         pose, information, found, distance_m = guess, np.zeros((6, 6)), 0.0, 0.0
@@ -305,7 +313,7 @@ class SurfaceMap:
             pose = moved(pose[None], step[None])[0]
             if scale_m == p.rounds[-1] and np.abs(step).sum() < p.converged:
                 break
-        return Placement(
+        return SurfaceMatch(
             pose,
             information,
             found / max(len(points_m), 1),
@@ -314,8 +322,8 @@ class SurfaceMap:
         )
 
 
-def _step(pose: F64, information: F64, gradient: F64, prior: Belief) -> F64:
-    """The Gauss-Newton step (6,) from a pose (4, 4) of what is measured there and of a prior."""
+def _step(pose: F64, information: F64, gradient: F64, prior: PoseWithCovariance) -> F64:
+    """Return the Gauss-Newton step (6,) from a pose (4, 4), given measurements there and a prior."""
     away, _, J = (of_prior[0] for of_prior in steps(prior.pose[None], pose[None]))
     step: F64 = -np.linalg.solve(
         information + J.T @ prior.information @ J + 1e-3 * np.eye(6),
@@ -325,7 +333,8 @@ def _step(pose: F64, information: F64, gradient: F64, prior: Belief) -> F64:
 
 
 def _displacement(points_m: F64) -> F64:
-    """The mean square in m2 by which changes (6,) of the base displace its points (N, 3): (6, 6)."""
+    """Return the mean square (6, 6), in m2, of the displacement of points (N, 3) by changes (6,) of the
+    base."""
     x, y, z = points_m.T
     displaced = np.zeros((len(points_m), 3, 6))
     displaced[:, :, :3] = np.eye(3)
@@ -341,13 +350,13 @@ _HALF = 1 << (_BITS - 1)
 
 @njit(cache=True, inline="always")
 def code_of(i: int, j: int, k: int) -> int:
-    """The three indices of a voxel, each within a million of zero, in one number."""
+    """Return the three indices of a voxel, each within a million of zero, as one number."""
     return ((i + _HALF) << (2 * _BITS)) | ((j + _HALF) << _BITS) | (k + _HALF)
 
 
 @njit(cache=True, inline="always")
 def _slot(slots: NDArray[np.int32], codes: I64, code: int) -> int:
-    """Where the row of a code is in `slots`, or where it belongs if it is not there."""
+    """Return the slot of the row of a code, or the slot where it belongs."""
     mask = len(slots) - 1
     mixed = np.uint64(code) * np.uint64(0x9E3779B97F4A7C15)
     slot = int(np.int64(mixed >> np.uint64(20)) & mask)
@@ -417,8 +426,8 @@ def fit_shapes(
 ) -> None:
     """Write mean and information (V, 9) of the voxels in `rows`; zero where there are too few points.
 
-    The information says how well a point is held in each direction, 0..1: s^2 / (v + s^2) for a variance v of
-    the points along it and a noise s, less what the widest direction has. So a plane holds along its
+    The information is the constraint of a point in each direction, 0..1: s^2 / (v + s^2) for a variance v of
+    the points along it and a noise s, less that of the widest direction. So a plane constrains along its
     normal, an edge across its line, and a ball not at all.
     """
     C = np.empty((3, 3))
@@ -453,7 +462,7 @@ def fit_shapes(
 
 @njit(cache=True)
 def first_per_voxel(points: F32, edge: float) -> NDArray[np.int64]:
-    """The indices of points (N, 3), the first in each voxel, in order."""
+    """Return the indices of the first of points (N, 3) in each voxel, in order."""
     size = 1 << 12
     while size < 3 * len(points):
         size *= 2
@@ -487,12 +496,12 @@ def normal_equations(
 ) -> tuple[F64, F64, float, float]:
     """Linearise the distances of points (N, 3) from the shapes (V, 9) of the voxels around them.
 
-    pose : (4, 4). A point meets the shape whose mean is nearest, of its own voxel and the 26 around it.
-    scale : of the Cauchy weight of a distance. weights : (N,) inverse variances of the points, relative.
-    The unknowns are the shift and the rotation vector of the placed points about the origin of the base.
+    pose : (4, 4). A point meets the shape whose mean is nearest, of its own voxel and the 26 around it. scale
+    : of the Cauchy weight of a distance. weights : (N,) inverse variances of the points, relative. The
+    unknowns are the shift and the rotation vector of the placed points about the origin of the base.
 
-    Returns H (6, 6) and g (6,) of the step H d = -g, the number of points that found a shape, and the sum of
-    their distances.
+    Returns H (6, 6) and g (6,) of the step H d = -g, the number of points with a shape, and the sum of their
+    distances.
     """
     H, g = np.zeros((6, 6)), np.zeros(6)
     J = np.zeros((3, 6))

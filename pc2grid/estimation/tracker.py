@@ -1,18 +1,13 @@
-"""Tracking from scan to scan: what is expected, where the scan lies, the smoother, health.
+"""Tracking from scan to scan: predict, match, smooth, judge.
 
-Each source counts by what it measures. Odometry knows the motion to a few percent in every direction. A scan
-knows the pose to millimetres, but only across the surfaces that it shows. A sensor places a scan by itself
-(`SensorOnWheels` in the plane, `CarriedSensor` in space); the smoother weighs that against odometry and
-against the scans before.
+Each source counts by its information. Odometry measures the motion to a few percent in every direction. A
+scan fixes the pose to millimetres, but only across the surfaces that it shows. A matcher (`PlanarMatcher` on
+wheels, `SpatialMatcher` in the hand) matches the scan by itself; the smoother fuses that with odometry and
+with the scans before. `HealthJudge` judges the result by the fit of the scan with the local map.
 
-What the pose of a scan is worth: by how the scan fits the local map.
-
-What odometry reports from scan to scan, and whether that can be.
-
-Where the scans overruled odometry.
-
-Wheels slip, and odometry of real robots comes late, bunched or repeated. The scans then show another motion,
-and tracking follows them; the poses are fine, but a user wants to know where and how often that was so.
+`Odometer` compares odometry with the scans. Wheels slip, and odometry of real robots comes late, bunched or
+repeated. The scans then show another motion, and tracking follows them: the poses are right, and the user is
+warned of where and how often odometry was an outlier (`check_odometry`).
 """
 
 from __future__ import annotations
@@ -28,200 +23,24 @@ import numpy as np
 from pc2grid.clouds.cloud import deskew, random_subset
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.estimation.line_map import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.estimation.placing import Placed, Placer, PlacingSensor
-from pc2grid.estimation.planar import SensorOnWheels
-from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, Belief, Evidence, Smoother
-from pc2grid.estimation.spatial import CarriedSensor
+from pc2grid.estimation.planar import PlanarMatcher
+from pc2grid.estimation.scan_matching import MatchedScan, MatchSelector, ScanMatcher
+from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, PoseWithCovariance, ScanFactors, Smoother
+from pc2grid.estimation.spatial import SpatialMatcher
 from pc2grid.geometry import F32, F64, SE2, invert_pose, motion_size
-from pc2grid.model import Health, OdometryCheck, Overruled, RegisteredScan, Scan
+from pc2grid.model import Health, OdometryCheck, OdometryOutlier, RegisteredScan, Scan
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
-
-
-class HealthJudge:
-    """Judges each scan, and counts the lost ones in a row."""
-
-    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
-        self._parameters = parameters
-        self._lost_scans = 0
-
-    def judge(self, placed: Placed, unaided: Belief | None, *, bridged: bool) -> Health:
-        """Judge a scan by where it was placed.
-
-        unaided : what is known of the pose of a sensor in the hand by scans alone; None on wheels, which do
-        not slip along a wall, and with odometry. bridged : odometry goes on from the scan before.
-
-        A scan that fits is FINE; DEGENERATE if one direction of its position is not determined; LOST if a
-        direction of an unaided pose is not known. One that does not fit is DEGENERATE, too, where odometry
-        tells where it is from a scan that was not lost; else LOST.
-        """
-        p, (sigma_m, sigma_rad) = self._parameters, (0.0, 0.0) if unaided is None else unaided.sigmas
-        fits = placed.first or placed.alone is not None
-        if fits and sigma_m <= p.known_m and sigma_rad <= p.known_rad:
-            self.restart()
-            return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
-        if bridged and not self._lost_scans:
-            return Health.DEGENERATE
-        if fits:  # a pose that fits anywhere along a wall does not become known by waiting
-            return self.give_up()
-        self._lost_scans += 1
-        return Health.LOST
-
-    @property
-    def gives_up(self) -> bool:
-        """Whether tracking must start again: so many scans in a row were lost."""
-        return self._lost_scans > self._parameters.give_up_scans
-
-    def give_up(self) -> Health:
-        """Start tracking again at once: the scan is lost."""
-        self._lost_scans += self._parameters.give_up_scans + 1
-        return Health.LOST
-
-    def restart(self) -> None:
-        """Start to count again."""
-        self._lost_scans = 0
-
-
-class Standstill:
-    """Notices that the walls have changed for good while odometry stood still, as after a ride in a lift.
-
-    Walls that come back, while the base stands or when it leaves, have not changed.
-    """
-
-    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
-        self._parameters = parameters
-        self._known: tuple[int, F64] | None = None  # stamp and T_odom_base of the last scan that fits well
-
-    def left(self, scan: Scan, *, sure: bool) -> bool:
-        """Take in the next scan; returns whether the base leaves a place whose walls have changed.
-
-        sure : it fits the local map well; not so the first scan of a map, which fits in any case. Where no
-        scan has fitted well yet, as behind glass, nothing can be said to have changed.
-        """
-        T_odom_base = scan.T_odom_base
-        if sure and T_odom_base is not None:
-            self._known = scan.stamp_ns, T_odom_base
-        known = self._known
-        if sure or known is None or T_odom_base is None:
-            return False
-        p, (distance_m, turn_rad) = self._parameters, motion_size(invert_pose(known[1]) @ T_odom_base)
-        if distance_m <= p.standing_m and turn_rad <= p.standing_rad:
-            return False
-        self._known = scan.stamp_ns, T_odom_base
-        return (scan.stamp_ns - known[0]) * 1e-9 > p.changed_s
-
-
-class Odometer:
-    """Remembers the last reading, and the pose of the base then. begin_ns : stamp of the first scan."""
-
-    def __init__(self, begin_ns: int = 0, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
-        self._parameters, self._begin_ns = parameters, begin_ns
-        self._scans = 0
-        self._last: tuple[F64, F64] | None = None  # T_odom_base and T_session_base
-
-    def remember(self, scan: Scan, pose: F64) -> None:
-        """Keep the reading of a scan, if it has one, with its final pose (4, 4)."""
-        self._scans += 1
-        if scan.T_odom_base is not None:
-            self._last = scan.T_odom_base, pose
-
-    def reported(self, scan: Scan) -> F64 | None:
-        """The motion (4, 4) since the last reading; None if there is none."""
-        if scan.T_odom_base is None or self._last is None:
-            return None
-        return invert_pose(self._last[0]) @ scan.T_odom_base
-
-    def continues(self, scan: Scan, seconds: float) -> bool:
-        """Whether odometry goes on from where it was last known; `seconds` since the last scan.
-
-        It does not if it reports an impossible motion, nor over a gap in which the log has neither scans nor
-        readings: its driver may have been restarted meanwhile. Nor does its first reading: odometry may begin
-        after the first scan, anywhere.
-        """
-        if scan.T_odom_base is None:
-            return True
-        reported = self.reported(scan)
-        usual_s = (scan.stamp_ns - self._begin_ns) * 1e-9 / max(self._scans, 1)
-        gap = min(seconds, scan.odometry_gap_s) > self._parameters.gap * usual_s
-        return reported is not None and not gap and self.is_possible(reported, seconds)
-
-    def is_possible(self, motion: F64, seconds: float) -> bool:
-        """Whether a robot or a person indoors can make a motion (4, 4) in a time."""
-        p, (distance_m, turn_rad) = self._parameters, motion_size(motion)
-        return max(distance_m, turn_rad) <= p.jump + p.fastest * seconds
-
-    def disagreement(self, scan: Scan, pose: F64) -> Disagreement | None:
-        """By how much the reported motion differs from that to the final pose (4, 4) of a scan."""
-        reported = self.reported(scan)
-        if reported is None or self._last is None:
-            return None
-        return disagreement(reported, invert_pose(self._last[1]) @ pose)
-
-
-_INEXACT_M, _INEXACT_RAD, _INEXACT_SHARE = 0.1, 0.1, 0.1
-"""Odometry that differs by less, or by less than this share of the motion, is merely inexact; by hand."""
-_TOGETHER_NS = 10**9
-"""Overruled scans that follow each other within this time are one stretch; chosen by hand."""
-_SHOWN = 20
-"""Stretches that are kept."""
-
-
-@dataclass(frozen=True, slots=True)
-class Disagreement:
-    """By how much the motion to a scan that odometry reports differs from that which the scan shows.
-
-    distance_m, turn_rad : size of the difference. overrules : whether it is more than odometry that is merely
-        inexact explains.
-    """
-
-    distance_m: float
-    turn_rad: float
-    overrules: bool
-
-
-def disagreement(reported: F64, moved: F64) -> Disagreement:
-    """By how much the motion (4, 4) that odometry reports differs from that of the poses."""
-    distance_m, turn_rad = motion_size(invert_pose(reported) @ moved)
-    (reported_m, reported_rad), (moved_m, moved_rad) = motion_size(reported), motion_size(moved)
-    overrules = distance_m > _INEXACT_M + _INEXACT_SHARE * max(
-        reported_m, moved_m
-    ) or turn_rad > _INEXACT_RAD + _INEXACT_SHARE * max(reported_rad, moved_rad)
-    return Disagreement(distance_m, turn_rad, overrules)
-
-
-def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None]) -> OdometryCheck:
-    """What the scans of a session say of its odometry.
-
-    disagreements : of each scan; None where there was nothing to compare.
-    """
-    compared = [(stamp, found) for stamp, found in zip(stamps_ns, disagreements, strict=True) if found]
-    overruled = [(stamp_ns, found) for stamp_ns, found in compared if found.overrules]
-    ends = np.flatnonzero(np.diff([stamp_ns for stamp_ns, _ in overruled]) > _TOGETHER_NS) + 1
-    cuts = [0, *ends.tolist(), len(overruled)]
-    stretches = [
-        Overruled(
-            from_ns=group[0][0],
-            to_ns=group[-1][0],
-            distance_m=max(found.distance_m for _, found in group),
-            turn_rad=max(found.turn_rad for _, found in group),
-        )
-        for group in (overruled[first:end] for first, end in itertools.pairwise(cuts) if first < end)
-    ]
-    stretches.sort(key=lambda s: (-(s.distance_m + s.turn_rad), s.from_ns))
-    return OdometryCheck(
-        compared=len(compared), overruled=len(overruled), stretches=tuple(stretches[:_SHOWN])
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tracked:
     """The result of tracking one scan.
 
-    registered : the scan, deskewed, with its pose and health.
-    planar_scan : the scan reduced to the plane.
-    keyframe : whether the robot had moved enough for the scan to become part of the local map.
-    restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
-    walls_changed : it was lost because the walls had changed while odometry stood still.
-    disagreement : of odometry with the pose; None for a lost scan, and where there is nothing to compare.
+    registered : the scan, deskewed, with its pose and health. planar_scan : the scan reduced to the plane.
+    keyframe : True if the robot had moved enough for the scan to become part of the local map. restart : the
+    first keyframe after tracking was lost: its pose relative to those before is unknown. walls_changed : it
+    was lost because the walls had changed while odometry stood still. disagreement : of odometry with the
+    pose; None for a lost scan, and where there is nothing to compare.
     """
 
     registered: RegisteredScan
@@ -233,7 +52,8 @@ class Tracked:
 
 
 class Tracker:
-    """Turns scans into poses and planar scans, one by one. Its memory is the size of two local maps.
+    """Tracks scans one by one: returns their poses and planar scans. Its memory is the size of two local
+    maps.
 
     The session frame is the base at the first scan, levelled: z up.
     """
@@ -246,7 +66,7 @@ class Tracker:
         *,
         in_hand: bool,
     ) -> None:
-        """in_hand : how the sensor is carried; `pc2grid.estimation.spatial.begin` finds it out."""
+        """Make a tracker. in_hand : see `pc2grid.estimation.spatial.begin`, which decides it."""
         self._config = registration
         self._parameters = parameters
         self._last: Scan | None = None
@@ -257,11 +77,11 @@ class Tracker:
         self._standstill = Standstill(parameters)
         self._in_hand = in_hand
         projection = projection or ProjectionConfig()
-        self._sensor: PlacingSensor
+        self._sensor: ScanMatcher
         if in_hand:
-            self._sensor = CarriedSensor(registration, projection)
+            self._sensor = SpatialMatcher(registration, projection)
         else:
-            self._sensor = SensorOnWheels(registration, projection, parameters)
+            self._sensor = PlanarMatcher(registration, projection, parameters)
         self._smoother = Smoother(self._sensor.free, IN_THE_HAND if in_hand else SMOOTHER)
         self._health = HealthJudge(parameters)
 
@@ -281,7 +101,7 @@ class Tracker:
         reading, reported = self._reading(scan), self._odometer.reported(scan)
         continues = self._odometer.continues(scan, seconds)
         # 1. What is expected: by odometry, or that the motion goes on. What is not plausible comes last.
-        steady = self._smoother.steady(seconds, turn := self._turn(scan))
+        steady = self._smoother.constant_velocity(seconds, turn := self._turn(scan))
         expected = [self._smoother.after(*steady)]
         if reading is not None and reported is not None:
             expected.insert(0 if continues else 1, self._smoother.by_odometry(reading))
@@ -289,9 +109,9 @@ class Tracker:
         motion = invert_pose(self._smoother.belief.pose) @ expected[0].pose
         points = self._deskewed(scan, motion, seconds)
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
-        placed = Placer(self._sensor, self._parameters).place(scan, points, expected)
+        placed = MatchSelector(self._sensor, self._parameters).place(scan, points, expected)
         between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
-        evidence = Evidence(seconds, reading, continues, placed.alone, between)
+        evidence = ScanFactors(seconds, reading, continues, placed.alone, between)
         estimate = self._estimated(placed, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
         health = self._judged(placed, estimate, evidence)
@@ -304,22 +124,24 @@ class Tracker:
             self._restart()
         return tracked
 
-    def _estimated(self, placed: Placed, evidence: Evidence) -> Belief:
-        """The pose of a scan by all that is known of it. Nothing ties a new local map to what was before."""
+    def _estimated(self, placed: MatchedScan, evidence: ScanFactors) -> PoseWithCovariance:
+        """Estimate the pose of a scan from its match and its factors. A new local map has no tie to the one
+        before.
+        """
         if not placed.first:
             return self._smoother.add(placed.pose, evidence)
         self._smoother.start(self._flat(placed.pose), evidence.T_odom_base, self._smoother.speed)
         return self._smoother.belief
 
-    def _judged(self, placed: Placed, estimate: Belief, evidence: Evidence) -> Health:
-        """What the pose of a scan is worth."""
+    def _judged(self, placed: MatchedScan, estimate: PoseWithCovariance, evidence: ScanFactors) -> Health:
+        """Judge the pose of a scan."""
         read = evidence.T_odom_base is not None
         bridged = placed.motion is not None or (read and evidence.continues)
         unaided = estimate if self._in_hand and not read else None
         return self._health.judge(placed, unaided, bridged=bridged)
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
-        """Extend the maps by a scan if it is worth it, and remember its final pose."""
+        """Extend the maps by a scan that is due, and keep its final pose."""
         lost = health is Health.LOST
         planar_scan = self._sensor.cut(scan, points, pose, lost=lost)
         keyframe = not lost and len(planar_scan.hits_m) > 0 and self._is_due(pose)
@@ -331,7 +153,7 @@ class Tracker:
         if keyframe:
             self._restarted = self._walls_changed = False
         found = None if lost else self._odometer.disagreement(scan, pose)
-        if health is Health.FINE and found is not None and found.overrules:
+        if health is Health.FINE and found is not None and found.is_outlier:
             health = Health.OVERRULED
         self._last = scan
         self._odometer.remember(scan, pose)
@@ -346,30 +168,32 @@ class Tracker:
         )
 
     def _is_due(self, pose: F64) -> bool:
-        """Whether the base has moved so far since the last keyframe that another one is worth it."""
+        """Return True if the base has moved enough since the last keyframe for another one."""
         if self._keyframe is None:
             return True
         p, step = self._parameters, self._keyframe.inverse() @ SE2.from_matrix(pose)
         return math.hypot(step.x, step.y) >= p.keyframe_travel_m or abs(step.yaw) >= p.keyframe_turn_rad
 
     def _restart(self) -> None:
-        """Forget the local maps; the poses go on from the last one."""
+        """Forget the local maps; the poses continue from the last one."""
         self._sensor.restart()
         self._health.restart()
         self._keyframe = None
         self._restarted = True
 
     def _flat(self, pose: F64) -> F64:
-        """A pose (4, 4) in the directions that are free: on wheels those of the plane."""
+        """Return a pose (4, 4) in the free directions: on wheels those of the plane."""
         return pose if self._in_hand else SE2.from_matrix(pose).lift()
 
     def _reading(self, scan: Scan) -> F64 | None:
-        """The reading (4, 4) of odometry at a scan."""
+        """Return the reading (4, 4) of odometry at a scan, or None."""
         return None if scan.T_odom_base is None else self._flat(scan.T_odom_base)
 
     def _turn(self, scan: Scan) -> F64 | None:
-        """The turn (4, 4) of a sensor in the hand since the last scan, by its IMU; None if that is not known,
-        and beside odometry."""
+        """Return the turn (4, 4) of a sensor in the hand since the last scan, by its IMU.
+
+        None if that is not known, and beside odometry.
+        """
         before = None if self._last is None else self._last.T_level_base
         unaided = self._in_hand and scan.T_odom_base is None
         if not unaided or before is None or scan.T_level_base is None:
@@ -377,10 +201,10 @@ class Tracker:
         return invert_pose(before) @ scan.T_level_base
 
     def _deskewed(self, scan: Scan, motion: F64, seconds: float) -> F32:
-        """The points (N, 3) of a scan that are used, without the motion while it was taken.
+        """Return the points (N, 3) of a scan that are used, without the motion while it was taken.
 
-        motion : (4, 4) expected since the scan before, `seconds` ago. It counts only where odometry says
-        nothing of the time of the scan itself, since a turn begins and ends within a scan.
+        motion : (4, 4) expected since the scan before, `seconds` ago. It is used only if odometry does not
+        cover the time of the scan itself, since a turn begins and ends within a scan.
         """
         away = scan.points_m - scan.T_base_sensor[:3, 3].astype(np.float32)
         keep = np.flatnonzero(np.einsum("ij,ij->i", away, away) >= self._config.min_range_m**2)
@@ -396,3 +220,178 @@ class Tracker:
                 within[:3, 3] = motion[:3, 3] * span_s / seconds
             motion, seconds = within, span_s
         return deskew(points, offsets, motion, seconds)
+
+
+class HealthJudge:
+    """Judges each scan, and counts the lost ones in a row."""
+
+    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters = parameters
+        self._lost_scans = 0
+
+    def judge(self, placed: MatchedScan, unaided: PoseWithCovariance | None, *, bridged: bool) -> Health:
+        """Judge a scan by its match.
+
+        unaided : the pose of a sensor in the hand without odometry, with its covariance; None on wheels,
+        which do not slip along a wall, and with odometry. bridged : odometry continues from the scan before.
+
+        A scan that fits is FINE; DEGENERATE if one direction of its position is not determined; LOST if a
+        direction of an unaided pose is not known. One that does not fit is also DEGENERATE if odometry gives
+        its pose from a scan that was not lost; else LOST.
+        """
+        p, (sigma_m, sigma_rad) = self._parameters, (0.0, 0.0) if unaided is None else unaided.sigmas
+        fits = placed.first or placed.alone is not None
+        if fits and sigma_m <= p.known_m and sigma_rad <= p.known_rad:
+            self.restart()
+            return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
+        if bridged and not self._lost_scans:
+            return Health.DEGENERATE
+        if fits:  # a pose that fits anywhere along a wall does not become known by waiting
+            return self.give_up()
+        self._lost_scans += 1
+        return Health.LOST
+
+    @property
+    def gives_up(self) -> bool:
+        """Return True if tracking must start again, after so many lost scans in a row."""
+        return self._lost_scans > self._parameters.give_up_scans
+
+    def give_up(self) -> Health:
+        """Start tracking again at once: the scan is lost."""
+        self._lost_scans += self._parameters.give_up_scans + 1
+        return Health.LOST
+
+    def restart(self) -> None:
+        """Start to count again."""
+        self._lost_scans = 0
+
+
+class Standstill:
+    """Detects that the walls have changed while odometry stood still, as after a ride in a lift.
+
+    Walls that come back, while the base stands or when it leaves, have not changed.
+    """
+
+    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters = parameters
+        self._known: tuple[int, F64] | None = None  # stamp and T_odom_base of the last scan that fits well
+
+    def left(self, scan: Scan, *, sure: bool) -> bool:
+        """Update with the next scan; returns True if the base leaves a place whose walls have changed.
+
+        sure : True if the scan fits the local map well; False for the first scan of a map, which fits in any
+        case. If no scan has fitted well yet, as behind glass, a change cannot be detected.
+        """
+        T_odom_base = scan.T_odom_base
+        if sure and T_odom_base is not None:
+            self._known = scan.stamp_ns, T_odom_base
+        known = self._known
+        if sure or known is None or T_odom_base is None:
+            return False
+        p, (distance_m, turn_rad) = self._parameters, motion_size(invert_pose(known[1]) @ T_odom_base)
+        if distance_m <= p.standing_m and turn_rad <= p.standing_rad:
+            return False
+        self._known = scan.stamp_ns, T_odom_base
+        return (scan.stamp_ns - known[0]) * 1e-9 > p.changed_s
+
+
+class Odometer:
+    """Keeps the last reading, and the pose of the base then. begin_ns : stamp of the first scan."""
+
+    def __init__(self, begin_ns: int = 0, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
+        self._parameters, self._begin_ns = parameters, begin_ns
+        self._scans = 0
+        self._last: tuple[F64, F64] | None = None  # T_odom_base and T_session_base
+
+    def remember(self, scan: Scan, pose: F64) -> None:
+        """Keep the reading of a scan, if it has one, with its final pose (4, 4)."""
+        self._scans += 1
+        if scan.T_odom_base is not None:
+            self._last = scan.T_odom_base, pose
+
+    def reported(self, scan: Scan) -> F64 | None:
+        """Return the motion (4, 4) since the last reading; None if there is none."""
+        if scan.T_odom_base is None or self._last is None:
+            return None
+        return invert_pose(self._last[0]) @ scan.T_odom_base
+
+    def continues(self, scan: Scan, seconds: float) -> bool:
+        """Return True if odometry continues from its last reading; `seconds` since the last scan.
+
+        It does not after an impossible motion, nor over a gap in which the log has neither scans nor
+        readings: its driver may have been restarted meanwhile. Nor does its first reading: odometry may begin
+        after the first scan, anywhere.
+        """
+        if scan.T_odom_base is None:
+            return True
+        reported = self.reported(scan)
+        usual_s = (scan.stamp_ns - self._begin_ns) * 1e-9 / max(self._scans, 1)
+        gap = min(seconds, scan.odometry_gap_s) > self._parameters.gap * usual_s
+        return reported is not None and not gap and self.is_possible(reported, seconds)
+
+    def is_possible(self, motion: F64, seconds: float) -> bool:
+        """Return True if a robot or a person indoors can make a motion (4, 4) in a time."""
+        p, (distance_m, turn_rad) = self._parameters, motion_size(motion)
+        return max(distance_m, turn_rad) <= p.jump + p.fastest * seconds
+
+    def disagreement(self, scan: Scan, pose: F64) -> Disagreement | None:
+        """Compare the reported motion with the one to the final pose (4, 4) of a scan."""
+        reported = self.reported(scan)
+        if reported is None or self._last is None:
+            return None
+        return disagreement(reported, invert_pose(self._last[1]) @ pose)
+
+
+_INEXACT_M, _INEXACT_RAD, _INEXACT_SHARE = 0.1, 0.1, 0.1
+"""Odometry that differs by less, or by less than this share of the motion, is merely inexact; by hand."""
+_TOGETHER_NS = 10**9
+"""OdometryOutlier scans that follow each other within this time are one stretch; chosen by hand."""
+_SHOWN = 20
+"""Stretches that are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Disagreement:
+    """The difference between the motion to a scan as reported by odometry and as shown by the scan.
+
+    distance_m, turn_rad : size of the difference. is_outlier : True if it is larger than that of odometry
+    that is merely inexact.
+    """
+
+    distance_m: float
+    turn_rad: float
+    is_outlier: bool
+
+
+def disagreement(reported: F64, moved: F64) -> Disagreement:
+    """Compare the motion (4, 4) that odometry reports with that of the poses."""
+    distance_m, turn_rad = motion_size(invert_pose(reported) @ moved)
+    (reported_m, reported_rad), (moved_m, moved_rad) = motion_size(reported), motion_size(moved)
+    is_outlier = distance_m > _INEXACT_M + _INEXACT_SHARE * max(
+        reported_m, moved_m
+    ) or turn_rad > _INEXACT_RAD + _INEXACT_SHARE * max(reported_rad, moved_rad)
+    return Disagreement(distance_m, turn_rad, is_outlier)
+
+
+def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None]) -> OdometryCheck:
+    """Summarise the disagreements of a session with its odometry.
+
+    disagreements : of each scan; None where there was nothing to compare.
+    """
+    compared = [(stamp, found) for stamp, found in zip(stamps_ns, disagreements, strict=True) if found]
+    overruled = [(stamp_ns, found) for stamp_ns, found in compared if found.is_outlier]
+    ends = np.flatnonzero(np.diff([stamp_ns for stamp_ns, _ in overruled]) > _TOGETHER_NS) + 1
+    cuts = [0, *ends.tolist(), len(overruled)]
+    stretches = [
+        OdometryOutlier(
+            from_ns=group[0][0],
+            to_ns=group[-1][0],
+            distance_m=max(found.distance_m for _, found in group),
+            turn_rad=max(found.turn_rad for _, found in group),
+        )
+        for group in (overruled[first:end] for first, end in itertools.pairwise(cuts) if first < end)
+    ]
+    stretches.sort(key=lambda s: (-(s.distance_m + s.turn_rad), s.from_ns))
+    return OdometryCheck(
+        compared=len(compared), overruled=len(overruled), stretches=tuple(stretches[:_SHOWN])
+    )

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.estimation.line_map import Match, PointGrid, best_placements, evenly
+from pc2grid.estimation.line_map import LineMatch, PointGrid, best_placements, evenly
 from pc2grid.geometry import F64, I64, SE2, SUBPIXEL_BITS, polygon_corners
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField
@@ -143,7 +143,7 @@ class LocalMap:
             cv2.fillPoly(free, [corners], _FREE, shift=SUBPIXEL_BITS)
         return free
 
-    def match(self, points_m: F64, normal_rad: NDArray[np.floating], guess: SE2) -> Match:
+    def match(self, points_m: F64, normal_rad: NDArray[np.floating], guess: SE2) -> LineMatch:
         """Refine the pose of points (N, 2) with normals (N,) in this local map, from the points alone."""
         no_prior = np.zeros((3, 3))
         return self._grid.match(

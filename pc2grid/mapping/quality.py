@@ -41,7 +41,7 @@ from pc2grid.geometry import F64, I64, SE2, BoolGrid, wrap_angle
 from pc2grid.mapping.graph import Edge, WallDirection, information_matrix
 from pc2grid.mapping.keyframes import Keyframe
 from pc2grid.mapping.parts import PARTS
-from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory, UncertainStretch
+from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory, UncertainSegment
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -344,7 +344,7 @@ def precision_of(
         length_m = float(travel_m[last] - travel_m[first])
         if length_m >= PARTS.least_travel_m:
             found.append(
-                UncertainStretch(
+                UncertainSegment(
                     from_ns=int(stamps_ns[first]),
                     to_ns=int(stamps_ns[last]),
                     x_m=float(xy[scans[worst], 0]),

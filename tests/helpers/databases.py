@@ -23,13 +23,13 @@ from pc2grid.model import (
     Loop,
     OccupancyGrid,
     OdometryCheck,
-    Overruled,
+    OdometryOutlier,
     PointMap,
     Precision,
     ReadReport,
     SessionMap,
     Trajectory,
-    UncertainStretch,
+    UncertainSegment,
 )
 from pc2grid.submaps.submaps import view_at
 from signature.boundary import boundary_bins
@@ -86,7 +86,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
         odometry=OdometryCheck(
             compared=9,
             overruled=2,
-            stretches=(Overruled(from_ns=10**9, to_ns=2 * 10**9, distance_m=0.3, turn_rad=0.5),),
+            stretches=(OdometryOutlier(from_ns=10**9, to_ns=2 * 10**9, distance_m=0.3, turn_rad=0.5),),
         ),
         consistency=Consistency(
             hits_on_free=1 / 7,
@@ -107,7 +107,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
             stamps_ns=(int(trajectory.stamps_ns[0]), int(trajectory.stamps_ns[-1])),
             sigma_m=(0.05, 0.7),
             loose=(
-                UncertainStretch(
+                UncertainSegment(
                     from_ns=int(trajectory.stamps_ns[3]),
                     to_ns=int(trajectory.stamps_ns[-1]),
                     x_m=1 / 3,

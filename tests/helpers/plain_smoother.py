@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from pc2grid.estimation.line_map import steps
-from pc2grid.estimation.smoother import Smoother, State
+from pc2grid.estimation.smoother import Smoother, WindowState
 from pc2grid.geometry import F64, wrap_angle
 
 
@@ -44,7 +44,7 @@ def plain_equations(smoother: Smoother, few: int) -> tuple[F64, F64]:
     return H, g
 
 
-def changed(smoother: Smoother, state: State, by: F64) -> State:
+def changed(smoother: Smoother, state: WindowState, by: F64) -> WindowState:
     """The state after a change (U,) of its unknowns."""
     changes = np.zeros((2, len(state.poses), 6))
     changes[:, :, smoother._free] = by[4:].reshape(len(state.poses), 2, -1).swapaxes(0, 1)
@@ -56,7 +56,7 @@ def between(first: F64, second: F64) -> F64:
     return steps(first[None], second[None]).step[0]
 
 
-def factors(smoother: Smoother, state: State, few: int) -> list[Factor]:
+def factors(smoother: Smoother, state: WindowState, few: int) -> list[Factor]:
     """All factors at a state."""
     p, free, w, prior = smoother._parameters, smoother._free, smoother._window, smoother._prior
     found, n, about = [], len(state.poses), smoother._prior.about

@@ -12,7 +12,7 @@ import itertools
 import numpy as np
 import pytest
 
-from pc2grid.estimation.smoother import PLANAR, SMOOTHER, Belief, Evidence, Smoother
+from pc2grid.estimation.smoother import PLANAR, SMOOTHER, PoseWithCovariance, ScanFactors, Smoother
 from pc2grid.geometry import F64, SE2
 
 gtsam = pytest.importorskip("gtsam")
@@ -37,14 +37,14 @@ def drive(scans: int = 40) -> tuple[list[SE2], list[SE2], dict[int, SE2]]:
     return true, read, {k: true[k] @ SE2(*noise[k].tolist()) for k in range(SEEN_EVERY, scans, SEEN_EVERY)}
 
 
-def by_pc2grid(read: list[SE2], seen: dict[int, SE2]) -> Belief:
+def by_pc2grid(read: list[SE2], seen: dict[int, SE2]) -> PoseWithCovariance:
     """The last pose by the smoother, which forgets scans behind its lag."""
     smoother = Smoother(PLANAR, GAUSSIAN)
     smoother.start(np.eye(4), read[0].lift())
     for k in range(1, len(read)):
         match = (seen[k].lift(), MATCH) if k in seen else None
         guess = smoother.by_odometry(read[k].lift()).pose
-        smoother.add(guess, Evidence(0.1, read[k].lift(), match=match))
+        smoother.add(guess, ScanFactors(0.1, read[k].lift(), match=match))
     return smoother.belief
 
 

@@ -16,7 +16,7 @@ import pytest
 from pc2grid import pipeline
 from pc2grid.clouds.ground import level_floor
 from pc2grid.estimation.ground_model import is_rolling
-from pc2grid.estimation.spatial import CARRIED, begin, first_pose
+from pc2grid.estimation.spatial import SPATIAL_PARAMETERS, begin, first_pose
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import F64, invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io import open_log
@@ -305,7 +305,7 @@ def test_where_no_floor_comes_in_view_the_user_is_told() -> None:
     beginning = begin(iter(unaided))
     assert list(beginning.scans) == unaided and not beginning.left_out
     assert beginning.warning is not None and "taken to be held level" in beginning.warning
-    few = dataclasses.replace(CARRIED, most_waiting=3)
+    few = dataclasses.replace(SPATIAL_PARAMETERS, most_waiting=3)
     assert begin(iter(unaided), few).scans == unaided[:3]
     assert begin(iter(())).warning is None
 

@@ -9,7 +9,7 @@ import pytest
 
 from pc2grid.estimation.tracker import Disagreement, Tracker, check_odometry
 from pc2grid.geometry import SE2
-from pc2grid.model import Health, OdometryCheck, Overruled, Scan
+from pc2grid.model import Health, OdometryCheck, OdometryOutlier, Scan
 from pc2grid.settings import Config
 from pc2grid.simulate import SimulationConfig, prepare_session
 
@@ -27,8 +27,8 @@ def test_scans_that_follow_closely_are_one_stretch() -> None:
         compared=5,
         overruled=3,
         stretches=(
-            Overruled(from_ns=10**9, to_ns=2 * 10**9, distance_m=0.3, turn_rad=0.7),
-            Overruled(from_ns=35 * 10**8, to_ns=35 * 10**8, distance_m=0.3, turn_rad=0.1),
+            OdometryOutlier(from_ns=10**9, to_ns=2 * 10**9, distance_m=0.3, turn_rad=0.7),
+            OdometryOutlier(from_ns=35 * 10**8, to_ns=35 * 10**8, distance_m=0.3, turn_rad=0.1),
         ),
     )
     assert check_odometry([], []) == OdometryCheck()

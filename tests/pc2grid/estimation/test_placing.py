@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from pc2grid.estimation.placing import Fit, Placed, Placer
-from pc2grid.estimation.smoother import PLANAR, Belief
+from pc2grid.estimation.scan_matching import MatchedScan, MatchSelector, ScanMatch
+from pc2grid.estimation.smoother import PLANAR, PoseWithCovariance
 from pc2grid.geometry import F64, SE2
 from pc2grid.model import Scan
 
@@ -17,27 +17,27 @@ SCAN = Scan(stamp_ns=0, points_m=np.zeros((0, 3), np.float32), T_base_sensor=np.
 EXACT = np.diag([1e4, 1e4, 1e4])  # a centimetre
 
 
-def fit_at(x: float, *, evidence: float, fits: bool = True) -> Fit:
+def fit_at(x: float, *, evidence: float, fits: bool = True) -> ScanMatch:
     """A match at a place on the x axis; one that does not fit has half of its points on the map."""
     pose = SE2(x, 0.0, 0.0).lift()
     overlap = 0.9 if fits else 0.45
-    return Fit(
+    return ScanMatch(
         pose=pose, alone=(pose, EXACT), overlap=overlap, measured=True,
         evidence=evidence, credible=fits,
     )  # fmt: skip
 
 
-def expected(x: float, sigma: float) -> Belief:
+def expected(x: float, sigma: float) -> PoseWithCovariance:
     """A base at a place on the x axis, known to so many m and rad."""
-    return Belief(SE2(x, 0.0, 0.0).lift(), sigma**2 * np.eye(3), np.array(PLANAR))
+    return PoseWithCovariance(SE2(x, 0.0, 0.0).lift(), sigma**2 * np.eye(3), np.array(PLANAR))
 
 
 @dataclass
 class Sensor:
     """Its matches are given: near where it is expected, and by search."""
 
-    near: Fit
-    elsewhere: Sequence[Fit] = ()
+    near: ScanMatch
+    elsewhere: Sequence[ScanMatch] = ()
     searched: int = 0
     free = PLANAR
     ground = None
@@ -50,17 +50,17 @@ class Sensor:
 
     def take(self, *of_scan: object) -> None: ...
 
-    def match(self, belief: Belief) -> list[Fit]:
+    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
         return [self.near]
 
-    def search(self, belief: Belief) -> Iterator[Fit]:
+    def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         self.searched += 1
         yield from self.elsewhere
 
-    def held(self, fit: Fit) -> Fit:
+    def observable(self, fit: ScanMatch) -> ScanMatch:
         return fit
 
-    def follow(self, belief: Belief) -> None: ...
+    def follow(self, belief: PoseWithCovariance) -> None: ...
 
     def levelled(self, pose: F64) -> F64:
         return pose
@@ -72,8 +72,8 @@ class Sensor:
     def restart(self) -> None: ...
 
 
-def placed(sensor: Sensor, belief: Belief) -> Placed:
-    return Placer(sensor).place(SCAN, SCAN.points_m, [belief])  # type: ignore[arg-type]
+def placed(sensor: Sensor, belief: PoseWithCovariance) -> MatchedScan:
+    return MatchSelector(sensor).place(SCAN, SCAN.points_m, [belief])  # type: ignore[arg-type]
 
 
 def test_what_fits_where_it_is_expected_is_not_searched_for() -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from pc2grid.estimation import surface_map as kernels
 from pc2grid.estimation.line_map import weakest
-from pc2grid.estimation.smoother import SPATIAL, Belief
+from pc2grid.estimation.smoother import SPATIAL, PoseWithCovariance
 from pc2grid.estimation.surface_map import SurfaceMap
 from pc2grid.geometry import F64, invert_pose, motion_size, pose_from_rotation_vector, transform_points
 from pc2grid.settings import RegistrationConfig
@@ -15,9 +15,9 @@ from pc2grid.settings import RegistrationConfig
 EDGE_M = 0.15
 
 
-def held(pose: F64, sigma: float) -> Belief:
+def held(pose: F64, sigma: float) -> PoseWithCovariance:
     """A prior with one standard deviation, in metres and radians."""
-    return Belief(pose, sigma**2 * np.eye(6), np.array(SPATIAL))
+    return PoseWithCovariance(pose, sigma**2 * np.eye(6), np.array(SPATIAL))
 
 
 def corner(seed: int, faces: tuple[int, ...] = (0, 1, 2)) -> F64:
@@ -80,7 +80,7 @@ def test_what_only_seems_to_be_held_is_not() -> None:
         middle = second[(np.abs(second[:, 1]) < 0.7) | (second[:, 1] > 1.3)]  # not the ends of wall and floor
         surfaces, weights = seen(first), np.ones(len(middle))
         placed = surfaces.match(middle, weights, np.eye(4), held(np.eye(4), 1.0))
-        truly = surfaces.held(middle, weights, placed)
+        truly = surfaces.observable(middle, weights, placed)
         left = weakest(truly.information, 3) / weakest(placed.information, 3)
         return placed.measured, truly.measured, left
 
