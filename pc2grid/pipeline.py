@@ -1,4 +1,4 @@
-"""A recording becomes a session map: the point-cloud half from end to end."""
+"""From a recording to a session map: tracking, loop closure, drawing, and division into submaps."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ _SHARE_BEFORE_LOOPS = 0.8
 def follow(
     scans: Iterable[Scan], config: Config = Config(), observer: Observer = Observer()
 ) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
-    """Each scan with its pose, and its planar scan, as they come.
+    """Yield each scan with its pose, and its planar scan, as they come.
 
     The memory needed is that of one local map, however many scans there are.
 
-    observer : is warned of scans before the first that shows which way is up, which are left out
-        (`pc2grid.estimation.spatial.begin`).
+    observer : gets a warning of scans that are left out before the first that shows which way is up
+    (`pc2grid.estimation.spatial.begin`).
 
     >>> import pc2grid
     >>> with pc2grid.open_log("tuesday.mcap") as log:
@@ -91,12 +91,11 @@ def build_map(
 ) -> SessionMap:
     """Turn a recording, or the part of it that `span` names, into a map with submaps.
 
-    observer : gets the progress, and each scan with its tracked pose.
-    recognizer : finds loops that are farther off than the search near the tracked pose reaches.
-    Of a recording that does not hang together (see `build_maps`), the part with the longest travel is
-    returned, and its report says what is left out.
-    Raises NoScans if there is nothing to make a map from, TrackingLost if the scans of a laser, or of a
-    sensor in the hand, cannot be followed without odometry.
+    observer : gets the progress, and each scan with its tracked pose. recognizer : finds loops beyond the
+    reach of the search near the tracked pose. Of a recording in several parts (see `build_maps`), the one
+    with the longest travel is returned, and its report names the others. Raises NoScans if there is nothing
+    to make a map from, TrackingLost if the scans of a laser, or of a sensor in the hand, cannot be followed
+    without odometry.
 
     >>> import pc2grid
     >>> with pc2grid.open_log("monday.mcap") as log:
@@ -121,10 +120,10 @@ def build_maps(
 ) -> tuple[SessionMap, ...]:
     """Turn a recording into a map, or into several if its parts cannot be placed to each other.
 
-    That is so where tracking was lost, and no loop joins what lies before and after
-    (`pc2grid.mapping.parts`). The first map has the name `session`, the
-    others `session#2`, `session#3`, ...; each has its own frame, the base at its first scan. The first map's
-    report also holds the counts of the whole recording.
+    A part ends where tracking was lost, unless a loop joins the scans before and after
+    (`pc2grid.mapping.parts`). The first map has the name `session`, the others `session#2`, `session#3`, ...;
+    each has its own frame, the base at its first scan. The first map's report also holds the counts of the
+    whole recording.
 
     Parameters and errors are those of `build_map`.
 
@@ -162,7 +161,7 @@ def build_maps(
 def _divided(
     part: SessionMap, report: ReadReport, *, session: str, sensor: SensorKind, config: PartitionConfig
 ) -> SessionMap:
-    """The map of a part under its name, cut into submaps."""
+    """Return the map of a part under its name, divided into submaps."""
     graph, submaps = divide(part.grid, config)
     return dataclasses.replace(
         part, session=session, sensor=sensor, submaps=submaps, graph=graph, report=report
@@ -170,9 +169,9 @@ def _divided(
 
 
 def longest_of(maps: Sequence[SessionMap]) -> SessionMap:
-    """The map with the longest travel of those of a recording, under the name of the recording.
+    """Return the map with the longest travel of those of a recording, under the name of the recording.
 
-    Its report is that of the whole recording, and says which maps are left out.
+    Its report is that of the whole recording, and names the maps that are left out.
     """
     longest = max(maps, key=lambda part: part.trajectory.length_m)
     if len(maps) == 1:
@@ -192,10 +191,10 @@ def map_scans(
     observer: Observer = Observer(),
     recognizer: PlaceRecognizer | None = None,
 ) -> tuple[OccupancyGrid, Trajectory, tuple[Loop, ...]]:
-    """Grid and trajectory of scans, and the loops that were found; never divided as by `build_maps`.
+    """Return the grid and trajectory of scans, and their loops; never divided as by `build_maps`.
 
-    observer : gets each scan with its tracked pose, before loops are closed.
-    recognizer : finds loops that are farther off than the search near the tracked pose reaches.
+    observer : gets each scan with its tracked pose, before loops are closed. recognizer : finds loops beyond
+    the reach of the search near the tracked pose.
 
     Only the pose of a scan stays in memory. The planar scan of a keyframe waits in a temporary file. So
     memory grows with the mapped area, not with the length of the recording. A robot that stands still adds
@@ -219,8 +218,8 @@ def _map(
     *,
     whole: bool = False,
 ) -> tuple[list[SessionMap], Track]:
-    """Track the scans, close the loops, and draw a map of each part; see `build_maps`. Returns what tracking
-    says, too.
+    """Track the scans, close the loops, and draw a map of each part, see `build_maps`; returns also the
+    track.
 
     whole : all scans are one part.
     """

@@ -1,28 +1,23 @@
-"""Sparse least squares over planar poses with robust edges.
+"""The pose graph in the plane, with two more sources of evidence: the axes of the building, and level floors.
 
-The manifold Gauss-Newton of Grisetti et al., "A tutorial on graph-based SLAM" (2010), section IV. Cauchy
-weights tell which of the edges that may be wrong are right, and those solve the graph. In the plane it needs
-3 numbers a pose where Open3D's optimiser has 6, uses each edge's information as it was measured, and needs no
-Open3D for a 2D laser.
-It was measured against Open3D's `global_optimization` (`docs/method.md`).
+`optimise` is sparse least squares over planar poses with robust edges: the manifold Gauss-Newton of Grisetti
+et al., "A tutorial on graph-based SLAM" (2010), section IV. Cauchy weights decide which of the edges that may
+be wrong are right, and those solve the graph. In the plane it needs 3 numbers a pose where Open3D's optimiser
+has 6, uses each edge's information as it was measured, and needs no Open3D for a 2D laser. It was compared
+with Open3D's `global_optimization` (`docs/method.md`).
 
-The axes of a building as a compass: most walls meet at right angles.
+Loops fix the headings at places that are visited twice. Along a corridor that is driven once nothing does,
+and an error of one degree moves its far end by 1.7 m in 100 m. As far as a building is right-angled, its
+walls give the heading (the Manhattan world of Coughlan and Yuille, 1999; in a pose graph: Peasley et al.,
+"Accurate on-line 3D occupancy grids using Manhattan world constraints", 2012). Each local map contributes the
+direction of its walls modulo 90 degrees, weakly and robustly: walls of other directions are either not
+concentrated (curved walls) or farther from the axes than the robust scale (a wing at another angle), and lose
+their weight. Loops and tracked steps are ten times as exact and decide wherever there are any.
 
-Loops tie a heading to the places that are seen twice. Along a corridor that is driven once nothing does, and
-an error of one degree moves its far end by 1.7 m in 100 m. The walls themselves show the direction, as far as
-the building is right-angled (the Manhattan world of Coughlan and Yuille, 1999; in a pose graph: Peasley et
-al., "Accurate on-line 3D occupancy grids using Manhattan world constraints", 2012).
-
-Each local map contributes the direction of its walls modulo 90 degrees, weakly and robustly: what a building
-with other angles shows is either not concentrated (curved walls) or farther from the axes than the robust
-scale (a wing at another angle), and loses its weight. The loops and the tracked steps, which are ten times
-as exact, decide wherever they say anything.
-
-The heights of a session's keyframes: one recording is one floor, and a floor is level.
-
-A pose in space drifts in height as it does in the plane. For gravity-aligned poses height is independent of
-x, y and yaw, so it is a least-squares problem of its own, and a linear one: steps of tracking between
-keyframes, the height above the floor where that is seen, and the heights of loops.
+The heights of keyframes drift as their positions do. For gravity-aligned poses height is independent of x, y
+and yaw, so `optimised_heights` is a linear least-squares problem of its own: steps of tracking between
+keyframes, the height above the floor where it is visible, and the heights of loops. One recording is one
+floor, and a floor is level.
 """
 
 from __future__ import annotations
@@ -49,9 +44,9 @@ class PoseGraphParameters:
     damping : added to the diagonal of the normal equations, so that they can always be solved.
     robust_sigmas : standard deviations at which a loop edge has half of its weight.
     annealing : factor by which the robust scale of loops shrinks in each iteration.
-    kept : share of its weight with which a loop still counts in full, when the graph is solved again: that
-        which is left at a chi-square of three `robust_sigmas` squared, 27. Of true loops, which have three
-        degrees of freedom, six in a million are farther off.
+    kept : share of its weight with which a loop still counts in full when the graph is solved again: the
+    weight at a chi-square of three `robust_sigmas` squared, 27. Of true loops, which have three degrees of
+    freedom, six in a million are farther off.
     """
 
     iterations: int = 25
@@ -69,8 +64,8 @@ POSE_GRAPH = PoseGraphParameters()
 class Edge:
     """A measured relative pose T_first_second with its information (3, 3) in the first pose's axes.
 
-    loop : whether the measurement may be wrong altogether; its weight is then robust. counts : how much of
-    its information it has kept, 0..1, as one at the edge of being a loop.
+    loop : True if the measurement may be wrong altogether; its weight is then robust. counts : weight, 0..1,
+    that is already a factor of the information; less than 1 for a doubtful overlap.
     """
 
     first: int
@@ -99,18 +94,17 @@ def optimise(
     walls: Sequence[WallDirection] | None = None,
     parameters: PoseGraphParameters = POSE_GRAPH,
 ) -> Solution:
-    """The poses (N, 3) that agree best with the edges; the first pose stays where it is.
+    """Optimise poses (N, 3) so that they agree best with the edges; the first pose is fixed.
 
-    walls : of each pose, where the building's axes constrain the headings; see
-        `pc2grid.mapping.graph`.
+    walls : of each pose, if the building's axes constrain the headings.
 
-    First, Cauchy weights say which loops agree. The robust scale of a loop that contradicts the poses starts
-    so large that it has half of its weight, and shrinks to its final value during the iterations (graduated
-    non-convexity, Yang et al. 2020): large drift is taken out by loops that agree, and a false loop is
-    outvoted. But together false loops still pull, each by the inverse of its error. So the graph is solved
-    again with fixed weights. A loop that has kept `kept` of its weight counts in full; beyond, its pull falls
-    with the fifth power of its error. There is no edge of being dropped at which a map would hang on the last
-    bit of a number.
+    First, Cauchy weights find the loops that agree. The robust scale of a loop that contradicts the poses
+    starts so large that it has half of its weight, and shrinks to its final value during the iterations
+    (graduated non-convexity, Yang et al. 2020): loops that agree correct large drift, and outvote a false
+    loop. But false loops together still pull, each by the inverse of its error. So the graph is solved again
+    with fixed weights. A loop that has kept `kept` of its weight counts in full; beyond, its pull falls with
+    the fifth power of its error. The weight has no step, at which the last bit of a number would decide on
+    the map.
     """
     poses = np.array(poses, dtype=np.float64)
     if not edges or len(poses) < 2:
@@ -152,7 +146,7 @@ def _normal_equations(
     error: F64,
     walls: Sequence[WallDirection] | None,
 ) -> tuple[csc_matrix, F64]:
-    """The matrix (3 N, 3 N) and the gradient (3 N,) of edges and of the building's axes.
+    """Return the matrix (3 N, 3 N) and the gradient (3 N,) of edges and of the building's axes.
 
     rows : (E, 6) unknowns of each edge. JtO : (E, 6, 3) transposed Jacobian times information.
     """
@@ -169,9 +163,10 @@ def _normal_equations(
 def information_matrix(
     poses: F64, edges: Sequence[Edge], walls: Sequence[WallDirection] | None = None
 ) -> coo_matrix:
-    """The information matrix (3 N, 3 N) of poses (N, 3), sparse: x, y, yaw of one pose after the other.
+    """Return the information matrix (3 N, 3 N) of poses (N, 3), sparse: x, y, yaw of one pose after the
+    other.
 
-    It leaves open where the whole lies. walls : as for `optimise`.
+    It does not constrain the pose of the whole. walls : as for `optimise`.
     """
     i, j, measured, information = _arrays(edges)
     _, jacobian = _linearise(poses, i, j, measured)
@@ -183,31 +178,32 @@ def information_matrix(
 
 
 def _of_edges(information: F64, rows: NDArray[np.intp], count: int) -> coo_matrix:
-    """The information matrix (3 N, 3 N) of edges, (E, 6, 6), between their unknowns (E, 6); N: `count`."""
+    """Return the information matrix (3 N, 3 N) of edges, (E, 6, 6), between their unknowns (E, 6). count :
+    N."""
     row, column = np.repeat(rows, 6, axis=1).ravel(), np.tile(rows, (1, 6)).ravel()
     return coo_matrix((information.ravel(), (row, column)), shape=(3 * count, 3 * count))
 
 
 def _of_headings(information: F64) -> coo_matrix:
-    """The information matrix (3 N, 3 N) of headings that are known with `information` (N,)."""
+    """Return the information matrix (3 N, 3 N) of headings with `information` (N,)."""
     yaw = 3 * np.arange(len(information)) + 2
     return coo_matrix((information, (yaw, yaw)), shape=(3 * len(yaw), 3 * len(yaw)))
 
 
 def _arrays(edges: Sequence[Edge]) -> tuple[NDArray[np.intp], NDArray[np.intp], F64, F64]:
-    """Of edges: first (E,) and second (E,) poses, measured steps (E, 3), information (E, 3, 3)."""
+    """Return first (E,) and second (E,) poses of edges, measured steps (E, 3) and information (E, 3, 3)."""
     i, j = np.array([(e.first, e.second) for e in edges]).T
     measured = np.array([(e.T_first_second.x, e.T_first_second.y, e.T_first_second.yaw) for e in edges])
     return i, j, measured, np.array([e.information for e in edges])
 
 
 def _unknowns(i: NDArray[np.intp], j: NDArray[np.intp]) -> NDArray[np.intp]:
-    """The numbers (E, 6) of the coordinates of both poses of each edge among those of all poses."""
+    """Return the numbers (E, 6) of the coordinates of both poses of each edge among those of all poses."""
     return np.stack((3 * i, 3 * i + 1, 3 * i + 2, 3 * j, 3 * j + 1, 3 * j + 2), axis=1)
 
 
 def _linearise(poses: F64, i: NDArray[np.intp], j: NDArray[np.intp], measured: F64) -> tuple[F64, F64]:
-    """Errors (E, 3) and Jacobians (E, 3, 6) with respect to both poses of each edge."""
+    """Return errors (E, 3) and Jacobians (E, 3, 6) with respect to both poses of each edge."""
     a, b = poses[i], poses[j]
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
@@ -224,14 +220,14 @@ def _linearise(poses: F64, i: NDArray[np.intp], j: NDArray[np.intp], measured: F
 
 
 def between(a: F64, b: F64) -> F64:
-    """T_a_b (N, 3) of poses (N, 3) in one frame: x, y, yaw."""
+    """Return T_a_b (N, 3) of poses (N, 3) in one frame: x, y, yaw."""
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
     return np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]))
 
 
 def compose(a: F64, b: F64) -> F64:
-    """Poses (N, 3) `b`, given in the frames of poses (N, 3) `a`, in the frame of these."""
+    """Compose poses: return `b` (N, 3), given in the frames of `a` (N, 3), in the frame of these."""
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     return np.column_stack(
         (a[:, 0] + c * b[:, 0] - s * b[:, 1], a[:, 1] + s * b[:, 0] + c * b[:, 1], a[:, 2] + b[:, 2])
@@ -260,10 +256,10 @@ AXES = AxesParameters()
 
 @dataclass(frozen=True, slots=True)
 class WallDirection:
-    """In which direction the walls of a local map run, modulo 90 degrees.
+    """The direction of the walls of a local map, modulo 90 degrees.
 
-    direction_rad : in the frame of the local map, within 45 degrees of its x axis. concentration : 0 where
-    all directions are as frequent, 1 where all walls are parallel or at right angles.
+    direction_rad : in the frame of the local map, within 45 degrees of its x axis. concentration : 0 if all
+    directions are equally frequent, 1 if all walls are parallel or at right angles.
     """
 
     direction_rad: float
@@ -271,7 +267,7 @@ class WallDirection:
 
 
 def wall_direction(normal_rad: NDArray[np.floating]) -> WallDirection:
-    """The direction of the walls with normals (N,); without a wall, of concentration 0."""
+    """Return the direction of the walls with normals (N,); without a wall, of concentration 0."""
     if not len(normal_rad):
         return WallDirection(0.0, 0.0)
     # Four times an angle is the same for directions that differ by right angles.
@@ -282,10 +278,10 @@ def wall_direction(normal_rad: NDArray[np.floating]) -> WallDirection:
 def pull_to_axes(
     yaw_rad: F64, walls: Sequence[WallDirection], parameters: AxesParameters = AXES
 ) -> tuple[F64, F64]:
-    """How far the walls of local maps with headings (N,) deviate from the axes, and what that counts.
+    """Return the deviation of the walls of local maps with headings (N,) from the axes, and its information.
 
-    Returns deviations (N,) in radians, within 45 degrees, by which the headings are too large, and their
-    robust information (N,) in 1 / rad^2 (weights of Geman and McClure). The axes are those of the local maps
+    Deviations (N,) are in radians, within 45 degrees, positive for headings that are too large; their robust
+    information (N,) is in 1 / rad^2 (weights of Geman and McClure). The axes are those of the local maps
     themselves.
     """
     direction = np.array([wall.direction_rad for wall in walls]) + yaw_rad
@@ -299,7 +295,7 @@ def pull_to_axes(
 
 
 def _from_axis(direction_rad: F64, axis_rad: float) -> F64:
-    """Directions (N,) relative to the nearest axis, from -45 to 45 degrees."""
+    """Return directions (N,) relative to the nearest axis, from -45 to 45 degrees."""
     return wrap_angle(4.0 * (direction_rad - axis_rad)) / 4.0
 
 
@@ -323,11 +319,11 @@ class FloorLevelParameters:
     around : keyframes on either side of the two of a loop whose points are compared.
     reach_m : the passes of a loop differ in height by no more. layer_m, cell_m : height and edge of the
         voxels in which they are. thin : layers that a column without a wall fills at most: floor, table and
-        ceiling. beside, stands_out : level surfaces make their meeting a peak, so many times as high as so
-        many layers beside it.
-    known_m : standard deviation of the first height; it counts where no floor is seen. lost_m : of a step
+        ceiling. beside, stands_out : the overlap of level surfaces is a peak over the heights, `stands_out`
+        times as high as `beside` layers away from it.
+    known_m : standard deviation of the first height; it matters where no floor is visible. lost_m : of a step
         where tracking was lost.
-    apart_from_m : floors of a map that lie so far apart are told.
+    apart_from_m : spread of the floors of a map above which there is a warning.
     """
 
     sigmas: float = 3.0
@@ -348,7 +344,7 @@ class FloorLevelParameters:
 FLOOR_LEVELS = FloorLevelParameters()
 
 
-def settled_heights(
+def optimised_heights(
     tracked_m: F64,
     travel_m: F64,
     above_floor_m: F64,
@@ -356,10 +352,10 @@ def settled_heights(
     loops: Sequence[HeightStep] = (),
     parameters: FloorLevelParameters = FLOOR_LEVELS,
 ) -> F64:
-    """The heights (K,) of keyframes above their one floor; without a floor, above any level.
+    """Return the heights (K,) of keyframes above their one floor; without a floor, above any level.
 
-    tracked_m : (K,) z as tracked. travel_m : (K,) metres of travel at each. above_floor_m : (K,) as seen, NaN
-    where no floor is. restarts : the keyframes before which tracking was lost.
+    tracked_m : (K,) z as tracked. travel_m : (K,) metres of travel at each. above_floor_m : (K,) as measured,
+    NaN where no floor is visible. restarts : the keyframes before which tracking was lost.
     """
     p, count = parameters, len(tracked_m)
     seen = np.flatnonzero(np.isfinite(above_floor_m))
@@ -396,7 +392,8 @@ def settled_heights(
 def rise_between(
     first_m: F64, second_m: F64, parameters: FloorLevelParameters = FLOOR_LEVELS
 ) -> float | None:
-    """By how much points (M, 3) must rise to meet others (N, 3); None if no level surface of both tells.
+    """Return the rise that brings points (M, 3) onto others (N, 3); None if no level surface of both fixes
+    it.
 
     first_m : the others. Floors, tables and ceilings meet at one height, walls at all.
     """
@@ -431,9 +428,10 @@ def rise_between(
 
 
 def floors_apart_m(heights_m: F64, above_floor_m: F64) -> float | None:
-    """Over which height the floor lies that keyframes at heights (K,) see, without the outer twentieths.
+    """Return the spread of the heights of the floor below keyframes at heights (K,), without the outer
+    twentieths.
 
-    None if none is seen.
+    None if no floor is visible.
     """
     floor_m = (heights_m - above_floor_m)[np.isfinite(above_floor_m)]
     if not len(floor_m):
@@ -443,7 +441,7 @@ def floors_apart_m(heights_m: F64, above_floor_m: F64) -> float | None:
 
 
 def floor_warning(apart_m: float | None, parameters: FloorLevelParameters = FLOOR_LEVELS) -> str | None:
-    """One sentence that says how far the floors of a map lie apart and what to do; None if they do not."""
+    """Return a warning with the spread of the floors of a map and what to do; None if there is none."""
     if apart_m is None or apart_m < parameters.apart_from_m:
         return None
     return (

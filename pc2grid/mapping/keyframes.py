@@ -1,14 +1,10 @@
-"""The planar scans that the map of a session is made of; those of a long session are kept in a file.
+"""What a session keeps while it is tracked: the pose of every scan, and the planar scan and points of
+keyframes.
 
-Records that wait in a temporary file, so that memory does not grow with the length of a session.
-
-The points in space of a session: those of its keyframes, kept until the loops are closed.
-
-A keyframe is reduced to one point a voxel and kept in a `Spool`, six bytes a point. When its final pose is
-known, it is added to the voxels of the session. So memory grows with the surfaces that were seen, and
-the file with the travel: 0.4 GB for an hour of a lidar at 0.5 m/s.
-
-The tracked scans of a session.
+Planar scans and points wait in a temporary file (`Spool`), so that memory does not grow with the length of a
+session. The points of a keyframe are reduced to one a voxel, six bytes each: 0.4 GB for an hour of a lidar at
+0.5 m/s. When the loops are closed they are added to the voxels of the session, so memory grows with the
+surfaces that were observed.
 """
 
 from __future__ import annotations
@@ -42,7 +38,8 @@ class Keyframe:
     """A planar scan that becomes part of the map, because the robot had moved since the one before.
 
     index : number of its scan in the session. T_session_base : as tracked, before loops are closed.
-    restart : the first keyframe after tracking was lost: its pose relative to those before is not measured.
+    restart : True for the first keyframe after tracking was lost: its pose relative to those before is not
+    measured.
     """
 
     index: int
@@ -86,11 +83,11 @@ class Keyframes:
         self._poses.extend((pose.x, pose.y, pose.yaw))
 
     def poses(self) -> F64:
-        """T_session_base of all as tracked, (K, 3): x, y, yaw."""
+        """Return T_session_base of all keyframes as tracked, (K, 3): x, y, yaw."""
         return np.array(self._poses).reshape(-1, 3)
 
     def pose(self, number: int) -> SE2:
-        """T_session_base of one as tracked."""
+        """Return T_session_base of a keyframe as tracked."""
         return SE2(*self._poses[3 * number : 3 * number + 3])
 
     def close(self) -> None:
@@ -99,51 +96,11 @@ class Keyframes:
 
 
 def grid_of(keyframes: Iterable[tuple[Keyframe, SE2]], projection: ProjectionConfig) -> OccupancyGrid:
-    """The occupancy grid of keyframes, each with the pose of its base in the frame of the grid."""
+    """Draw the occupancy grid of keyframes, each with the pose of its base in the frame of the grid."""
     builder = GridBuilder(projection)
     for keyframe, pose in keyframes:
         builder.add(keyframe.planar_scan, pose)
     return builder.grid()
-
-
-IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of the keyframes of a 2D laser
-
-
-class Spool:
-    """Byte strings in the order in which they were appended, read in any order.
-
-    More than `IN_MEMORY_BYTES` of them are written to a temporary file without a name: a killed process
-    leaves no file behind.
-
-    what : they are, for the user.
-    """
-
-    def __init__(self, what: str) -> None:
-        self._what = what
-        self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY_BYTES)  # noqa: SIM115
-        self._ends = array("q", [0])
-
-    def append(self, record: bytes) -> None:
-        """Add one. Raises OutputError if the disk is full."""
-        try:
-            self._file.seek(self._ends[-1])
-            self._file.write(record)
-            self._file.flush()
-        except OSError as error:
-            raise OutputError(
-                f"{tempfile.gettempdir()}: no room for the {self._what} of the map: {error.strerror}",
-                hint="set TMPDIR to a folder on a larger disk",
-            ) from error
-        self._ends.append(self._ends[-1] + len(record))
-
-    def __getitem__(self, number: int) -> bytes:
-        begin, end = self._ends[number], self._ends[number + 1]
-        self._file.seek(begin)
-        return self._file.read(end - begin)
-
-    def close(self) -> None:
-        """Delete the file."""
-        self._file.close()
 
 
 _STEPS = 32767  # of int16, from the origin of the base to the farthest point
@@ -176,7 +133,7 @@ class KeyframePoints:
         self._scans.append(index)
 
     def __getitem__(self, number: int) -> tuple[int, F32]:
-        """The number of a scan in the session, and its points (N, 3) in the base frame."""
+        """Return the number of a scan in the session, and its points (N, 3) in the base frame."""
         steps = np.frombuffer(self._clouds[number], "<i2").reshape(-1, 3)
         return self._scans[number], steps * np.float32(self._step_m)
 
@@ -184,16 +141,17 @@ class KeyframePoints:
         return (self[number] for number in range(len(self._scans)))
 
     def around(self, number: int, most: int, T_session_base: F64) -> F64:
-        """The points (M, 3) of a keyframe and some on either side, at the poses (N, 4, 4) of their scans."""
+        """Return the points (M, 3) of a keyframe and `most` on either side, at the poses (N, 4, 4) of their
+        scans."""
         near = range(max(number - most, 0), min(number + most + 1, len(self._scans)))
         return np.concatenate(
             [transform_points(T_session_base[k], m) for k, m in map(self.__getitem__, near)]
         )
 
     def registered(self, T_session_base: F64, chosen: BoolGrid | None = None) -> PointMap | None:
-        """The points at the poses (N, 4, 4) of their scans, one a voxel; None if there are none.
+        """Return the points at the poses (N, 4, 4) of their scans, one a voxel; None if there are none.
 
-        chosen : (N,) the scans to use; by default all.
+        chosen : (N,) mask of the scans to use; by default all.
         """
         cloud = VoxelCloud(self._voxel_m)
         for index, points_m in self:
@@ -218,7 +176,7 @@ class Track:
     trajectory : before loops are closed. disagreements : of odometry, at each scan. readings : (N, 4, 4) of
     odometry, NaN where there is none.
     walls_changed_ns : stamps of the scans before which the walls had changed while odometry stood still.
-    left_out : scans before the first of the trajectory. warning : why, or what was assumed of that.
+    left_out : number of scans before the first of the trajectory. warning : why, or an assumption about it.
     """
 
     trajectory: Trajectory
@@ -230,18 +188,19 @@ class Track:
 
     @property
     def with_odometry(self) -> bool:
-        """Whether any scan has an odometry pose."""
+        """Return True if any scan has an odometry pose."""
         return bool(np.isfinite(self.readings).any())
 
     @property
     def heights_m(self) -> F64:
-        """(N,) by odometry, as a base on wheels is tracked in the plane; without odometry as tracked."""
+        """Return the heights (N,) of odometry, as a base on wheels is tracked in the plane; without odometry
+        as tracked."""
         poses = self.readings if self.with_odometry else self.trajectory.T_session_base
         return poses[:, 2, 3]
 
 
 class TrackRecord:
-    """Collects a track scan by scan; of a scan it keeps the pose, the reading of odometry and the health."""
+    """Collects a track scan by scan: the pose, the reading of odometry and the health."""
 
     def __init__(self) -> None:
         self._stamps, self._poses, self._readings = array("q"), array("d"), array("d")
@@ -263,7 +222,7 @@ class TrackRecord:
         self._readings.extend((_NO_READING if scan.T_odom_base is None else scan.T_odom_base).ravel())
 
     def track(self, left_out: int, warning: str | None) -> Track:
-        """The track of all scans; `left_out` and `warning` as of a `Track`."""
+        """Return the track of all scans; `left_out` and `warning` as of a `Track`."""
         trajectory = Trajectory(
             stamps_ns=np.array(self._stamps, dtype=np.int64),
             T_session_base=np.frombuffer(self._poses).reshape(-1, 4, 4),
@@ -272,3 +231,43 @@ class TrackRecord:
         readings = np.frombuffer(self._readings).reshape(-1, 4, 4)
         changed_ns = tuple(self._walls_changed_ns)
         return Track(trajectory, self._disagreements, readings, changed_ns, left_out, warning)
+
+
+IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of the keyframes of a 2D laser
+
+
+class Spool:
+    """Byte strings in the order in which they were appended, read in any order.
+
+    More than `IN_MEMORY_BYTES` of them are written to a temporary file without a name: a killed process
+    leaves no file behind.
+
+    what : a word for the records, for error messages.
+    """
+
+    def __init__(self, what: str) -> None:
+        self._what = what
+        self._file = tempfile.SpooledTemporaryFile(max_size=IN_MEMORY_BYTES)  # noqa: SIM115
+        self._ends = array("q", [0])
+
+    def append(self, record: bytes) -> None:
+        """Add one. Raises OutputError if the disk is full."""
+        try:
+            self._file.seek(self._ends[-1])
+            self._file.write(record)
+            self._file.flush()
+        except OSError as error:
+            raise OutputError(
+                f"{tempfile.gettempdir()}: no room for the {self._what} of the map: {error.strerror}",
+                hint="set TMPDIR to a folder on a larger disk",
+            ) from error
+        self._ends.append(self._ends[-1] + len(record))
+
+    def __getitem__(self, number: int) -> bytes:
+        begin, end = self._ends[number], self._ends[number + 1]
+        self._file.seek(begin)
+        return self._file.read(end - begin)
+
+    def close(self) -> None:
+        """Delete the file."""
+        self._file.close()

@@ -1,4 +1,4 @@
-"""Local maps of a session: a few metres of travel, drawn as one rigid map that loops are closed on."""
+"""Local maps of a session: a few metres of travel, drawn as one rigid map on which loops are closed."""
 
 from __future__ import annotations
 
@@ -21,13 +21,11 @@ from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField
 class LocalMapParameters:
     """How a local map is drawn and matched. Chosen by hand; checked on the relations of fr079 and intel.
 
-    range_m : hits farther from the sensor are left out: they are too sparse to match.
-    cell_m : edge of a cell.
-    margin_m : free border around the points, at least the widest neighbourhood of `radii_cells`.
-    wall_m : a point this near an obstacle meets it.
-    radii_cells : neighbourhoods of the refinement, see `PointGrid.match`.
-    every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them add no new walls.
-    cached : local maps that stay in memory.
+    range_m : hits farther from the sensor are left out: they are too sparse to match. cell_m : edge of a
+    cell. margin_m : free border around the points, at least the widest neighbourhood of `radii_cells`. wall_m
+    : largest distance of a point that meets an obstacle. radii_cells : neighbourhoods of the refinement, see
+    `PointGrid.match`. every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them
+    add no new walls. cached : local maps that stay in memory.
 
     Of two local maps that are compared with each other:
 
@@ -35,9 +33,9 @@ class LocalMapParameters:
     min_observed : at least this share of the points of one of the two must lie in cells that the other one
         observed.
     min_agreement : share of those that must meet an obstacle instead of free space, in both directions.
-    edge : with so much less than both of them an overlap counts nothing, with so much more in full, and in
-        between by how much it is. At a step, the last bit of a number decides whether a loop is closed: most
-        of those of a phone in a corridor (depth/corridor_phone) are observed to 0.29 to 0.43.
+    edge : the weight of an overlap rises from 0 to 1 between so much below both limits and so much above.
+    With a step, the last bit of a number decides on a loop: most of those of a phone in a corridor
+    (depth/corridor_phone) are observed to 0.29 to 0.43.
     """
 
     range_m: float = 12.0
@@ -53,7 +51,7 @@ class LocalMapParameters:
     edge: float = 0.0
 
     def counts(self, observed: float, agreement: float) -> float:
-        """How much an overlap counts, 0..1."""
+        """Return the weight of an overlap, 0..1."""
         if not self.edge:
             return float(observed > self.min_observed and agreement >= self.min_agreement)
         above = np.array((observed - self.min_observed, agreement - self.min_agreement))
@@ -71,15 +69,15 @@ _FREE, _HIT = 1, 2  # what a local map observed in a cell; 0: nothing
 
 
 def pose_at(poses: F64, index: int) -> SE2:
-    """One of poses (N, 3): x, y, yaw."""
+    """Return one of poses (N, 3): x, y, yaw."""
     x, y, yaw = poses[index]
     return SE2(float(x), float(y), float(yaw))
 
 
 class Overlap(NamedTuple):
-    """How two local maps that show the same place lie to each other: T_older_newer.
+    """The relative pose T_older_newer of two local maps that show the same place.
 
-    information : (3, 3) on that. counts : how much, 0..1, it counts already in the information.
+    information : (3, 3) on that. counts : weight, 0..1, which is already a factor of the information.
     """
 
     pose: SE2
@@ -118,13 +116,13 @@ class LocalMap:
         field = self._likelihood(cells)
         self._field = field.values.astype(np.float32) * np.float32(1.0 / 255.0)
         near_wall = np.exp(-0.5 * (parameters.wall_m / LIKELIHOOD.sigma_m) ** 2)
-        self._seen = np.where(self._field > near_wall, _HIT, self._free(outlines))
+        self._observed = np.where(self._field > near_wall, _HIT, self._free(outlines))
         _, first = np.unique(cells @ (self._grid.shape[1], 1), return_index=True)
         self.points_m: F64 = points[first]
         self.normal_rad: F64 = normal_rad[first]
 
     def _likelihood(self, cells: I64) -> LikelihoodField:
-        """The likelihood field of obstacles in cells (N, 2)."""
+        """Return the likelihood field of obstacles in cells (N, 2)."""
         occupied = np.zeros(self._grid.shape, np.bool_)
         occupied[cells[:, 0], cells[:, 1]] = True
         low_x, low_y = self._low_m.tolist()
@@ -136,7 +134,7 @@ class LocalMap:
         )
 
     def _free(self, outlines: Sequence[F64]) -> NDArray[np.uint8]:
-        """Cells (H, W) inside one of the outlines (B, 2) of free space."""
+        """Return the cells (H, W) inside one of the outlines (B, 2) of free space."""
         free = np.zeros(self._grid.shape, dtype=np.uint8)
         for outline in outlines:
             corners = polygon_corners((outline - self._low_m) / self._parameters.cell_m)
@@ -151,37 +149,38 @@ class LocalMap:
         )
 
     def agreement(self, points_m: F64, pose: SE2) -> tuple[float, float]:
-        """How well points (N, 2) placed at `pose` fit what this local map observed.
+        """Return how well points (N, 2) at `pose` agree with the observations of this local map.
 
-        Returns the share of the points in observed cells, and among those the share in cells at an obstacle
-        (the others lie in free space).
+        The first value is the share of the points in observed cells; the second, among those, the share in
+        cells at an obstacle (the others lie in free space).
         """
         cells = self._cells(pose.apply(points_m))
-        inside = ((cells >= 0) & (cells < self._seen.shape)).all(axis=1)
-        seen = self._seen[cells[inside, 0], cells[inside, 1]]
+        inside = ((cells >= 0) & (cells < self._observed.shape)).all(axis=1)
+        seen = self._observed[cells[inside, 0], cells[inside, 1]]
         observed = int((seen > 0).sum())
         return observed / max(len(points_m), 1), float((seen == _HIT).sum()) / max(observed, 1)
 
     def _cells(self, points: F64) -> I64:
-        """Points (N, 2) as cells (N, 2), row and column; may lie outside."""
+        """Return points (N, 2) as cells (N, 2), row and column; they may lie outside."""
         cells: I64 = np.floor((points - self._low_m) / self._parameters.cell_m)[:, ::-1].astype(np.int64)
         return cells
 
     def sample(self) -> tuple[F64, F64]:
-        """The points (S, 2) that are compared with another local map, and their normals (S,)."""
+        """Return the points (S, 2) that are compared with another local map, and their normals (S,)."""
         chosen = evenly(len(self.points_m), self._parameters.search_points)
         return self.points_m[chosen], self.normal_rad[chosen]
 
     def information(self, newer: LocalMap, T_self_newer: SE2) -> F64:
-        """Information (3, 3) on the pose of a newer local map by what both show; none along a bare wall."""
+        """Return the information (3, 3) on the pose of a newer local map by surfaces of both; none along a
+        bare wall."""
         return self.match(*newer.sample(), T_self_newer).information
 
     def overlap(self, newer: LocalMap, guess: SE2, window_m: float, window_rad: float) -> Overlap | None:
-        """The pose of a newer local map in this one, near a guess; None if they do not overlap or agree.
+        """Match a newer local map with this one near a guess; None if they do not overlap or agree.
 
-        Correlative scan matching over the window proposes poses. Of those at which enough of each local map
-        lies on what the other one observed, the one at which they agree best counts: a wrong one contradicts
-        the other loops in the pose graph.
+        Correlative scan matching over the window proposes poses. A pose counts if enough of each local map
+        lies on ground that the other one observed; of those, the one with the best agreement is returned: a
+        wrong one contradicts the other loops in the pose graph.
         """
         p, fits = self._parameters, []
         (points, normals), (points_back, _) = newer.sample(), self.sample()
@@ -209,29 +208,29 @@ class LocalMaps:
         self._parameters = parameters
         self.runs: list[range] = []
         self.anchors: list[int] = []
-        self._settled: F64 | None = None
+        self._optimised: F64 | None = None
         self._drawn = lru_cache(parameters.cached)(self._draw)
 
     def complete(self) -> None:
-        """The keyframes since the last local map become one."""
+        """Make a local map of the keyframes since the last one."""
         run = range(self.runs[-1].stop if self.runs else 0, len(self._keyframes))
         self.runs.append(run)
         self.anchors.append(run[len(run) // 2])
 
-    def redraw(self, settled: F64) -> None:
-        """From now on, draw with settled keyframe poses (K, 3), x, y, yaw, in place of the tracked ones."""
-        self._settled = settled
+    def redraw(self, optimised: F64) -> None:
+        """Draw from now on with optimised keyframe poses (K, 3), x, y, yaw, in place of the tracked ones."""
+        self._optimised = optimised
         self._drawn.cache_clear()
 
     def __getitem__(self, number: int) -> LocalMap:
         return self._drawn(number)
 
     def keyframes(self, numbers: range, anchor: int) -> tuple[list[Keyframe], list[SE2]]:
-        """Keyframes, and their poses T_anchor_base in the frame of the keyframe `anchor`."""
+        """Return keyframes, and their poses T_anchor_base in the frame of the keyframe `anchor`."""
         return [self._keyframes[k] for k in numbers], self.poses(numbers, anchor)
 
     def poses(self, numbers: Iterable[int], anchor: int) -> list[SE2]:
-        """T_anchor_base of keyframes in the frame of the keyframe `anchor`."""
+        """Return T_anchor_base of keyframes in the frame of the keyframe `anchor`."""
         T_anchor_session = self._pose(anchor).inverse()
         return [T_anchor_session @ self._pose(k) for k in numbers]
 
@@ -242,5 +241,5 @@ class LocalMaps:
         return LocalMap(keyframes, poses, self._parameters)
 
     def _pose(self, number: int) -> SE2:
-        """T_session_base of a keyframe: settled, or as tracked if loops are not closed yet."""
-        return self._keyframes.pose(number) if self._settled is None else pose_at(self._settled, number)
+        """Return T_session_base of a keyframe: optimised, or as tracked if loops are not closed yet."""
+        return self._keyframes.pose(number) if self._optimised is None else pose_at(self._optimised, number)

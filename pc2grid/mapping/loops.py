@@ -1,38 +1,22 @@
-"""Loop closure: a place that is seen again corrects the drift of tracking.
+"""Loop closure: overlaps with places of earlier visits correct the drift of tracking.
 
-The session is cut into local maps of a few metres of travel. Each new local map is compared with older ones
-that it may overlap: correlative scan matching over the uncertainty of tracking proposes poses, and those are
-accepted at which the free space and the obstacles of both local maps agree. A robust pose graph over the
-local maps gives the corrected poses (the scan-to-submap constraints of Hess et al., "Real-time loop closure
-in 2D lidar SLAM", 2016, between two submaps). Between the anchors of local maps the correction is
-interpolated, because the error of tracking grows gradually.
+A session is cut into local maps of a few metres of travel. Each new local map is compared with older ones
+that it may overlap: correlative scan matching over the uncertainty of tracking proposes poses, and a pose is
+accepted if the free space and the obstacles of both local maps agree. A robust pose graph over the local maps
+gives the corrected poses (the scan-to-submap constraints of Hess et al., "Real-time loop closure in 2D lidar
+SLAM", 2016, between two submaps). Between the anchors of local maps the correction is interpolated, because
+the error of tracking grows gradually.
 
-Loops that are farther off than the search window are found by a `PlaceRecognizer`, if one is given
-(`pc2grid.mapping.loops`).
-
-Which recognised places are loops: those that agree with the drift of tracking and with each other.
+After a long way a loop may be farther off than this search reaches. For these a `PlaceRecognizer`, which a
+package above this one implements, compares the map of the last few local maps (`PlaceMap`) with those of all
+earlier places, without using their poses.
 
 A recognition alone may be wrong with high confidence: buildings repeat themselves, and some look alike when
 they are turned by 180 degrees. Two facts that the recognizer does not use distinguish such a place from the
-right one. Tracking drifts, but only so far. And what is recognised on two stretches must fit together with
-the travel between them (pairwise consistency, Mangelson et al., "Pairwise consistent measurement set
-maximization for robust multi-robot map merging", 2018). A recognition that is not accepted remains a
-candidate, because later ones may support it.
-
-The numbers of loop closure.
-
-Stretches of travel, and the places that a recognizer finds on them.
-
-Loops that are farther off than the search near the tracked pose reaches are found by a `PlaceRecognizer`. It
-is asked for stretches of a few local maps; what it finds waits among the `LoopCandidates`.
-
-What loop closure needs from place recognition, which is implemented in a package above this one.
-
-Tracking drifts, so after a long way a loop can be farther off than loop closure searches (some metres, some
-degrees). A recognizer compares the map of the last metres with those of all earlier stretches of the same
-session, without using their poses.
-
-The pose graph of a session while it grows: its local maps, the tracked steps between them, and loops.
+right one. The drift of tracking is bounded. And the recognitions at two places must be consistent with the
+travel between them (pairwise consistency, Mangelson et al., "Pairwise consistent measurement set maximization
+for robust multi-robot map merging", 2018). A recognition that is not accepted remains a candidate
+(`LoopCandidates`), because later ones may support it.
 """
 
 from __future__ import annotations
@@ -52,126 +36,11 @@ from pc2grid.geometry import F64, I64, SE2, freeze
 from pc2grid.mapping.graph import Edge, Solution, WallDirection, between, compose, optimise, wall_direction
 from pc2grid.mapping.keyframes import Keyframe, Keyframes, grid_of
 from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps, pose_at
-from pc2grid.mapping.part_maps import SettledKeyframes, interpolate_corrections
+from pc2grid.mapping.part_maps import OptimisedKeyframes, interpolate_corrections
 from pc2grid.mapping.parts import connected
 from pc2grid.mapping.quality import position_sigmas
 from pc2grid.model import Loop, OccupancyGrid
 from pc2grid.settings import ProjectionConfig
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CandidateParameters:
-    """Numbers of the acceptance. Chosen on aces and csail, unless noted.
-
-    The drift that tracking may have over a travel, in standard deviations, generous because a slip of the
-    wheels counts too (`docs/method.md`):
-
-    drift_m, drift_per_m : of position, constant and per metre of travel.
-    drift_rad, drift_rad_per_m : of yaw.
-
-    The drift over the short travel between two recognitions that support each other:
-
-    short_m, short_per_m, short_rad : as above; per metre of travel the yaw drifts by `drift_rad_per_m`.
-    consistent : largest Mahalanobis distance at which two of them agree; 3 degrees of freedom, 1 %.
-
-    What is required:
-
-    alone : largest Mahalanobis distance from the tracked pose at which a recognition without support is
-        accepted.
-    supported : the same with one other recognition that agrees.
-    possible : the same with two; beyond it a recognition is never accepted. 3 degrees of freedom, 0.3 %.
-    known_way_m : a recognition over a shorter way adds nothing: tracking is more exact. A stretch and a half.
-    rival : log-odds by which a contradicting place of the same stretch must be less likely.
-    pending : candidates that are kept at most, the latest.
-    """
-
-    drift_m: float = 0.3
-    drift_per_m: float = 0.025
-    drift_rad: float = math.radians(1.5)
-    drift_rad_per_m: float = math.radians(0.1)
-    short_m: float = 0.15
-    short_per_m: float = 0.015
-    short_rad: float = math.radians(1.0)
-    consistent: float = 3.37
-    alone: float = 1.0
-    supported: float = 2.5
-    possible: float = 3.8
-    known_way_m: float = 18.0
-    rival: float = 3.0
-    pending: int = 100
-
-
-CANDIDATES = CandidateParameters()
-
-
-class LoopCandidates:
-    """Recognised places that are not accepted as loops yet."""
-
-    def __init__(self, parameters: CandidateParameters = CANDIDATES) -> None:
-        self._parameters = parameters
-        self._pending: list[Recognition] = []
-
-    def add(self, candidates: Sequence[Recognition]) -> None:
-        """Add what was recognised on the newest stretch."""
-        self._pending = [*self._pending, *candidates][-self._parameters.pending :]
-
-    def take(self, nodes: F64, travel_m: F64) -> list[Recognition]:
-        """The candidates that are loops by drift and by each other. They, and those that cannot be, go.
-
-        nodes : (N, 3) settled poses of the stretches. travel_m : (N,) metres of travel at each.
-        """
-        pending, p = self._pending, self._parameters
-        if not pending:
-            return []
-        older, newer = np.array([(c.older, c.newer) for c in pending]).T
-        measured = np.array([(c.T_older_newer.x, c.T_older_newer.y, c.T_older_newer.yaw) for c in pending])
-        probability = np.clip([c.probability for c in pending], 1e-6, 1.0 - 1e-6)
-
-        way_m = travel_m[newer] - travel_m[older]
-        error = between(measured, between(nodes[older], nodes[newer]))
-        off = _mahalanobis(error, p.drift_m + p.drift_per_m * way_m, p.drift_rad + p.drift_rad_per_m * way_m)
-        in_reach, known = off <= p.possible, way_m <= p.known_way_m
-
-        agrees = self._agreement(older, newer, measured, nodes, travel_m)
-        same = newer[:, None] == newer
-        support = np.array([len(set(newer[row])) for row in agrees & ~same & in_reach])
-        likely = np.log(probability / (1.0 - probability)) - 0.5 * off**2
-
-        reach = np.choose(np.minimum(support, 2), (p.alone, p.supported, p.possible))
-        fits = (off <= reach) & ~known
-        # Rival k of candidate i contradicts it; one of the two must be clearly better.
-        weaker = support < support[:, None]
-        less_likely = (support == support[:, None]) & (likely <= likely[:, None] - p.rival)
-        beaten = weaker | less_likely | ~(same & ~agrees & in_reach)
-        chosen = fits & beaten.all(axis=1)
-        self._pending = list(compress(pending, in_reach & ~known & ~chosen))
-        return list(compress(pending, chosen))
-
-    def _agreement(
-        self, older: I64, newer: I64, measured: F64, nodes: F64, travel_m: F64
-    ) -> NDArray[np.bool_]:
-        """Which candidates (C, C) fit together with the travel between them.
-
-        older, newer : (C,) stretches. measured : (C, 3) x, y, yaw of the newer in the older.
-        """
-        p = self._parameters
-        travelled_m = np.abs(travel_m[newer][:, None] - travel_m[newer])
-        travelled_m += np.abs(travel_m[older][:, None] - travel_m[older])
-        first, second = (k.ravel() for k in np.indices(travelled_m.shape))
-        there = compose(measured[first], between(nodes[newer[first]], nodes[newer[second]]))
-        again = compose(between(nodes[older[first]], nodes[older[second]]), measured[second])
-        apart = _mahalanobis(
-            between(there, again),
-            p.short_m + p.short_per_m * travelled_m.ravel(),
-            p.short_rad + p.drift_rad_per_m * travelled_m.ravel(),
-        )
-        return (apart <= p.consistent).reshape(travelled_m.shape)
-
-
-def _mahalanobis(error: F64, sigma_m: F64, sigma_rad: F64) -> F64:
-    """(N,) length of errors (N, 3) of x, y, yaw in standard deviations."""
-    yaw = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-    return np.asarray(np.sqrt((error[:, 0] ** 2 + error[:, 1] ** 2) / sigma_m**2 + yaw**2 / sigma_rad**2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,22 +49,21 @@ class LoopParameters:
 
     Cutting into local maps:
 
-    travel_m : travel after which a local map is complete.
-    turn_m_per_rad : travel that a turn on the spot counts as.
+    travel_m : travel after which a local map is complete. turn_m_per_rad : travel that a turn on the spot
+    counts as.
 
     Which pairs are compared:
 
-    near_m : older local maps within this distance may overlap the newest one.
-    compared : older local maps that the newest is compared with.
+    near_m : older local maps within this distance may overlap the newest one. compared : older local maps
+    that the newest is compared with.
 
     How far is searched: as far as tracking may have drifted since the pose was last certain.
 
-    certain_m, certain_rad : the window directly after a loop.
-    drift_per_m, drift_rad_per_m : growth of the window per metre of travel.
-    max_window_m, max_window_rad : its largest size.
-    lost_m : travel that a lost stretch counts as; enough for the largest window.
+    certain_m, certain_rad : the window directly after a loop. drift_per_m, drift_rad_per_m : growth of the
+    window per metre of travel. max_window_m, max_window_rad : its largest size. lost_m : travel that a lost
+    part of the session counts as; enough for the largest window.
 
-    What they count in the pose graph:
+    Their information in the pose graph:
 
     information_share : of the information that a match reports: the errors of points on one wall are
         correlated.
@@ -206,10 +74,9 @@ class LoopParameters:
 
     Place recognition:
 
-    stretch_maps : consecutive local maps that make a stretch: 12 m of travel, chosen on aces, csail and
-        killian.
-    recognized_m : window of the comparison that confirms a recognition; its yaw is within `certain_rad`.
-    compared_pairs : pairs of local maps of the two stretches that are compared at most.
+    maps_per_place : consecutive local maps that make a place map: 12 m of travel, chosen on aces, csail and
+    killian. recognized_m : window of the comparison that confirms a recognition; its yaw is within
+    `certain_rad`. compared_pairs : pairs of local maps of the two place maps that are compared at most.
     """
 
     travel_m: float = 4.0
@@ -230,19 +97,20 @@ class LoopParameters:
     tracking_sigma_rad_per_m: float = math.radians(0.05)
     lost_sigma_m: float = 1.5
     lost_sigma_rad: float = math.radians(60.0)
-    stretch_maps: int = 3
+    maps_per_place: int = 3
     recognized_m: float = 0.4
     compared_pairs: int = 4
 
     def window(self, drift_m: float) -> tuple[float, float]:
-        """Half widths of the search window, metres and radians, after `drift_m` of travel."""
+        """Return the half widths of the search window, metres and radians, after `drift_m` of travel."""
         return (
             min(self.certain_m + self.drift_per_m * drift_m, self.max_window_m),
             min(self.certain_rad + self.drift_rad_per_m * drift_m, self.max_window_rad),
         )
 
     def tracked_information(self, length_m: float, restart: bool) -> F64:
-        """Information (3, 3) of a tracked step between anchors; restart: tracking was lost in between."""
+        """Return the information (3, 3) of a tracked step between anchors. restart : tracking was lost in
+        between."""
         sigma_m = self.tracking_sigma_m + self.tracking_sigma_per_m * length_m
         sigma_rad = self.tracking_sigma_rad + self.tracking_sigma_rad_per_m * length_m
         if restart:
@@ -265,12 +133,57 @@ errors of tracking by a camera in simulated csail (`docs/method.md`); checked on
 """
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CandidateParameters:
+    """Parameters of `LoopCandidates`. Chosen on aces and csail, unless noted.
+
+    Standard deviation of the drift of tracking over a travel, large enough for a slip of the wheels
+    (`docs/method.md`):
+
+    drift_m, drift_per_m : of position, constant and per metre of travel. drift_rad, drift_rad_per_m : of yaw.
+
+    The drift over the short travel between two recognitions that support each other:
+
+    short_m, short_per_m, short_rad : as above; per metre of travel the yaw drifts by `drift_rad_per_m`.
+    consistent : largest Mahalanobis distance at which two of them agree; 3 degrees of freedom, 1 %.
+
+    Acceptance:
+
+    alone : largest Mahalanobis distance from the tracked pose at which a recognition without support is
+        accepted.
+    supported : the same with one other recognition that agrees.
+    possible : the same with two; beyond it a recognition is never accepted. 3 degrees of freedom, 0.3 %.
+    known_way_m : a recognition over a shorter way adds nothing: tracking is more exact. The travel of one and
+    a half place maps.
+    margin : log-odds by which a contradicting recognition of the same place map must be less likely.
+    pending : candidates that are kept at most, the latest.
+    """
+
+    drift_m: float = 0.3
+    drift_per_m: float = 0.025
+    drift_rad: float = math.radians(1.5)
+    drift_rad_per_m: float = math.radians(0.1)
+    short_m: float = 0.15
+    short_per_m: float = 0.015
+    short_rad: float = math.radians(1.0)
+    consistent: float = 3.37
+    alone: float = 1.0
+    supported: float = 2.5
+    possible: float = 3.8
+    known_way_m: float = 18.0
+    margin: float = 3.0
+    pending: int = 100
+
+
+CANDIDATES = CandidateParameters()
+
+
 class LoopCloser:
     """Closes loops while a session is recorded.
 
-    keyframes : gets those of the session; local maps are drawn from them when needed.
-    recognizer : asked for every stretch of travel; None: loops are searched near the tracked pose only.
-    projection : how the grids for the recognizer are drawn.
+    keyframes : gets those of the session; local maps are drawn from them when needed. recognizer : gets every
+    place map; None: loops are searched near the tracked pose only. projection : how the grids for the
+    recognizer are drawn.
     """
 
     def __init__(
@@ -288,8 +201,8 @@ class LoopCloser:
         self._local_maps = LocalMaps(keyframes, local_map_parameters)
         self._graph = SessionGraph(parameters)
         candidates = LoopCandidates(candidate_parameters)
-        self._stretches = Stretches(
-            self._local_maps, candidates, parameters.stretch_maps, recognizer, projection
+        self._place_maps = PlaceMaps(
+            self._local_maps, candidates, parameters.maps_per_place, recognizer, projection
         )
         self._travel_m = 0.0  # in the local map that is not complete yet
         self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
@@ -304,19 +217,19 @@ class LoopCloser:
                 self._complete_local_map()
         self._keyframes.append(keyframe)
 
-    def finish(self) -> SettledKeyframes:
-        """The settled poses; without a loop and without walls they are the tracked ones."""
+    def finish(self) -> OptimisedKeyframes:
+        """Return the optimised poses; without a loop and without walls they are the tracked ones."""
         if not len(self._keyframes):
-            return SettledKeyframes.empty()
+            return OptimisedKeyframes.empty()
         self._complete_local_map()
-        if self._stretches.finish():
+        if self._place_maps.finish():
             self._close_candidates()
-        return self._settled_keyframes()
+        return self._optimised_keyframes()
 
     # --- during the session -------------------------------------------------------------------------------
 
     def _complete_local_map(self) -> None:
-        """The last keyframes become a local map: placed by tracking, then compared with older ones."""
+        """Make a local map of the last keyframes: place it by tracking, then compare it with older ones."""
         newest = len(self._graph)
         self._local_maps.complete()
         restart = self._local_maps.runs[newest].start in self._keyframes.restarts
@@ -325,9 +238,9 @@ class LoopCloser:
         overlaps = list(self._overlaps(newest))
         self._close(overlaps)
         # Overlaps with the local maps just before show nothing but that tracking is smooth.
-        recent = newest - 2 * self._parameters.stretch_maps
+        recent = newest - 2 * self._parameters.maps_per_place
         known = any(edge.first < recent for edge in overlaps)
-        if self._stretches.extend(restart=restart, known=known):
+        if self._place_maps.extend(restart=restart, known=known):
             self._close_candidates()
 
     def _place(self, newest: int, restart: bool) -> None:
@@ -346,7 +259,7 @@ class LoopCloser:
         self._graph.extend(step, walls, shown)
 
     def _tracked(self, number: int) -> SE2:
-        """The pose of a local map as tracked."""
+        """Return the pose of a local map as tracked."""
         return self._keyframes.pose(self._local_maps.anchors[number])
 
     def _close(self, loops: list[Edge]) -> None:
@@ -357,7 +270,7 @@ class LoopCloser:
             self._graph.solve()
 
     def _overlaps(self, newest: int) -> Iterator[Edge]:
-        """Verified overlaps of the newest local map with older ones, near its tracked pose."""
+        """Yield verified overlaps of the newest local map with older ones, near its tracked pose."""
         window = self._parameters.window(self._drift_m)
         nodes = self._graph.nodes
         # The local map before the newest is left out: tracking matched both against the same walls.
@@ -368,7 +281,7 @@ class LoopCloser:
             yield from self._compare(older, newest, self._graph.relative(older, newest), window)
 
     def _compare(self, older: int, newer: int, guess: SE2, window: tuple[float, float]) -> list[Edge]:
-        """The measured relative pose of two local maps near a guess; none if they do not match.
+        """Match two local maps near a guess; returns an edge, or none if they do not match.
 
         window : half widths of the search around the guess, metres and radians.
         """
@@ -381,24 +294,26 @@ class LoopCloser:
     # --- place recognition --------------------------------------------------------------------------------
 
     def _close_candidates(self) -> None:
-        """Close the loops among the recognised places that drift allows and that agree with each other: those
-        whose local maps match near where they were recognised."""
+        """Close the loops among the recognised places.
+
+        Those that drift allows and that agree with each other are confirmed by matching their local maps.
+        """
         p = self._parameters
         loops: list[Edge] = []
-        for found in self._stretches.accepted(self._graph.nodes, np.array(self._travelled_m)):
-            for older, newer, guess in self._stretches.guesses(found)[: p.compared_pairs]:
+        for found in self._place_maps.accepted(self._graph.nodes, np.array(self._travelled_m)):
+            for older, newer, guess in self._place_maps.guesses(found)[: p.compared_pairs]:
                 loops += self._compare(older, newer, guess, (p.recognized_m, p.certain_rad))
         self._close(loops)
         if loops:
-            # The newest stretch lies where it belongs now: what the search near the tracked pose missed is
-            # near.
-            self._close([edge for number in self._stretches.latest() for edge in self._overlaps(number)])
+            # The newest place map is where it belongs now: loops that the search near the tracked pose missed
+            # are near.
+            self._close([edge for number in self._place_maps.latest() for edge in self._overlaps(number)])
 
     # --- at the end of the session ------------------------------------------------------------------------
 
-    def _settled_keyframes(self) -> SettledKeyframes:
-        """Solve the pose graph; the poses, loops and parts that this gives."""
-        solution = self._settle()
+    def _optimised_keyframes(self) -> OptimisedKeyframes:
+        """Solve the pose graph; returns its poses, loops and parts."""
+        solution = self._optimise()
         scans, anchors = self._keyframes.scans, self._local_maps.anchors
         loops = tuple(
             Loop(
@@ -413,9 +328,9 @@ class LoopCloser:
         )
         part = self._parts(solution)
         lengths = [len(run) for run in self._local_maps.runs]
-        return SettledKeyframes(
+        return OptimisedKeyframes(
             scans=np.array(scans, dtype=np.int64),
-            poses=self._settled(),
+            poses=self._optimised(),
             loops=loops,
             segments=np.repeat(self._segments(), lengths),
             parts=np.repeat(part, lengths),
@@ -423,25 +338,26 @@ class LoopCloser:
             sigma_m=self._graph.sigmas(solution, part),
         )
 
-    def _settle(self) -> Solution:
-        """Solve the pose graph.
+    def _optimise(self) -> Solution:
+        """Solve the pose graph, measure its overlaps again, and solve it again.
 
-        The overlaps were measured on local maps that are as bent as tracking drifts. So these are drawn again
-        with the poses that are found, and compared again.
+        The overlaps were measured on local maps that are bent by the drift of tracking. So these are drawn
+        again with the optimised poses, and compared again.
         """
         self._graph.solve()
-        self._local_maps.redraw(self._settled())
+        self._local_maps.redraw(self._optimised())
         self._graph.edges = [self._again(edge) if edge.loop else edge for edge in self._graph.edges]
         return self._graph.solve()
 
     def _again(self, edge: Edge) -> Edge:
-        """An overlap as the local maps show it now; as it was if they no longer do."""
+        """Measure an overlap again on the present local maps; return the old one if they no longer
+        overlap."""
         guess = self._graph.relative(edge.first, edge.second)
         window = self._parameters.certain_m, self._parameters.certain_rad
         return next(iter(self._compare(edge.first, edge.second, guess, window)), edge)
 
-    def _settled(self) -> F64:
-        """Keyframe poses (K, 3) that follow the anchors of their local maps.
+    def _optimised(self) -> F64:
+        """Return keyframe poses (K, 3) that follow the anchors of their local maps.
 
         The correction passes gradually from one anchor to the next. Where tracking was lost the error is a
         jump, so there each local map moves rigidly up to its end.
@@ -462,21 +378,21 @@ class LoopCloser:
     # --- segments and parts -------------------------------------------------------------------------------
 
     def _segments(self) -> I64:
-        """(N,) number of the segment of each local map; a new one begins at each restart."""
+        """Return the number (N,) of the segment of each local map; a new one begins at each restart."""
         restarts = self._keyframes.restarts
         begins = [number > 0 and run.start in restarts for number, run in enumerate(self._local_maps.runs)]
         return np.cumsum(begins, dtype=np.int64)
 
     def _parts(self, solution: Solution) -> I64:
-        """(N,) number of the part of each local map."""
+        """Return the number (N,) of the part of each local map."""
         loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
         return connected(self._segments(), loops)
 
 
 def spread_over_visits(distance_m: F64, near_m: float, count: int) -> list[int]:
-    """Which older local maps, `distance_m` (N,) away from the newest, to compare it with; `count` at most.
+    """Choose older local maps, `distance_m` (N,) away from the newest, to compare it with; `count` at most.
 
-    A robot that drives up and down sees a place dozens of times. The nearest local map of the first visit,
+    A robot that drives up and down passes a place dozens of times. The nearest local map of the first visit,
     of the last and of some in between are chosen, so that the newest is connected to all visits.
     """
     near = np.flatnonzero(distance_m < near_m)
@@ -489,168 +405,8 @@ def spread_over_visits(distance_m: F64, near_m: float, count: int) -> list[int]:
     return nearest + others[: count - len(nearest)]
 
 
-class Stretches:
-    """The stretches of a session that its recognizer was asked for.
-
-    candidates : get what it finds. maps : consecutive local maps that make a stretch.
-    recognizer : None: there are no stretches. projection : how the grids for the recognizer are drawn.
-    """
-
-    def __init__(
-        self,
-        local_maps: LocalMaps,
-        candidates: LoopCandidates,
-        maps: int,
-        recognizer: PlaceRecognizer | None,
-        projection: ProjectionConfig,
-    ) -> None:
-        self._local_maps, self._candidates, self._maps = local_maps, candidates, maps
-        self._recognizer, self._projection = recognizer, projection
-        self._asked: list[range] = []  # the local maps of each
-        self._known_places: list[bool] = []  # whether each local map overlaps one of an earlier visit
-        self._begin = 0  # first local map of the stretch that is not complete yet
-
-    def extend(self, *, restart: bool, known: bool) -> bool:
-        """Take the newest local map; returns whether it completes a stretch that the recognizer is asked for.
-
-        restart : tracking was lost before it. known : it overlaps a local map of an earlier visit.
-
-        A stretch does not reach across a lost part of the session: its map would be bent. Where all its local
-        maps overlap those of an earlier visit already, there is nothing to ask and nothing new to remember.
-        """
-        if restart:
-            self._begin = len(self._known_places)
-        self._known_places.append(known)
-        stretch = range(self._begin, len(self._known_places))
-        if len(stretch) < self._maps:
-            return False
-        self._begin = stretch.stop
-        return self._ask(stretch)
-
-    def finish(self) -> bool:
-        """The last local maps make a stretch that may overlap the one before; returns as `extend` does."""
-        stop = len(self._known_places)
-        return self._begin < stop and self._ask(range(max(stop - self._maps, 0), stop))
-
-    def latest(self) -> range:
-        """The local maps of the stretch that was asked for last."""
-        return self._asked[-1]
-
-    def accepted(self, nodes: F64, travel_m: F64) -> list[Recognition]:
-        """What was recognised and is a loop, by drift and by each other; each is returned once.
-
-        nodes : (N, 3) settled poses of the local maps. travel_m : (N,) metres of travel at each.
-        """
-        middles = [_middle(stretch) for stretch in self._asked]
-        return self._candidates.take(nodes[middles], travel_m[middles])
-
-    def guesses(self, found: Recognition) -> list[tuple[int, int, SE2]]:
-        """The pairs of local maps of two stretches, the nearest first.
-
-        Of each the older, the newer, and T_older_newer by the recognition.
-        """
-        pairs = []
-        for older, T_stretch_older in self._within(self._asked[found.older]):
-            for newer, T_stretch_newer in self._within(self._asked[found.newer]):
-                # The last stretch overlaps the one before. Neighbours are matched by tracking already.
-                if newer - older < 2:
-                    continue
-                guess = T_stretch_older.inverse() @ found.T_older_newer @ T_stretch_newer
-                pairs.append((older, newer, guess))
-        return sorted(pairs, key=lambda pair: (math.hypot(pair[2].x, pair[2].y), *pair[:2]))
-
-    def _within(self, stretch: range) -> list[tuple[int, SE2]]:
-        """The local maps of a stretch, and their tracked poses in its frame."""
-        anchors = self._local_maps.anchors
-        poses = self._local_maps.poses((anchors[number] for number in stretch), anchors[_middle(stretch)])
-        return list(zip(stretch, poses, strict=True))
-
-    def _ask(self, stretch: range) -> bool:
-        """Ask where a stretch was seen before, unless all of its local maps are known."""
-        if self._recognizer is None or all(self._known_places[k] for k in stretch):
-            return False
-        self._asked.append(stretch)
-        self._candidates.add(self._recognizer.recognize(self._draw(len(self._asked) - 1, stretch)))
-        return True
-
-    def _draw(self, index: int, numbers: range) -> Stretch:
-        """The stretch of some consecutive local maps, in the frame of the anchor of the middle one."""
-        runs = self._local_maps.runs
-        keyframes, poses = self._local_maps.keyframes(
-            range(runs[numbers[0]].start, runs[numbers[-1]].stop), self._local_maps.anchors[_middle(numbers)]
-        )
-        return Stretch(
-            index=index,
-            grid=grid_of(zip(keyframes, poses, strict=True), self._projection),
-            poses=np.array([(pose.x, pose.y, pose.yaw) for pose in poses]),
-            scans=np.array([keyframe.index for keyframe in keyframes]),
-        )
-
-
-def _middle(numbers: range) -> int:
-    """The local map whose frame a stretch is drawn in."""
-    return numbers[len(numbers) // 2]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Stretch:
-    """The map of a few metres of travel, long enough to be recognised.
-
-    index : number of the stretch among those of its session that the recognizer is given, from 0, in the
-        order of travel. The last one of a session may be shorter, and overlap the one before.
-    grid : its occupancy grid, in its own frame: the base at one of its keyframes, in the middle.
-    poses : (K, 3) x, y, yaw of its keyframes in the same frame, metres and radians.
-    scans : (K,) number of each keyframe's scan within the session.
-    """
-
-    index: int
-    grid: OccupancyGrid
-    poses: F64
-    scans: I64
-
-    def __post_init__(self) -> None:
-        freeze(self, "poses", float, (None, 3))
-        freeze(self, "scans", np.int64, (None,))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recognition:
-    """Two stretches that show the same place, and how they lie to each other.
-
-    older, newer : their indices.
-    T_older_newer : the frame of the newer stretch in the frame of the older one. Exact to some decimetres;
-        loop closure refines it on the local maps.
-    probability : 0..1, calibrated, that both show the same place, by what they look like.
-
-    Of the recognitions of one newer stretch, which show it at several places, at most one is right, or those
-    at one place that several older stretches saw.
-    """
-
-    older: int
-    newer: int
-    T_older_newer: SE2
-    probability: float
-
-
-class PlaceRecognizer(Protocol):
-    """Proposes and verifies earlier stretches of a session that show the same place as the newest one."""
-
-    def recognize(self, newest: Stretch) -> Sequence[Recognition]:
-        """The earlier stretches that the newest one overlaps, each with its verified relative pose.
-
-        Called once for every stretch that does not overlap known ones throughout, in the order of their
-        indices, from 0. A recognizer therefore keeps what it needs of those that it was given: signatures to
-        propose with, grids to verify with.
-
-        It must not return `older >= newest.index`. All places that look like the newest stretch may be
-        returned, right or wrong: loop closure accepts those that agree with the drift of tracking and with
-        each other (`pc2grid.mapping.loops`).
-        """
-        ...
-
-
 class SessionGraph:
-    """The pose graph over the anchors of local maps.
+    """The pose graph over the anchors of local maps, which grows with the session.
 
     nodes : (N, 3) x, y, yaw of each anchor in the session, by the last optimisation. edges : tracked steps
     and loops, in the order in which they were found.
@@ -675,7 +431,7 @@ class SessionGraph:
     def extend(self, step: SE2, walls: WallDirection, shown: F64 | None) -> None:
         """Add the next local map, a tracked step from the last one.
 
-        shown : information (3, 3) on the step by what both local maps show; None: tracking was lost.
+        shown : information (3, 3) on the step by surfaces of both local maps; None: tracking was lost.
         """
         newest = len(self)
         information = self._parameters.tracked_information(math.hypot(step.x, step.y), shown is None)
@@ -685,7 +441,7 @@ class SessionGraph:
         self.add(pose_at(self.nodes, newest - 1) @ step, walls)
 
     def relative(self, first: int, second: int) -> SE2:
-        """T_first_second by the present poses."""
+        """Return T_first_second by the present poses."""
         return pose_at(self.nodes, first).inverse() @ pose_at(self.nodes, second)
 
     def solve(self) -> Solution:
@@ -695,10 +451,11 @@ class SessionGraph:
         return solution
 
     def sigmas(self, solution: Solution, part: I64) -> F64:
-        """Standard deviation (N,) in metres of the position of each local map within its part (N,).
+        """Return the standard deviation (N,) in metres of the position of each local map within its part
+        (N,).
 
-        In the pose graph a tracked step counts as exact as it is wherever tracking works at all. How exact a
-        step is by what its local maps show of each other is added here.
+        In the pose graph the information of a tracked step is that of tracking where it works at all. The
+        information of the surfaces that its two local maps share is added here.
         """
         sigma_m = np.zeros(len(part))
         number = np.empty(len(part), np.int64)  # of each local map within its part
@@ -717,3 +474,238 @@ class SessionGraph:
             walls = [self._walls[local_map] for local_map in own]
             sigma_m[own] = position_sigmas(solution.poses[own], within, walls)[0]
         return sigma_m
+
+
+# Place recognition.
+
+# Place recognition.
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlaceMap:
+    """The map of a few metres of travel, long enough to be recognised.
+
+    index : number of this place map in its session, from 0, in the order of travel. The last one may be
+    shorter, and overlap the one before.
+    grid : its occupancy grid, in its own frame: the base at one of its keyframes, in the middle.
+    poses : (K, 3) x, y, yaw of its keyframes in the same frame, metres and radians.
+    scans : (K,) number of each keyframe's scan within the session.
+    """
+
+    index: int
+    grid: OccupancyGrid
+    poses: F64
+    scans: I64
+
+    def __post_init__(self) -> None:
+        freeze(self, "poses", float, (None, 3))
+        freeze(self, "scans", np.int64, (None,))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recognition:
+    """Two place maps of the same place, and their relative pose.
+
+    older, newer : their indices.
+    T_older_newer : the frame of the newer place map in that of the older one. Exact to some decimetres; loop
+    closure refines it on the local maps.
+    probability : 0..1, calibrated, that both show the same place, by their appearance.
+
+    At most one recognition of a newer place map is right, or those at one place that several older ones show.
+    """
+
+    older: int
+    newer: int
+    T_older_newer: SE2
+    probability: float
+
+
+class PlaceRecognizer(Protocol):
+    """Proposes and verifies earlier place maps of a session that show the same place as the newest one."""
+
+    def recognize(self, newest: PlaceMap) -> Sequence[Recognition]:
+        """Return the earlier place maps that the newest one overlaps, each with its verified relative pose.
+
+        It is called for every place map that does not overlap known ones throughout, in the order of their
+        indices, from 0. A recognizer therefore keeps what it needs of earlier ones: signatures to propose
+        with, grids to verify with.
+
+        It must not return `older >= newest.index`. All places similar to the newest may be returned, right or
+        wrong: loop closure accepts those that agree with the drift of tracking and with each other.
+        """
+        ...
+
+
+class PlaceMaps:
+    """The place maps of a session that were given to its recognizer.
+
+    candidates : get its recognitions. maps : consecutive local maps in a place map.
+    recognizer : None: there are no place maps. projection : how their grids are drawn.
+    """
+
+    def __init__(
+        self,
+        local_maps: LocalMaps,
+        candidates: LoopCandidates,
+        maps: int,
+        recognizer: PlaceRecognizer | None,
+        projection: ProjectionConfig,
+    ) -> None:
+        self._local_maps, self._candidates, self._maps = local_maps, candidates, maps
+        self._recognizer, self._projection = recognizer, projection
+        self._asked: list[range] = []  # the local maps of each
+        self._known_places: list[bool] = []  # whether each local map overlaps one of an earlier visit
+        self._begin = 0  # first local map of the place that is not complete yet
+
+    def extend(self, *, restart: bool, known: bool) -> bool:
+        """Add the newest local map. Return True if a place map was completed and passed to the recognizer.
+
+        restart : tracking was lost before it. known : it overlaps a local map of an earlier visit.
+
+        A place map does not reach across a lost part of the session: it would be bent. If all its local maps
+        overlap those of an earlier visit already, it is not passed on, as it adds nothing.
+        """
+        if restart:
+            self._begin = len(self._known_places)
+        self._known_places.append(known)
+        place = range(self._begin, len(self._known_places))
+        if len(place) < self._maps:
+            return False
+        self._begin = place.stop
+        return self._ask(place)
+
+    def finish(self) -> bool:
+        """Make a place map of the last local maps, which may overlap the one before; returns as `extend`
+        does."""
+        stop = len(self._known_places)
+        return self._begin < stop and self._ask(range(max(stop - self._maps, 0), stop))
+
+    def latest(self) -> range:
+        """Return the local maps of the last place map that was passed on."""
+        return self._asked[-1]
+
+    def accepted(self, nodes: F64, travel_m: F64) -> list[Recognition]:
+        """Return the recognitions that are loops, by drift and by each other; each is returned once.
+
+        nodes : (N, 3) optimised poses of the local maps. travel_m : (N,) metres of travel at each.
+        """
+        middles = [_middle(place) for place in self._asked]
+        return self._candidates.take(nodes[middles], travel_m[middles])
+
+    def guesses(self, found: Recognition) -> list[tuple[int, int, SE2]]:
+        """Return the pairs of local maps of two place maps, the nearest first.
+
+        Each is the older, the newer, and T_older_newer by the recognition.
+        """
+        pairs = []
+        for older, T_place_older in self._within(self._asked[found.older]):
+            for newer, T_place_newer in self._within(self._asked[found.newer]):
+                # The last place map overlaps the one before. Neighbours are matched by tracking already.
+                if newer - older < 2:
+                    continue
+                guess = T_place_older.inverse() @ found.T_older_newer @ T_place_newer
+                pairs.append((older, newer, guess))
+        return sorted(pairs, key=lambda pair: (math.hypot(pair[2].x, pair[2].y), *pair[:2]))
+
+    def _within(self, place: range) -> list[tuple[int, SE2]]:
+        """Return the local maps of a place map, and their tracked poses in its frame."""
+        anchors = self._local_maps.anchors
+        poses = self._local_maps.poses((anchors[number] for number in place), anchors[_middle(place)])
+        return list(zip(place, poses, strict=True))
+
+    def _ask(self, place: range) -> bool:
+        """Pass a place map to the recognizer, unless all of its local maps are known."""
+        if self._recognizer is None or all(self._known_places[k] for k in place):
+            return False
+        self._asked.append(place)
+        self._candidates.add(self._recognizer.recognize(self._draw(len(self._asked) - 1, place)))
+        return True
+
+    def _draw(self, index: int, numbers: range) -> PlaceMap:
+        """Draw the place map of consecutive local maps, in the frame of the anchor of the middle one."""
+        runs = self._local_maps.runs
+        keyframes, poses = self._local_maps.keyframes(
+            range(runs[numbers[0]].start, runs[numbers[-1]].stop), self._local_maps.anchors[_middle(numbers)]
+        )
+        return PlaceMap(
+            index=index,
+            grid=grid_of(zip(keyframes, poses, strict=True), self._projection),
+            poses=np.array([(pose.x, pose.y, pose.yaw) for pose in poses]),
+            scans=np.array([keyframe.index for keyframe in keyframes]),
+        )
+
+
+def _middle(numbers: range) -> int:
+    """Return the local map in whose frame a place map is drawn."""
+    return numbers[len(numbers) // 2]
+
+
+class LoopCandidates:
+    """Recognised places that are not accepted as loops yet."""
+
+    def __init__(self, parameters: CandidateParameters = CANDIDATES) -> None:
+        self._parameters = parameters
+        self._pending: list[Recognition] = []
+
+    def add(self, candidates: Sequence[Recognition]) -> None:
+        """Add the recognitions of the newest place map."""
+        self._pending = [*self._pending, *candidates][-self._parameters.pending :]
+
+    def take(self, nodes: F64, travel_m: F64) -> list[Recognition]:
+        """Return the candidates that are loops by drift and by each other; remove them and the impossible
+        ones.
+
+        nodes : (N, 3) optimised poses of the place maps. travel_m : (N,) metres of travel at each.
+        """
+        pending, p = self._pending, self._parameters
+        if not pending:
+            return []
+        older, newer = np.array([(c.older, c.newer) for c in pending]).T
+        measured = np.array([(c.T_older_newer.x, c.T_older_newer.y, c.T_older_newer.yaw) for c in pending])
+        probability = np.clip([c.probability for c in pending], 1e-6, 1.0 - 1e-6)
+
+        way_m = travel_m[newer] - travel_m[older]
+        error = between(measured, between(nodes[older], nodes[newer]))
+        off = _mahalanobis(error, p.drift_m + p.drift_per_m * way_m, p.drift_rad + p.drift_rad_per_m * way_m)
+        in_reach, known = off <= p.possible, way_m <= p.known_way_m
+
+        agrees = self._agreement(older, newer, measured, nodes, travel_m)
+        same = newer[:, None] == newer
+        support = np.array([len(set(newer[row])) for row in agrees & ~same & in_reach])
+        likely = np.log(probability / (1.0 - probability)) - 0.5 * off**2
+
+        reach = np.choose(np.minimum(support, 2), (p.alone, p.supported, p.possible))
+        fits = (off <= reach) & ~known
+        # Rival k of candidate i contradicts it; one of the two must be clearly better.
+        weaker = support < support[:, None]
+        less_likely = (support == support[:, None]) & (likely <= likely[:, None] - p.margin)
+        beaten = weaker | less_likely | ~(same & ~agrees & in_reach)
+        chosen = fits & beaten.all(axis=1)
+        self._pending = list(compress(pending, in_reach & ~known & ~chosen))
+        return list(compress(pending, chosen))
+
+    def _agreement(
+        self, older: I64, newer: I64, measured: F64, nodes: F64, travel_m: F64
+    ) -> NDArray[np.bool_]:
+        """Return a mask (C, C) of the pairs of candidates that are consistent with the travel between them.
+
+        older, newer : (C,) place maps. measured : (C, 3) x, y, yaw of the newer in the older.
+        """
+        p = self._parameters
+        travelled_m = np.abs(travel_m[newer][:, None] - travel_m[newer])
+        travelled_m += np.abs(travel_m[older][:, None] - travel_m[older])
+        first, second = (k.ravel() for k in np.indices(travelled_m.shape))
+        there = compose(measured[first], between(nodes[newer[first]], nodes[newer[second]]))
+        again = compose(between(nodes[older[first]], nodes[older[second]]), measured[second])
+        apart = _mahalanobis(
+            between(there, again),
+            p.short_m + p.short_per_m * travelled_m.ravel(),
+            p.short_rad + p.drift_rad_per_m * travelled_m.ravel(),
+        )
+        return (apart <= p.consistent).reshape(travelled_m.shape)
+
+
+def _mahalanobis(error: F64, sigma_m: F64, sigma_rad: F64) -> F64:
+    """Return the length (N,) of errors (N, 3) of x, y, yaw in standard deviations."""
+    yaw = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
+    return np.asarray(np.sqrt((error[:, 0] ** 2 + error[:, 1] ** 2) / sigma_m**2 + yaw**2 / sigma_rad**2))

@@ -29,7 +29,7 @@ class OccupancyParameters:
     hit, miss, limit : log-odds in hundredths, as int16 adds them. One hit makes a cell occupied by nav2's
         threshold, two misses make it free. A hit weighs two misses, so a thin wall that passing rays graze
         stays; three misses clear a person who has left.
-    body_m : radius of the robot's body around the origin of the base, where no obstacle can be.
+    body_m : radius of the robot's body around the origin of the base, which is free of obstacles.
     lone_window, lone_cells : a cell that was hit once is noise if at least `lone_cells` cells in the square
         of `lone_window` around it were hit more often.
     """
@@ -43,45 +43,16 @@ class OccupancyParameters:
 
 
 OCCUPANCY = OccupancyParameters()
-Window = tuple[slice, slice]
+Slices = tuple[slice, slice]
 """Rows and columns of a part of an array."""
-
-_TILE = 256  # cells along the edge of a tile
-
-
-class _Tile:
-    """A square of cells: evidence for walls and for things, log-odds in hundredths, and heights (`SLICES`).
-
-    observed : cells that something was added to.
-    """
-
-    def __init__(self) -> None:
-        self.walls = np.zeros((_TILE, _TILE), np.int16)
-        self.things = np.zeros((_TILE, _TILE), np.int16)
-        self.observed = np.zeros((_TILE, _TILE), np.bool_)
-        self.heights = np.zeros((_TILE, _TILE), np.uint8)
-
-
-def _under(low: I64, shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, int], Window, Window]]:
-    """The tiles under a window (h, w) whose first cell is in the column and the row `low`.
-
-    Of each its row and column among the tiles, and which of its cells are which of the window.
-    """
-    (x0, y0), (height, width) = low.tolist(), shape
-    for row in range(y0 // _TILE, (y0 + height - 1) // _TILE + 1):
-        for column in range(x0 // _TILE, (x0 + width - 1) // _TILE + 1):
-            r, c = row * _TILE - y0, column * _TILE - x0
-            of_window = np.s_[max(r, 0) : min(r + _TILE, height), max(c, 0) : min(c + _TILE, width)]
-            of_tile = np.s_[max(-r, 0) : min(_TILE, height - r), max(-c, 0) : min(_TILE, width - c)]
-            yield (row, column), of_tile, of_window
 
 
 class GridBuilder:
     """Draws planar scans into a growing grid.
 
     Cells are aligned to multiples of the resolution in the session's frame. A cell that no planar scan
-    observed stays unknown. Things on the floor that are no walls have evidence of their own: what was taken
-    for a wall until rays passed over it becomes a thing.
+    observed stays unknown. Low obstacles have evidence of their own: what was taken for a wall until rays
+    passed over it becomes a low obstacle.
     """
 
     def __init__(self, config: ProjectionConfig, parameters: OccupancyParameters = OCCUPANCY) -> None:
@@ -123,7 +94,8 @@ class GridBuilder:
         self._check_size(len(self._tiles) * _TILE * _TILE)
 
     def _drawn(self, planar_scan: PlanarScan, T_grid_base: SE2) -> tuple[NDArray[np.int16], I64, I64, I64]:
-        """The log-odds (h, w) that a planar scan adds for walls, and the cells of its hits and things.
+        """Return the log-odds (h, w) that a planar scan adds for walls, and the cells of its hits and low
+        obstacles.
 
         The latter (M, 2) and (L, 2) are columns and rows of the window, whose first cell is at the last array
         (2,), column and row in the grid's frame.
@@ -158,7 +130,7 @@ class GridBuilder:
         np.clip(evidence + more, -limit, limit, out=evidence)
 
     def grid(self) -> OccupancyGrid:
-        """The map so far: 0..100 where observed, unknown elsewhere, cropped to the observed part."""
+        """Return the map so far: 0..100 where observed, unknown elsewhere, cropped to the observed part."""
         resolution = self._config.resolution_m
         if not self._tiles:
             return OccupancyGrid(
@@ -193,7 +165,7 @@ class GridBuilder:
 
     @property
     def _height_m(self) -> float | None:
-        """Of the plane that all planar scans are of; None if they are not of one."""
+        """Return the height of the scan plane; None if the scans are not all of one plane."""
         low_m, high_m = self._planes_m or (math.nan, math.nan)
         return low_m if high_m - low_m < self._config.resolution_m else None
 
@@ -215,13 +187,45 @@ class GridBuilder:
             )
 
 
+_TILE = 256  # cells along the edge of a tile
+
+
+class _Tile:
+    """A square of cells: evidence for walls and for low obstacles, log-odds in hundredths, and heights
+    (`SLICES`).
+
+    observed : cells with any observation.
+    """
+
+    def __init__(self) -> None:
+        self.walls = np.zeros((_TILE, _TILE), np.int16)
+        self.things = np.zeros((_TILE, _TILE), np.int16)
+        self.observed = np.zeros((_TILE, _TILE), np.bool_)
+        self.heights = np.zeros((_TILE, _TILE), np.uint8)
+
+
+def _under(low: I64, shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, int], Slices, Slices]]:
+    """Yield the tiles under a window (h, w) whose first cell is in the column and the row `low`.
+
+    Each comes with its row and column among the tiles, its cells in the tile, and the same cells in the
+    window.
+    """
+    (x0, y0), (height, width) = low.tolist(), shape
+    for row in range(y0 // _TILE, (y0 + height - 1) // _TILE + 1):
+        for column in range(x0 // _TILE, (x0 + width - 1) // _TILE + 1):
+            r, c = row * _TILE - y0, column * _TILE - x0
+            of_window = np.s_[max(r, 0) : min(r + _TILE, height), max(c, 0) : min(c + _TILE, width)]
+            of_tile = np.s_[max(-r, 0) : min(_TILE, height - r), max(-c, 0) : min(_TILE, width - c)]
+            yield (row, column), of_tile, of_window
+
+
 def _percent(log_odds: NDArray[np.floating] | np.floating) -> NDArray[np.floating]:
-    """Log-odds in hundredths as a probability in percent."""
+    """Return log-odds in hundredths as a probability in percent."""
     return np.asarray(OCCUPIED / (1.0 + np.exp(-log_odds / np.float32(100.0))))
 
 
 def _count_around(mask: NDArray[np.bool_], width: int) -> NDArray[np.uint8]:
-    """Number of cells of the mask (H, W) in the square of `width` cells around each cell."""
+    """Count the cells of the mask (H, W) in the square of `width` cells around each cell."""
     return np.asarray(
         cv2.boxFilter(
             mask.astype(np.uint8), -1, (width, width), normalize=False, borderType=cv2.BORDER_CONSTANT
@@ -231,7 +235,8 @@ def _count_around(mask: NDArray[np.bool_], width: int) -> NDArray[np.uint8]:
 
 
 def _rims(corners: NDArray[np.int32], free_m: NDArray[np.float32]) -> list[NDArray[np.int32]]:
-    """The parts of an outline (B, 2) at known ranges; elsewhere the outline runs through the sensor."""
+    """Return the parts of an outline (B, 2) at known ranges; elsewhere the outline runs through the
+    sensor."""
     known = np.flatnonzero(free_m > 0)
     if len(known) == len(free_m):
         return [np.concatenate((corners, corners[:1]))]

@@ -1,9 +1,4 @@
-"""The map of each part of a session: its keyframes drawn at their poses after loop closure.
-
-Poses after loop closure: of the keyframes, and from these of every scan.
-
-The report of a session map: scans that are not in it, and warnings with what to do.
-"""
+"""The end of a session: its poses after loop closure, the map of each part, and its report with warnings."""
 
 from __future__ import annotations
 
@@ -23,8 +18,8 @@ from pc2grid.mapping.graph import (
     HeightStep,
     floor_warning,
     floors_apart_m,
+    optimised_heights,
     rise_between,
-    settled_heights,
 )
 from pc2grid.mapping.keyframes import KeyframePoints, Keyframes, Track, grid_of
 from pc2grid.mapping.parts import PARTS, odometry_warnings
@@ -32,23 +27,87 @@ from pc2grid.mapping.quality import consistency_warning, measure_consistency, pr
 from pc2grid.model import Health, Loop, ReadReport, SessionMap, Trajectory, part_name
 from pc2grid.settings import ProjectionConfig
 
-_WARN_DEGENERATE = 0.1
-"""Share of degenerate scans above which the report says so; chosen by hand."""
+
+@dataclass(frozen=True, slots=True)
+class OptimisedKeyframes:
+    """The poses of a session's keyframes after loop closure.
+
+    scans : (K,) number of each keyframe's scan. poses : (K, 3) x, y, yaw of each in the session's frame.
+    loops : between the scans at the anchors of local maps that overlap.
+    segments : (K,) number of the segment of each; a new one begins where the pose relative to the keyframe
+    before is unknown. parts : (K,) number of the part of each: segments that loops join. Poses of different
+    parts are unrelated; see `pc2grid.mapping.parts`.
+    anchors : (N,) numbers, in `scans`, of the keyframes at the anchors of the local maps.
+    sigma_m : (N,) standard deviation of the position of each of these within its part, in the least certain
+        direction; see `pc2grid.mapping.quality`.
+    """
+
+    scans: I64
+    poses: F64
+    loops: tuple[Loop, ...]
+    segments: I64
+    parts: I64
+    anchors: I64
+    sigma_m: F64
+
+    @classmethod
+    def empty(cls) -> OptimisedKeyframes:
+        """Return those of a session without keyframes."""
+        none = np.empty(0, np.int64)
+        return cls(none, np.empty((0, 3)), (), segments=none, parts=none, anchors=none, sigma_m=np.empty(0))
+
+    def undivided(self) -> OptimisedKeyframes:
+        """Return the same keyframes as one part of one segment."""
+        together = np.zeros(len(self.scans), np.int64)
+        return replace(self, segments=together, parts=together)
+
+
+def interpolate_corrections(tracked: F64, known: Sequence[int] | I64, corrected: F64) -> F64:
+    """Return poses (N, 3) of all scans, from the corrected poses (K, 3) of those of them that are `known`.
+
+    Between two of these the correction passes linearly from one to the other, so the tracked motion between
+    them stays smooth.
+    """
+    index = np.asarray(known)
+    scans = np.arange(len(tracked))
+    left = np.clip(np.searchsorted(index, scans, side="right") - 1, 0, len(index) - 1)
+    right = np.minimum(left + 1, len(index) - 1)
+    a, b = _moved(tracked, index, corrected, left), _moved(tracked, index, corrected, right)
+    span = np.maximum(index[right] - index[left], 1)
+    share = np.clip((scans - index[left]) / span, 0.0, 1.0)[:, None]
+    mixed: F64 = a + share * np.column_stack((b[:, :2] - a[:, :2], wrap_angle(b[:, 2] - a[:, 2])))
+    mixed[:, 2] = wrap_angle(mixed[:, 2])
+    return mixed
+
+
+def _moved(tracked: F64, index: NDArray[np.integer], corrected: F64, which: NDArray[np.integer]) -> F64:
+    """Move every scan as if rigidly attached to the known scan number `which` (N,)."""
+    old, new = tracked[index[which]], corrected[which]
+    turn = new[:, 2] - old[:, 2]
+    c, s = np.cos(turn), np.sin(turn)
+    d = tracked[:, :2] - old[:, :2]
+    moved: F64 = np.column_stack(
+        (new[:, 0] + c * d[:, 0] - s * d[:, 1], new[:, 1] + s * d[:, 0] + c * d[:, 1], tracked[:, 2] + turn)
+    )
+    return moved
+
+
+# The map of each part.
 
 
 def draw_parts(
     keyframes: Keyframes,
     track: Track,
-    closed: SettledKeyframes,
+    closed: OptimisedKeyframes,
     projection: ProjectionConfig,
     points: KeyframePoints | None = None,
 ) -> list[SessionMap]:
-    """The map of each part of a session in a frame of its own, compared with its scans.
+    """Draw the map of each part of a session in a frame of its own, and compare it with its scans.
 
     points : in space, of the keyframes; None: the maps have none.
     The maps have no name, no sensor and no submaps yet.
     """
-    part, T_part_base = _settled(track.trajectory, closed)
+    part, T_part_base = _optimised(track.trajectory, closed)
     floors_m = _level(T_part_base, part, closed, np.array(keyframes.above_floor_m), points)
     everywhere = dataclasses.replace(track.trajectory, T_session_base=T_part_base)
     drawn = []
@@ -89,42 +148,13 @@ def draw_parts(
 
 
 def long_enough(parts: Sequence[SessionMap]) -> list[SessionMap]:
-    """The parts that are long enough to be recognised, or the longest one if none is."""
+    """Return the parts that are long enough to be recognised, or the longest one if none is."""
     kept = [part for part in parts if part.trajectory.length_m >= PARTS.least_travel_m]
     return kept or [max(parts, key=lambda part: part.trajectory.length_m)]
 
 
-def _report(trajectory: Trajectory, of_map: Sequence[str]) -> ReadReport:
-    """The report of a part alone: its scans, those that were lost, and warnings, the last ones `of_map`."""
-    lost = [k for k, health in enumerate(trajectory.health) if health is Health.LOST]
-    weak = sum(health is Health.DEGENERATE for health in trajectory.health)
-    total, warnings = len(trajectory), []
-    if lost:
-        seconds = (trajectory.stamps_ns[lost[0]] - trajectory.stamps_ns[0]) * 1e-9
-        warnings.append(
-            f"registration was lost for {len(lost)} of {total} scans, first {seconds:.1f} s after the first "
-            "scan; they are not in the map"
-        )
-    if weak > _WARN_DEGENERATE * total:
-        warnings.append(
-            f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
-            "or on the motion before"
-        )
-    skipped = {"registration lost": len(lost)} if lost else {}
-    return ReadReport(scans_read=total, scans_skipped=skipped, warnings=(*warnings, *of_map))
-
-
-def _of_scans(trajectory: Trajectory, scans: I64) -> Trajectory:
-    """Some scans of a trajectory, by their numbers (M,)."""
-    return Trajectory(
-        stamps_ns=trajectory.stamps_ns[scans],
-        T_session_base=trajectory.T_session_base[scans],
-        health=tuple(trajectory.health[k] for k in scans.tolist()),
-    )
-
-
-def _settled(tracked: Trajectory, closed: SettledKeyframes) -> tuple[I64, F64]:
-    """The part (N,) of each scan, and its pose (N, 4, 4) in the frame of the part after loop closure.
+def _optimised(tracked: Trajectory, closed: OptimisedKeyframes) -> tuple[I64, F64]:
+    """Return the part (N,) of each scan, and its pose (N, 4, 4) in the frame of the part after loop closure.
 
     A scan belongs to the keyframe before it. Scans before the first keyframe belong to that. The frame of the
     first part is that of the session; that of another is the base at its first scan, levelled.
@@ -148,29 +178,29 @@ def _settled(tracked: Trajectory, closed: SettledKeyframes) -> tuple[I64, F64]:
     return part, T_session_base
 
 
-def _moved_in_plane(T_session_base: F64, tracked: F64, settled: F64) -> F64:
-    """Spatial poses (N, 4, 4), moved as their planar poses (N, 3) move from `tracked` to `settled`.
+def _moved_in_plane(T_session_base: F64, tracked: F64, optimised: F64) -> F64:
+    """Move spatial poses (N, 4, 4) as their planar poses (N, 3) move from `tracked` to `optimised`.
 
     Tilt and height stay as they are.
     """
-    turn_rad = settled[:, 2] - tracked[:, 2]
+    turn_rad = optimised[:, 2] - tracked[:, 2]
     c, s = np.cos(turn_rad), np.sin(turn_rad)
     rotation = np.zeros((len(turn_rad), 3, 3))
     rotation[:, 0, 0], rotation[:, 0, 1], rotation[:, 1, 0], rotation[:, 1, 1] = c, -s, s, c
     rotation[:, 2, 2] = 1.0
     moved = T_session_base.copy()
     moved[:, :3, :3] = rotation @ T_session_base[:, :3, :3]
-    moved[:, :2, 3] = settled[:, :2]
+    moved[:, :2, 3] = optimised[:, :2]
     return moved
 
 
 def _level(
-    T_part_base: F64, part: I64, closed: SettledKeyframes, above_floor_m: F64, points: KeyframePoints | None
+    T_part_base: F64, part: I64, closed: OptimisedKeyframes, above_floor_m: F64, points: KeyframePoints | None
 ) -> list[float | None]:
-    """Give the poses (N, 4, 4) of all scans their height above one level floor, in place.
+    """Set the heights of the poses (N, 4, 4) of all scans to those above one level floor, in place.
 
-    above_floor_m : (K,) of the keyframes, as seen. Returns how far the floors of each part lie apart. Where
-    no keyframe sees a floor, as on wheels, heights stay as they are.
+    above_floor_m : (K,) of the keyframes, as measured. Returns the spread of the floors of each part. Where
+    no keyframe shows a floor, as on wheels, heights stay as they are.
     """
     apart_m: list[float | None] = []
     for number in range(int(part.max(initial=0)) + 1):
@@ -183,7 +213,7 @@ def _level(
         travel_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(way, axis=0).T)))
         restarts = np.flatnonzero(np.diff(closed.segments[own])) + 1
         loops = [] if points is None else _height_loops(T_part_base, closed, own, points)
-        heights_m = settled_heights(tracked_m, travel_m, seen_m, restarts, loops)
+        heights_m = optimised_heights(tracked_m, travel_m, seen_m, restarts, loops)
         apart_m.append(floors_apart_m(heights_m, seen_m))
         raised_m = heights_m - tracked_m
         of_part = np.flatnonzero(part == number)
@@ -192,9 +222,9 @@ def _level(
 
 
 def _height_loops(
-    T_part_base: F64, closed: SettledKeyframes, own: I64, points: KeyframePoints
+    T_part_base: F64, closed: OptimisedKeyframes, own: I64, points: KeyframePoints
 ) -> list[HeightStep]:
-    """The loops between some keyframes (K,), as far as the points of both tell how high these lie."""
+    """Return the loops between some keyframes (K,) whose relative height the points of both fix."""
     number, found = {int(closed.scans[k]): i for i, k in enumerate(own)}, []
     for loop in closed.loops:
         if not loop.accepted or loop.older not in number or loop.newer not in number:
@@ -211,7 +241,7 @@ def _height_loops(
 
 
 def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
-    """The loops between two of the scans, numbered within these."""
+    """Return the loops between two of the scans, numbered within these."""
     number = {scan: k for k, scan in enumerate(scans.tolist())}
     return tuple(
         dataclasses.replace(loop, older=number[loop.older], newer=number[loop.newer])
@@ -220,70 +250,19 @@ def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
     )
 
 
-@dataclass(frozen=True, slots=True)
-class SettledKeyframes:
-    """The poses of a session's keyframes after loop closure.
-
-    scans : (K,) number of each keyframe's scan. poses : (K, 3) x, y, yaw of each in the session's frame.
-    loops : between the scans at the anchors of local maps that overlap.
-    segments : (K,) number of the segment of each; a new one begins where the pose relative to the keyframe
-        before is unknown. parts : (K,) number of the part of each: segments that loops join. Poses of
-        different parts have nothing to do with each other; see `pc2grid.mapping.parts`.
-    anchors : (N,) numbers, in `scans`, of the keyframes at the anchors of the local maps.
-    sigma_m : (N,) standard deviation of the position of each of these within its part, in the least certain
-        direction; see `pc2grid.mapping.quality`.
-    """
-
-    scans: I64
-    poses: F64
-    loops: tuple[Loop, ...]
-    segments: I64
-    parts: I64
-    anchors: I64
-    sigma_m: F64
-
-    @classmethod
-    def empty(cls) -> SettledKeyframes:
-        """Those of a session without keyframes."""
-        none = np.empty(0, np.int64)
-        return cls(none, np.empty((0, 3)), (), segments=none, parts=none, anchors=none, sigma_m=np.empty(0))
-
-    def undivided(self) -> SettledKeyframes:
-        """The same, as if nothing in it were unknown."""
-        together = np.zeros(len(self.scans), np.int64)
-        return replace(self, segments=together, parts=together)
-
-
-def interpolate_corrections(tracked: F64, known: Sequence[int] | I64, corrected: F64) -> F64:
-    """Poses (N, 3) of all scans, from the corrected poses (K, 3) of those of them that are `known`.
-
-    Between two of these the correction passes linearly from one to the other, so the motion that was
-    tracked between them stays smooth.
-    """
-    index = np.asarray(known)
-    scans = np.arange(len(tracked))
-    left = np.clip(np.searchsorted(index, scans, side="right") - 1, 0, len(index) - 1)
-    right = np.minimum(left + 1, len(index) - 1)
-    a, b = _moved(tracked, index, corrected, left), _moved(tracked, index, corrected, right)
-    span = np.maximum(index[right] - index[left], 1)
-    share = np.clip((scans - index[left]) / span, 0.0, 1.0)[:, None]
-    mixed: F64 = a + share * np.column_stack((b[:, :2] - a[:, :2], wrap_angle(b[:, 2] - a[:, 2])))
-    mixed[:, 2] = wrap_angle(mixed[:, 2])
-    return mixed
-
-
-def _moved(tracked: F64, index: NDArray[np.integer], corrected: F64, which: NDArray[np.integer]) -> F64:
-    """Every scan as if rigidly attached to the known scan number `which` (N,)."""
-    old, new = tracked[index[which]], corrected[which]
-    turn = new[:, 2] - old[:, 2]
-    c, s = np.cos(turn), np.sin(turn)
-    d = tracked[:, :2] - old[:, :2]
-    moved: F64 = np.column_stack(
-        (new[:, 0] + c * d[:, 0] - s * d[:, 1], new[:, 1] + s * d[:, 0] + c * d[:, 1], tracked[:, 2] + turn)
+def _of_scans(trajectory: Trajectory, scans: I64) -> Trajectory:
+    """Select some scans of a trajectory, by their numbers (M,)."""
+    return Trajectory(
+        stamps_ns=trajectory.stamps_ns[scans],
+        T_session_base=trajectory.T_session_base[scans],
+        health=tuple(trajectory.health[k] for k in scans.tolist()),
     )
-    return moved
 
 
+# Reports and warnings.
+
+_WARN_DEGENERATE = 0.1
+"""Share of degenerate scans above which the report says so; chosen by hand."""
 _MOST_LOST = 0.2
 """Share of lost scans above which a laser gives no map without odometry: its parts do not hang together.
 Chosen by hand."""
@@ -291,30 +270,25 @@ _STOREY_M = 2.0
 """A hand lifts a sensor by less than this, and storeys are at least 2.4 m high; chosen by hand."""
 
 
-def check_followed(trajectory: Trajectory, name: str) -> None:
-    """Raise TrackingLost if more than a fifth of the scans of the log `name` are lost."""
-    lost = [health is Health.LOST for health in trajectory.health]
-    if sum(lost) <= _MOST_LOST * len(lost):
-        return
-    first_s = (trajectory.stamps_ns[lost.index(True)] - trajectory.stamps_ns[0]) * 1e-9
-    raise TrackingLost(
-        f"{name}: {sum(lost)} of {len(lost)} scans could not be followed, first {first_s:.1f} s after the "
-        "first scan, and the log has no odometry",
-        hint="--odometry TOPIC names a topic with odometry, --start and --duration a part that can be "
-        "followed; else record odometry, or scans that are closer together",
-    )
-
-
-def lost_warnings(health: Sequence[Health]) -> list[str]:
-    """At most one sentence: that a query, with scans of this health, begins anew where tracking was lost."""
-    lost = [number for number, of_scan in enumerate(health, start=1) if of_scan is Health.LOST]
-    if not lost:
-        return []
-    return [
-        f"{len(lost)} of {len(health)} scans could not be followed, so only the last "
-        f"{len(health) - lost[-1]} count; record odometry, or more scans a second, or corners and furniture "
-        "in place of bare walls"
-    ]
+def _report(trajectory: Trajectory, of_map: Sequence[str]) -> ReadReport:
+    """Return the report of a part alone: its scans, those that were lost, and warnings, the last ones
+    `of_map`."""
+    lost = [k for k, health in enumerate(trajectory.health) if health is Health.LOST]
+    weak = sum(health is Health.DEGENERATE for health in trajectory.health)
+    total, warnings = len(trajectory), []
+    if lost:
+        seconds = (trajectory.stamps_ns[lost[0]] - trajectory.stamps_ns[0]) * 1e-9
+        warnings.append(
+            f"registration was lost for {len(lost)} of {total} scans, first {seconds:.1f} s after the first "
+            "scan; they are not in the map"
+        )
+    if weak > _WARN_DEGENERATE * total:
+        warnings.append(
+            f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
+            "or on the motion before"
+        )
+    skipped = {"registration lost": len(lost)} if lost else {}
+    return ReadReport(scans_read=total, scans_skipped=skipped, warnings=(*warnings, *of_map))
 
 
 def part_reports(
@@ -324,10 +298,10 @@ def part_reports(
     kept: Sequence[SessionMap],
     walls_changed_ns: Collection[int] = (),
 ) -> list[ReadReport]:
-    """The report of each part that is kept.
+    """Return the report of each part that is kept.
 
     report : of the reader. It becomes part of that of the first part; the scans of the others are counted in
-        theirs.
+    theirs.
     walls_changed_ns : as of a `Track`.
     """
     first, *others = (part.report for part in kept)
@@ -350,7 +324,7 @@ def division_warning(
     kept: Sequence[SessionMap],
     walls_changed_ns: Collection[int] = (),
 ) -> str:
-    """One sentence that says into what a recording was divided, where, and what to do."""
+    """Return a warning with the parts of a divided recording, where they begin, and what to do."""
     start_ns = min(int(part.trajectory.stamps_ns[0]) for part in parts if len(part.trajectory))
 
     def begin_s(part: SessionMap) -> float:
@@ -380,8 +354,35 @@ def division_warning(
     )
 
 
+def check_followed(trajectory: Trajectory, name: str) -> None:
+    """Raise TrackingLost if more than a fifth of the scans of the log `name` are lost."""
+    lost = [health is Health.LOST for health in trajectory.health]
+    if sum(lost) <= _MOST_LOST * len(lost):
+        return
+    first_s = (trajectory.stamps_ns[lost.index(True)] - trajectory.stamps_ns[0]) * 1e-9
+    raise TrackingLost(
+        f"{name}: {sum(lost)} of {len(lost)} scans could not be followed, first {first_s:.1f} s after the "
+        "first scan, and the log has no odometry",
+        hint="--odometry TOPIC names a topic with odometry, --start and --duration a part that can be "
+        "followed; else record odometry, or scans that are closer together",
+    )
+
+
+def lost_warnings(health: Sequence[Health]) -> list[str]:
+    """Return a warning if a query, with scans of this health, begins anew where tracking was lost; else
+    nothing."""
+    lost = [number for number, of_scan in enumerate(health, start=1) if of_scan is Health.LOST]
+    if not lost:
+        return []
+    return [
+        f"{len(lost)} of {len(health)} scans could not be followed, so only the last "
+        f"{len(health) - lost[-1]} count; record odometry, or more scans a second, or corners and furniture "
+        "in place of bare walls"
+    ]
+
+
 def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
-    """The report of a recording, with what was assumed, and what is said of odometry and of heights."""
+    """Return the report of a recording with warnings of the track: assumptions, odometry and heights."""
     warnings, skipped = [*report.warnings], dict(report.scans_skipped)
     if track.warning is not None:
         warnings.append(track.warning)
@@ -393,7 +394,7 @@ def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
 
 
 def height_warnings(heights_m: F64, trajectory: Trajectory) -> list[str]:
-    """At most one sentence: that scans are as high (N,) above others as another floor is, and what to do."""
+    """Return a warning if some scans are higher (N,) than others by a floor of a house; else nothing."""
     known = np.flatnonzero(np.isfinite(heights_m))
     rise_m = heights_m[known] - heights_m[known[:1]]
     away = known[np.abs(rise_m) > _STOREY_M]

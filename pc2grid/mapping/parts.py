@@ -1,14 +1,12 @@
-"""Parts of a session that cannot be placed to each other.
+"""Checks of a whole session: which of its parts hang together, and whether odometry agrees with the scans.
 
-Where tracking was lost and started again, the pose relative to what was before is unknown: a new segment
-begins. Loops that were accepted between two segments join them again; what remains unconnected is a part,
-and becomes a session of its own.
+Where tracking was lost and started again, the pose relative to earlier scans is unknown: a new segment
+begins. Loops that were accepted between two segments join them again. A component of joined segments is a
+part, and becomes a session of its own (`connected`).
 
-What is wrong with odometry, or with where tf puts the sensor, in a whole recording.
-
-The scans show how the robot moves. Odometry that reports the opposite all the time, or nothing, does not
-merely slip: the sensor is mounted upside down, or turned by half a turn, and tf does not say so; or the
-odometry has a wrong sign, stands still, or knows no turns. A map of such a recording may be mirrored.
+Odometry that reports the opposite motion all the time, or none, does not merely slip: the sensor is mounted
+upside down, or turned by half a turn, and tf does not contain it; or the odometry has a wrong sign, stands
+still, or measures no turns. A map of such a recording may be mirrored (`odometry_warnings`).
 """
 
 from __future__ import annotations
@@ -33,8 +31,8 @@ class PartParameters:
 
     joining : different local maps on each of the two sides that must be in agreeing loops, to join
         them; a single room may look like another one. Chosen by hand.
-    least_travel_m : a part with less travel is left out: later recordings are recognised by stretches of 8 m
-        and more.
+    least_travel_m : a part with less travel is left out: later recordings are recognised by 8 m of travel and
+    more.
     """
 
     joining: int = 2
@@ -45,10 +43,10 @@ PARTS = PartParameters()
 
 
 def connected(segment: I64, loops: Sequence[Edge]) -> I64:
-    """(N,) number of the part of each local map, in the order in which the parts begin.
+    """Return the number (N,) of the part of each local map, in the order in which the parts begin.
 
-    segment : (N,) number of the segment of each, from 0. loops : that were accepted. Two segments are joined
-    if enough different local maps of the one lie on enough different ones of the other.
+    segment : (N,) number of the segment of each, from 0. loops : accepted ones. Two segments are joined if
+    enough different local maps of the one overlap enough different ones of the other.
     """
     ends: dict[tuple[int, int], list[Edge]] = {}
     for loop in loops:
@@ -80,9 +78,9 @@ between the others is no measure of it. In eight real recordings it reports .93 
 class _Kind:
     """A kind of motion.
 
-    columns : of motions (M, 6). least : less than this in all, metres or radians, says nothing of odometry;
-    chosen by hand. opposite, otherwise : what a user is told of odometry that reports the opposite, and of
-    odometry that is no measure of it.
+    columns : of motions (M, 6). least : with less in all, metres or radians, odometry is not judged; chosen
+    by hand. opposite, otherwise : warnings for odometry that reports the opposite, and for odometry that does
+    not measure it.
     """
 
     columns: slice
@@ -113,7 +111,7 @@ _KINDS = (
 
 
 def odometry_warnings(trajectory: Trajectory, readings: F64) -> list[str]:
-    """At most two sentences for the user, on the travel and on the turns.
+    """Return at most two sentences for the user, on the travel and on the turns.
 
     readings : (N, 4, 4) T_odom_base at each scan, not finite where there is none.
     """
@@ -129,8 +127,10 @@ def odometry_warnings(trajectory: Trajectory, readings: F64) -> list[str]:
 
 
 def _motions(trajectory: Trajectory, readings: F64) -> tuple[F64, F64]:
-    """Motions (M, 6), in metres and as rotation vectors, by the scans and by odometry, between scans that fix
-    the pose."""
+    """Return motions (M, 6) by the scans and by odometry, in metres and as rotation vectors.
+
+    They are between scans that fix the pose.
+    """
     fixed = np.array([health in (Health.FINE, Health.OVERRULED) for health in trajectory.health], bool)
     lost = np.cumsum([health is Health.LOST for health in trajectory.health])
     usable = np.flatnonzero(fixed & np.isfinite(readings).all(axis=(1, 2)))
@@ -144,7 +144,7 @@ def _motions(trajectory: Trajectory, readings: F64) -> tuple[F64, F64]:
 
 
 def _apart(stamps_ns: NDArray[np.int64], scans: NDArray[np.intp]) -> list[int]:
-    """Of some scans, those that follow each other after the time over which motions are compared."""
+    """Select scans of which consecutive ones are at least `_APART_NS` apart."""
     chosen: list[int] = []
     for scan in scans.tolist():
         if not chosen or stamps_ns[scan] - stamps_ns[chosen[-1]] >= _APART_NS:
@@ -153,15 +153,15 @@ def _apart(stamps_ns: NDArray[np.int64], scans: NDArray[np.intp]) -> list[int]:
 
 
 def _step(a: F64, b: F64) -> F64:
-    """The motion (6,) from a pose (4, 4) to another one."""
+    """Return the motion (6,) from a pose (4, 4) to another one."""
     motion = invert_pose(a) @ b
     return np.concatenate((motion[:3, 3], rotation_vector(motion)))
 
 
 def _compared(shown: F64, reported: F64) -> tuple[float, float, float]:
-    """Motions (M, 3) beside those that are reported (M, 3).
+    """Compare motions (M, 3) by the scans with reported ones (M, 3).
 
-    Returns the sums of their lengths, and how much of what is shown odometry reports; a jump of it counts no
+    Returns the sums of their lengths, and the reported share of the motion by the scans; a jump counts no
     more than twice.
     """
     lengths = np.linalg.norm(shown, axis=1)

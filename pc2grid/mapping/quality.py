@@ -1,26 +1,20 @@
-"""Does a map agree with the scans it was drawn from?
+"""The quality of a map without ground truth: its consistency with its scans, and the precision of its poses.
 
-Where a trajectory is bent, the robot draws a place a second time beside the first. Scans of one visit then
-put walls on ground that scans of other visits saw free. A map of several scans keeps what most of them say,
-so the figure is, for each scan, the share of its wall hits that lie on free ground of the final map, away
-from every wall. No ground truth is needed. A place that was seen only once cannot disagree.
+Consistency. Where a trajectory is bent, the robot draws a place a second time beside the first. Scans of one
+visit then put walls on ground that scans of other visits observed as free. A map of several scans keeps the
+majority, so the measure is, for each scan, the share of its wall hits on free ground of the final map, away
+from every wall. A place that was visited only once cannot contradict itself. Only hits that end the view are
+taken as walls. People put hits on free ground as well, but they walk on: a hit counts only if the keyframe
+before or after has it too. Doors and moved chairs stay for a while, in one corner of the view, whereas a bent
+trajectory shifts whole walls for metres of travel. So the share is averaged over a few metres of travel, and
+only a large share counts.
 
-Only hits that end the view are taken as walls. People put hits on free ground as well, but they walk on: a
-hit counts only if the keyframe before or after has seen it too. Doors and moved chairs stay for a while, in
-one corner of the view, whereas a bent place shifts whole walls for metres of travel. So the share is averaged
-over a few metres of travel, and only a large share counts.
-
-How exactly the places of a map lie to each other, from the pose graph it was made with.
-
-A corridor that was driven once and never met again cannot contradict anything, so the checks of
-`consistency.py` are silent about it. But the pose graph knows: the covariance of its solution grows along
-such a corridor and shrinks wherever a loop ties it to the rest.
-
-The covariance of the poses is the inverse of the information matrix (Thrun, Burgard and Fox, "Probabilistic
-Robotics", chapter 11). It is stated relative to the part of the session that is well tied together, not to
-the first pose: the error of each position is what remains after the whole has been placed on the truth, with
-the weight of well-known places (the S-transformation of Baarda, 1973, as free networks are adjusted in
-geodesy).
+Precision. A corridor that was driven once cannot contradict anything, but the covariance of the pose graph
+grows along it, and shrinks wherever a loop ties it to the rest. The covariance of the poses is the inverse of
+the information matrix (Thrun, Burgard and Fox, "Probabilistic Robotics", chapter 11). It is given relative to
+the well-constrained part of the session, not to the first pose: the error of each position is that which
+remains after the whole has been fitted to the truth, weighted by how well each place is known (the
+S-transformation of Baarda, 1973, as free networks are adjusted in geodesy).
 """
 
 from __future__ import annotations
@@ -53,15 +47,16 @@ class ConsistencyParameters:
     wall_m : a hit on free ground counts if it is farther than this from every wall; three cells of the
         default resolution. From the same trial.
     sectors, behind_m : a hit counts if no other hit in its sector of the view lies more than `behind_m`
-        behind it: what a lidar sees over, or a floor taken for an obstacle, is no wall. Half a degree.
-    same_m : a neighbouring keyframe has seen a hit if it has a hit within this distance; two cells of the
-        default resolution.
+    behind it: an obstacle below the view of a lidar, or a floor taken for an obstacle, is no wall. Half a
+    degree.
+    same_m : a neighbouring keyframe confirms a hit if it has a hit within this distance; two cells of the
+    default resolution.
     window_m : travel over which the share of contradicting hits is averaged.
     turn_m_per_rad : travel that a turn on the spot counts as, as in loop closure.
     fewest_hits : of a window; with fewer, the share is computed as if there were so many.
     contradicted_from : share of the hits of a window from which its middle contradicts the map.
     bent_from : share of the travel that contradicts a map from which the map is called bent.
-    shown : stretches that are kept, the longest first.
+    shown : contradictions that are kept, the longest first.
 
     `window_m`, `contradicted_from` and `bent_from` were chosen on real logs and simulated drives, whose poses
     were the true ones, those with loops closed, those without loops, and true poses bent on purpose
@@ -115,7 +110,9 @@ def measure_consistency(
         hits_on_free=float(contradicting.sum() / max(hits.sum(), 1)),
         contradicted=share_of_keyframes,
         bent=share_of_keyframes >= parameters.bent_from,
-        stretches=_stretches(contradicted, shares, poses, trajectory.stamps_ns[index])[: parameters.shown],
+        stretches=_contradictions(contradicted, shares, poses, trajectory.stamps_ns[index])[
+            : parameters.shown
+        ],
     )
 
 
@@ -125,7 +122,7 @@ def consistency_warning(
     *,
     with_odometry: bool = False,
 ) -> str | None:
-    """One sentence that says where a map is bent and what to do; None if it is not bent.
+    """Return a warning with the place where a map is bent and what to do; None if it is not bent.
 
     with_odometry : the recording has odometry, so that it need not be advised.
     """
@@ -144,7 +141,8 @@ def consistency_warning(
 
 
 def _clear_ground(grid: OccupancyGrid, wall_m: float) -> BoolGrid:
-    """(H, W) free cells whose centres are farther than `wall_m` from the centre of every occupied cell."""
+    """Return the free cells (H, W) whose centres are farther than `wall_m` from the centre of every occupied
+    cell."""
     if not grid.cells.size:
         return np.zeros(grid.cells.shape, np.bool_)
     reach = math.floor(wall_m / grid.resolution_m)
@@ -159,7 +157,7 @@ def _clear_ground(grid: OccupancyGrid, wall_m: float) -> BoolGrid:
 class _Drawn:
     """The hits of a keyframe in the session frame.
 
-    index : number of its scan. hits_m : (M, 2) within reach. on_clear : (M,) which lie on clear ground.
+    index : number of its scan. hits_m : (M, 2) within reach. on_clear : (M,) mask of those on clear ground.
     """
 
     index: int
@@ -170,7 +168,7 @@ class _Drawn:
 def _drawn(
     keyframe: Keyframe, pose: SE2, grid: OccupancyGrid, clear: BoolGrid, parameters: ConsistencyParameters
 ) -> _Drawn:
-    """The hits that end the view, and which of them lie on clear ground."""
+    """Return the hits that end the view, and which of them lie on clear ground."""
     rays_m = keyframe.planar_scan.hits_m - keyframe.planar_scan.origin_m
     range_m, bearing_rad = np.hypot(*rays_m.T), np.arctan2(rays_m[:, 1], rays_m[:, 0])
     sector = (
@@ -188,16 +186,16 @@ def _drawn(
 
 
 def _with_neighbours(scans: Iterable[_Drawn]) -> Iterator[tuple[_Drawn | None, _Drawn, _Drawn | None]]:
-    """Each scan between the one before and the one after it; None at the two ends."""
+    """Yield each scan between the one before and the one after it; None at the two ends."""
     before, here, after = tee(scans, 3)
     next(after, None)
     return zip(chain((None,), before), here, chain(after, (None,)), strict=False)
 
 
 def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m: float) -> int:
-    """How many hits on clear ground a neighbouring scan has seen too, within `same_m`.
+    """Count the hits on clear ground that a neighbouring scan confirms within `same_m`.
 
-    Something that moves is elsewhere in the next keyframe; a wall in the wrong place is not.
+    A moving object is elsewhere in the next keyframe; a wall in the wrong place is not.
     """
     doubtful_m = scan.hits_m[scan.on_clear]
     seen_again = np.zeros(len(doubtful_m), np.bool_)
@@ -209,7 +207,7 @@ def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m
 
 
 def _window_shares(poses: F64, hits: I64, contradicting: I64, parameters: ConsistencyParameters) -> F64:
-    """Share of contradicting hits in the window of travel around each of the poses (K, 3)."""
+    """Return the share of contradicting hits in the window of travel around each of the poses (K, 3)."""
     steps = np.diff(poses, axis=0)
     step_m = np.hypot(steps[:, 0], steps[:, 1]) + parameters.turn_m_per_rad * np.abs(wrap_angle(steps[:, 2]))
     travel_m = np.concatenate(([0.0], np.cumsum(step_m)))
@@ -221,8 +219,10 @@ def _window_shares(poses: F64, hits: I64, contradicting: I64, parameters: Consis
     return shares
 
 
-def _stretches(contradicted: BoolGrid, shares: F64, poses: F64, stamps_ns: I64) -> tuple[Contradiction, ...]:
-    """The runs of contradicting keyframes (K,), the longest in metres first."""
+def _contradictions(
+    contradicted: BoolGrid, shares: F64, poses: F64, stamps_ns: I64
+) -> tuple[Contradiction, ...]:
+    """Return the runs of contradicting keyframes (K,), the longest in metres first."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], contradicted, [False]))))
     found = []
     for begin, end in edges.reshape(-1, 2).tolist():
@@ -238,7 +238,7 @@ def _stretches(contradicted: BoolGrid, shares: F64, poses: F64, stamps_ns: I64) 
                 share=float(shares[worst]),
             )
         )
-    return tuple(sorted(found, key=lambda stretch: (-stretch.length_m, stretch.from_ns)))
+    return tuple(sorted(found, key=lambda one: (-one.length_m, one.from_ns)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -269,11 +269,12 @@ def position_sigmas(
     walls: Sequence[WallDirection] | None = None,
     parameters: PrecisionParameters = PRECISION,
 ) -> tuple[F64, F64]:
-    """Standard deviation (N,) of each position in metres, in its least certain direction, and weights (N,).
+    """Return the standard deviation (N,) of each position in metres, in its least certain direction, and
+    weights (N,).
 
     poses : (N, 3) x, y, yaw that agree best with the edges. edges : those that count; they connect all poses.
     walls : of each pose, if the building's axes constrain the headings.
-    weights : with which the places count when the map is placed on the truth.
+    weights : of the places, when the map is fitted to the truth.
     """
     count = len(poses)
     sigma, weight = np.zeros(count), np.ones(count)
@@ -286,13 +287,13 @@ def position_sigmas(
     blocks = _diagonal_blocks(solve, count)
     moved = _moved_by_whole(poses)
     for _ in range(parameters.rounds):
-        # The whole is placed by weighted least squares: its motion is `placing` (3, 3 N) times the errors.
+        # The whole is placed by weighted least squares: its motion is `placement` (3, 3 N) times the errors.
         normal = np.einsum("n,nai,naj->ij", weight, moved, moved)
         by_pose = np.zeros((count, 3, 3))
         by_pose[:, :2] = weight[:, None, None] * moved @ np.linalg.inv(normal)
-        placing = by_pose.reshape(-1, 3)
-        with_errors = solve(placing)
-        of_whole = placing.T @ with_errors
+        placement = by_pose.reshape(-1, 3)
+        with_errors = solve(placement)
+        of_whole = placement.T @ with_errors
         across = with_errors.reshape(-1, 3, 3)[:, :2] @ moved.transpose(0, 2, 1)
         covariance = blocks - across - across.transpose(0, 2, 1)
         covariance += moved @ of_whole @ moved.transpose(0, 2, 1)
@@ -302,7 +303,7 @@ def position_sigmas(
 
 
 def _diagonal_blocks(solve: Callable[[F64], F64], count: int) -> F64:
-    """The covariance (N, 2, 2) of x and y of each of the poses.
+    """Return the covariance (N, 2, 2) of x and y of each of the poses.
 
     solve : the product of columns (3 N, K) with the covariance (3 N, 3 N) of all.
     """
@@ -318,7 +319,7 @@ def _diagonal_blocks(solve: Callable[[F64], F64], count: int) -> F64:
 
 
 def _moved_by_whole(poses: F64) -> F64:
-    """How each position moves (N, 2, 3) with a motion x, y, yaw of the whole about its middle."""
+    """Return the Jacobian (N, 2, 3) of each position in a motion x, y, yaw of the whole about its middle."""
     moved = np.zeros((len(poses), 2, 3))
     moved[:, 0, 0] = moved[:, 1, 1] = 1.0
     away = poses[:, :2] - poses[:, :2].mean(axis=0)
@@ -329,7 +330,8 @@ def _moved_by_whole(poses: F64) -> F64:
 def precision_of(
     trajectory: Trajectory, scans: I64, sigma_m: F64, parameters: PrecisionParameters = PRECISION
 ) -> Precision:
-    """The precision of a map, from the standard deviations (N,) at some of its scans (N,), in their order."""
+    """Return the precision of a map, from the standard deviations (N,) at some of its scans (N,), in their
+    order."""
     if not len(scans):
         return Precision()
     stamps_ns, xy, travel_m = trajectory.stamps_ns, trajectory.planar()[:, :2], trajectory.path_m()
@@ -356,12 +358,13 @@ def precision_of(
     return Precision(
         stamps_ns=tuple(stamps_ns[scans].tolist()),
         sigma_m=tuple(sigma_m.round(3).tolist()),
-        loose=tuple(sorted(found, key=lambda stretch: (-stretch.sigma_m, stretch.from_ns))),
+        loose=tuple(sorted(found, key=lambda one: (-one.sigma_m, one.from_ns))),
     )
 
 
 def precision_warning(precision: Precision, trajectory: Trajectory) -> str | None:
-    """One sentence that says which part of a map is weakly tied to the rest and what to do; None if none."""
+    """Return a warning with the part of a map that is weakly tied to the rest and what to do; None if none
+    is."""
     if not precision.loose:
         return None
     worst = precision.loose[0]

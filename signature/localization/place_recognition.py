@@ -17,7 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from pc2grid.mapping.loops import Recognition, Stretch
+from pc2grid.mapping.loops import PlaceMap, Recognition
 from pc2grid.matching.score import Fit
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
@@ -87,7 +87,7 @@ class SessionRecognizer:
         self._map = lru_cache(parameters.maps)(lambda index: SearchMap.of(self._grid(index)))
         self._places: Places | None = None
 
-    def recognize(self, newest: Stretch) -> Sequence[Recognition]:
+    def recognize(self, newest: PlaceMap) -> Sequence[Recognition]:
         """The earlier stretches that look like the newest one, each place with its own probability."""
         query = query_of(newest.grid, newest.poses[:, :2], self._made_with, self._config)
         found = [] if self._places is None else self._look_up(query, self._places)

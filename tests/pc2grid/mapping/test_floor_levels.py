@@ -13,11 +13,11 @@ from pc2grid.mapping.graph import (
     HeightStep,
     floor_warning,
     floors_apart_m,
+    optimised_heights,
     rise_between,
-    settled_heights,
 )
 from pc2grid.mapping.keyframes import Keyframe, Keyframes, Track
-from pc2grid.mapping.part_maps import SettledKeyframes, draw_parts
+from pc2grid.mapping.part_maps import OptimisedKeyframes, draw_parts
 from pc2grid.model import Health, SessionMap, Trajectory
 from pc2grid.settings import ProjectionConfig
 
@@ -42,8 +42,8 @@ def off_m(heights_m: F64) -> float:
 
 def test_the_floor_pins_the_height_and_nothing_else_does() -> None:
     seen = seen_floor()
-    assert off_m(settled_heights(TRACKED_M, WAY_M, seen, NO_RESTART)) < 0.03
-    nothing = settled_heights(TRACKED_M, WAY_M, np.full(COUNT, np.nan), NO_RESTART)
+    assert off_m(optimised_heights(TRACKED_M, WAY_M, seen, NO_RESTART)) < 0.03
+    nothing = optimised_heights(TRACKED_M, WAY_M, np.full(COUNT, np.nan), NO_RESTART)
     assert floors_apart_m(nothing, seen) == pytest.approx(0.36, abs=0.04)
     assert nothing == pytest.approx(TRACKED_M, abs=1e-6)
 
@@ -52,31 +52,31 @@ def test_floors_of_other_keyframes_pin_nothing() -> None:
     """The control: where a hand rises and sinks, heights that are shuffled contradict the steps."""
     seen = seen_floor()
     shuffled = np.random.default_rng(1).permutation(seen)
-    right, wrong = (settled_heights(TRACKED_M, WAY_M, of, NO_RESTART) for of in (seen, shuffled))
+    right, wrong = (optimised_heights(TRACKED_M, WAY_M, of, NO_RESTART) for of in (seen, shuffled))
     assert off_m(wrong) > 2.0 * off_m(right)
 
 
 def test_a_floor_that_is_seen_now_and_then_is_enough_and_a_table_is_no_floor() -> None:
     seen = seen_floor(every=10)
     seen[60:64], seen[130:133] = 0.7, 0.66
-    assert off_m(settled_heights(TRACKED_M, WAY_M, seen, NO_RESTART)) < 0.06
+    assert off_m(optimised_heights(TRACKED_M, WAY_M, seen, NO_RESTART)) < 0.06
 
 
 def test_loops_hold_the_height_where_no_floor_is_seen() -> None:
     """The floor is seen at the start only. The way back passes what was seen on the way there."""
     seen = np.where(np.arange(COUNT) < 10, seen_floor(), np.nan)
     loops = [HeightStep(k, COUNT - 1 - k, SWAY_M[COUNT - 1 - k] - SWAY_M[k], 0.03) for k in range(0, 100, 10)]
-    alone = settled_heights(TRACKED_M, WAY_M, seen, NO_RESTART)
-    closed = settled_heights(TRACKED_M, WAY_M, seen, NO_RESTART, loops)
+    alone = optimised_heights(TRACKED_M, WAY_M, seen, NO_RESTART)
+    closed = optimised_heights(TRACKED_M, WAY_M, seen, NO_RESTART, loops)
     assert abs(alone[-1] - HAND_M - SWAY_M[-1]) > 0.3
     assert abs(closed[-1] - HAND_M - SWAY_M[-1]) < 0.05
     false = [*loops, HeightStep(0, COUNT - 1, 0.5, 0.03)]
-    assert settled_heights(TRACKED_M, WAY_M, seen, NO_RESTART, false) == pytest.approx(closed, abs=0.03)
+    assert optimised_heights(TRACKED_M, WAY_M, seen, NO_RESTART, false) == pytest.approx(closed, abs=0.03)
 
 
 def test_where_tracking_was_lost_the_height_begins_anew() -> None:
     tracked = TRACKED_M + np.where(np.arange(COUNT) < 100, 0.0, 0.8)
-    assert off_m(settled_heights(tracked, WAY_M, seen_floor(), np.array([100]))) < 0.03
+    assert off_m(optimised_heights(tracked, WAY_M, seen_floor(), np.array([100]))) < 0.03
 
 
 def surfaces(rise_m: float, seed: int) -> F64:
@@ -116,7 +116,7 @@ def map_of(tracked_m: F64, above_floor_m: F64) -> SessionMap:
     trajectory = Trajectory(stamps_ns=np.arange(COUNT), T_session_base=poses, health=(Health.FINE,) * COUNT)
     together, none = np.zeros(COUNT, np.int64), np.empty(0, np.int64)
     planar = np.column_stack((poses[:, :2, 3], np.zeros(COUNT)))
-    closed = SettledKeyframes(
+    closed = OptimisedKeyframes(
         np.arange(COUNT), planar, (), segments=together, parts=together, anchors=none, sigma_m=np.empty(0)
     )
     track = Track(trajectory, [None] * COUNT, np.full((COUNT, 4, 4), np.nan))

@@ -13,7 +13,7 @@ STEP_M = 4.0
 
 
 def corridor(count: int) -> tuple[F64, F64]:
-    """Stretches along a straight corridor that was driven back and forth: poses and travel."""
+    """PlaceMaps along a straight corridor that was driven back and forth: poses and travel."""
     x = STEP_M * np.minimum(np.arange(count), 2 * (count // 2) - np.arange(count))
     nodes = np.column_stack((x, np.zeros(count), np.where(np.arange(count) < count // 2, 0.0, math.pi)))
     return nodes, STEP_M * np.arange(count)

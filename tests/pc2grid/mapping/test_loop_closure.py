@@ -13,8 +13,8 @@ from pc2grid.geometry import F64, SE2
 from pc2grid.mapping.graph import Edge, optimise
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import LocalMap, Overlap
-from pc2grid.mapping.loops import CandidateParameters, LoopCloser, LoopParameters, Recognition, Stretch
-from pc2grid.mapping.part_maps import SettledKeyframes, interpolate_corrections
+from pc2grid.mapping.loops import CandidateParameters, LoopCloser, LoopParameters, PlaceMap, Recognition
+from pc2grid.mapping.part_maps import OptimisedKeyframes, interpolate_corrections
 from tests.helpers.rooms import RESOLUTION_M
 
 Wall = tuple[tuple[float, float], tuple[float, float]]
@@ -110,7 +110,7 @@ def scan_of(pose: SE2, walls: list[Wall]) -> PlanarScan:
 
 def closed(
     poses: list[SE2], planar_scans: list[PlanarScan], restart: int | None = None, **options: Any
-) -> tuple[F64, SettledKeyframes]:
+) -> tuple[F64, OptimisedKeyframes]:
     """Settled poses of all keyframes, and the result of loop closure."""
     closer = LoopCloser(Keyframes(), **options)
     for k, (pose, planar_scan) in enumerate(zip(poses, planar_scans, strict=True)):
@@ -185,10 +185,10 @@ class KnowsTheTruth:
 
     def __init__(self, truth: list[SE2]) -> None:
         self._truth = truth
-        self.stretches: list[Stretch] = []
+        self.stretches: list[PlaceMap] = []
         self.frames: list[SE2] = []  # true pose of each stretch
 
-    def recognize(self, newest: Stretch) -> list[Recognition]:
+    def recognize(self, newest: PlaceMap) -> list[Recognition]:
         anchor = int(np.flatnonzero(np.abs(newest.poses).sum(axis=1) < 1e-9)[0])
         self.stretches.append(newest)
         self.frames.append(self._truth[newest.scans[anchor]])

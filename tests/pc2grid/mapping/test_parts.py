@@ -14,7 +14,7 @@ from pc2grid.mapping.graph import Edge
 from pc2grid.mapping.keyframes import Keyframe, Keyframes, Track
 from pc2grid.mapping.loops import LoopCloser, LoopParameters
 from pc2grid.mapping.part_maps import (
-    SettledKeyframes,
+    OptimisedKeyframes,
     draw_parts,
     height_warnings,
     long_enough,
@@ -80,7 +80,7 @@ def begin_of_second_lap() -> int:
 
 def mapped(
     keyframes: list[Keyframe], trajectory: Trajectory, parameters: LoopParameters
-) -> tuple[SettledKeyframes, list[SessionMap]]:
+) -> tuple[OptimisedKeyframes, list[SessionMap]]:
     kept = Keyframes()
     closer = LoopCloser(kept, parameters=parameters)
     for keyframe in keyframes:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, wrap_angle
-from pc2grid.mapping.loops import Stretch
+from pc2grid.mapping.loops import PlaceMap
 from pc2grid.matching.score import Fit
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config
@@ -53,9 +53,9 @@ def seen_from(grid: OccupancyGrid, pose: SE2) -> OccupancyGrid:
     return OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=origin_m)
 
 
-def stretch(index: int, grid: OccupancyGrid) -> Stretch:
+def stretch(index: int, grid: OccupancyGrid) -> PlaceMap:
     poses = np.column_stack((np.linspace(-1.0, 1.0, 9), np.zeros(9), np.zeros(9)))
-    return Stretch(index=index, grid=grid, poses=poses, scans=np.arange(9))
+    return PlaceMap(index=index, grid=grid, poses=poses, scans=np.arange(9))
 
 
 def test_an_earlier_place_is_recognised_and_a_new_one_is_not() -> None:
