@@ -478,8 +478,6 @@ class SessionGraph:
 
 # Place recognition.
 
-# Place recognition.
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceMap:

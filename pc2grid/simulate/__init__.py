@@ -1,7 +1,7 @@
 """Simulated recordings with ground truth: a robot with one of three sensors drives through a building.
 
 The building is a procedural office, a given floor plan, or a real building as a point cloud or a mesh.
-Nothing here is fitted to recordings of real sensors; numbers whose origin is not named are chosen by hand.
+Nothing here is fitted to recordings of real sensors; numbers without a named origin are chosen by hand.
 """
 
 from pc2grid.simulate.config import SimulationConfig

@@ -1,8 +1,7 @@
-"""The motion along a route: speeds, turns in place and short stops.
+"""The drive of a simulated robot: its route through free space, its motion along it, and its wheel odometry.
 
-The route of a robot through free space: first to places that it has not visited.
-
-Wheel odometry of a simulated drive.
+The route leads first to places that the robot has not visited. The motion has speeds, turns in place and
+short stops.
 """
 
 from __future__ import annotations
@@ -27,9 +26,10 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.simulate.config import DriveConfig, OdometryConfig
 from pc2grid.simulate.plan import clearance_m
 
+# The motion along a route.
+
 RATE_HZ = 100.0
 """Samples of a drive in a second."""
-
 _PAUSE_S = (0.5, 2.5)  # shortest and longest stop
 _SMOOTHING_S = 0.08  # standard deviation in time that inertia gives to every change of speed
 _LEAST_MPS = 0.02  # mean speed of a step; keeps the time of a step finite
@@ -49,16 +49,17 @@ class Drive:
 
     @property
     def duration_s(self) -> float:
-        """Time of the last pose."""
+        """Return the time of the last pose."""
         return (len(self.poses) - 1) / RATE_HZ
 
     @property
     def length_m(self) -> float:
-        """Distance driven."""
+        """Return the distance driven."""
         return float(np.linalg.norm(np.diff(self.poses[:, :2], axis=0), axis=1).sum())
 
     def at(self, times_s: F64) -> F64:
-        """Poses (..., 3) at times (...) in seconds; before the start and after the end the robot stands."""
+        """Return poses (..., 3) at times (...) in seconds; before the start and after the end the robot
+        stands."""
         position = np.clip(np.asarray(times_s) * RATE_HZ, 0, len(self.poses) - 1)
         low = np.minimum(position.astype(np.int64), max(len(self.poses) - 2, 0))
         high = np.minimum(low + 1, len(self.poses) - 1)
@@ -67,47 +68,9 @@ class Drive:
         return poses
 
     def pose(self, time_s: float) -> SE2:
-        """T_map_base."""
+        """Return T_map_base at a time."""
         x, y, yaw = (float(v) for v in self.at(np.array(time_s)))
         return SE2(x, y, wrap_angle(yaw))
-
-
-def _headings(points_m: F64) -> F64:
-    """Direction of the line at each of its points, radians, without jumps of 2 pi."""
-    reach = min(2, len(points_m) - 1)
-    index = np.arange(len(points_m))
-    ahead = points_m[np.minimum(index + reach, len(points_m) - 1)]
-    direction = ahead - points_m[np.maximum(index - reach, 0)]
-    return np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
-
-
-def _follow(points_m: F64, yaws: F64, config: DriveConfig) -> F64:
-    """Times (N,) along a line, starting and ending at rest, within speed, yaw rate and acceleration."""
-    steps = np.maximum(np.linalg.norm(np.diff(points_m, axis=0), axis=1), 1e-6)
-    bend = np.abs(np.gradient(yaws)) / np.gradient(np.concatenate(([0.0], np.cumsum(steps))))
-    bend = maximum_filter1d(bend, 5)
-    speed = np.minimum(config.speed_mps, config.yaw_rate_rps / np.maximum(bend, 1e-3))
-    speed[0] = speed[-1] = 0.0
-    for i in range(1, len(speed)):
-        speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + 2 * config.acceleration_mps2 * steps[i - 1]))
-    for i in range(len(speed) - 2, -1, -1):
-        speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + 2 * config.acceleration_mps2 * steps[i]))
-    seconds = 2 * steps / np.maximum(speed[1:] + speed[:-1], _LEAST_MPS)
-    seconds = np.maximum(seconds, np.abs(np.diff(yaws)) / config.yaw_rate_rps)
-    return np.concatenate(([0.0], np.cumsum(seconds)))
-
-
-def _turn(angle_rad: float, config: DriveConfig) -> tuple[F64, F64]:
-    """Times and angles of a turn in place with a trapezoidal profile of the yaw rate."""
-    size = abs(angle_rad)
-    top = min(config.yaw_rate_rps, np.sqrt(size * config.yaw_acceleration_rps2))
-    ramp_s = top / config.yaw_acceleration_rps2
-    total_s = ramp_s + size / top
-    times = np.linspace(0, total_s, max(int(total_s * RATE_HZ), 2))
-    up = np.minimum(times, ramp_s)
-    down = np.maximum(times - (total_s - ramp_s), 0)
-    angles = top * (times - up) + config.yaw_acceleration_rps2 * (up**2 - down**2) / 2
-    return times, np.sign(angle_rad) * angles
 
 
 def drive_along(route: Route, config: DriveConfig, rng: np.random.Generator) -> Drive:
@@ -148,25 +111,63 @@ def drive_along(route: Route, config: DriveConfig, rng: np.random.Generator) -> 
     return Drive(gaussian_filter1d(sampled, _SMOOTHING_S * RATE_HZ, axis=0, mode="nearest"))
 
 
+def _headings(points_m: F64) -> F64:
+    """Return the direction of the line at each of its points, radians, without jumps of 2 pi."""
+    reach = min(2, len(points_m) - 1)
+    index = np.arange(len(points_m))
+    ahead = points_m[np.minimum(index + reach, len(points_m) - 1)]
+    direction = ahead - points_m[np.maximum(index - reach, 0)]
+    return np.unwrap(np.arctan2(direction[:, 1], direction[:, 0]))
+
+
+def _follow(points_m: F64, yaws: F64, config: DriveConfig) -> F64:
+    """Return times (N,) along a line, starting and ending at rest, within speed, yaw rate and
+    acceleration."""
+    steps = np.maximum(np.linalg.norm(np.diff(points_m, axis=0), axis=1), 1e-6)
+    curvature = np.abs(np.gradient(yaws)) / np.gradient(np.concatenate(([0.0], np.cumsum(steps))))
+    curvature = maximum_filter1d(curvature, 5)
+    speed = np.minimum(config.speed_mps, config.yaw_rate_rps / np.maximum(curvature, 1e-3))
+    speed[0] = speed[-1] = 0.0
+    for i in range(1, len(speed)):
+        speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + 2 * config.acceleration_mps2 * steps[i - 1]))
+    for i in range(len(speed) - 2, -1, -1):
+        speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + 2 * config.acceleration_mps2 * steps[i]))
+    seconds = 2 * steps / np.maximum(speed[1:] + speed[:-1], _LEAST_MPS)
+    seconds = np.maximum(seconds, np.abs(np.diff(yaws)) / config.yaw_rate_rps)
+    return np.concatenate(([0.0], np.cumsum(seconds)))
+
+
+def _turn(angle_rad: float, config: DriveConfig) -> tuple[F64, F64]:
+    """Return times and angles of a turn in place with a trapezoidal profile of the yaw rate."""
+    size = abs(angle_rad)
+    top = min(config.yaw_rate_rps, np.sqrt(size * config.yaw_acceleration_rps2))
+    ramp_s = top / config.yaw_acceleration_rps2
+    total_s = ramp_s + size / top
+    times = np.linspace(0, total_s, max(int(total_s * RATE_HZ), 2))
+    up = np.minimum(times, ramp_s)
+    down = np.maximum(times - (total_s - ramp_s), 0)
+    angles = top * (times - up) + config.yaw_acceleration_rps2 * (up**2 - down**2) / 2
+    return times, np.sign(angle_rad) * angles
+
+
+# The route.
+
 STEP_M = 0.05
 """Distance between two points of a route."""
-
 SEEN_M = 1.5
 """Places this near to the route count as visited."""
-
 START_M = 1.0
 """A start may be this far from the nearest place where the robot fits."""
-
 _LATTICE_M = 0.1  # distance between the points among which the route is planned
-_CENTRE_WINDOW_M, _CENTRE_SHARE = (
-    0.6,
-    0.95,
-)  # a centre has this share of the largest clearance within the window
-_COMFORT_M, _DISCOMFORT = (
-    0.5,
-    2.0,
-)  # with less clearance than this more than needed, an edge weighs up to 1 + 2
-_SEARCH_M = (8.0, 30.0, math.inf)  # goals are looked for within these distances, one after another
+
+
+# A centre has this share of the largest clearance within the window.
+_CENTRE_WINDOW_M, _CENTRE_SHARE = 0.6, 0.95
+
+
+# With less clearance than this beyond the necessary one, an edge counts up to 1 + `_DISCOMFORT` times.
+_COMFORT_M, _DISCOMFORT = 0.5, 2.0
+_SEARCH_M = (8.0, 30.0, math.inf)  # goals are searched for within these distances, one after another
 _NEAREST_GOAL_M = 0.5
 _BLOCK_M, _TASTE_M = 2.0, 4.0  # edge of a block, and largest detour for its preference
 _AHEAD_M = 1.5  # detour accepted for a goal that lies ahead and not beside
@@ -190,8 +191,53 @@ class Route:
 
     @property
     def length_m(self) -> float:
-        """Length of the line."""
+        """Return the length of the line."""
         return float(np.linalg.norm(np.diff(self.points_m, axis=0), axis=1).sum())
+
+
+def plan_route(
+    grid: OccupancyGrid,
+    blocked: NDArray[np.bool_],
+    length_m: float,
+    *,
+    start_m: tuple[float, float] | None,
+    least_m: float,
+    rng: np.random.Generator,
+) -> Route:
+    """Plan a route of `length_m` that stays `least_m` away from everything that is not free.
+
+    blocked : (H, W) cells below clutter. Places that were not visited come first; at dead ends the robot
+    turns; later it comes back to places, which closes loops. Raises ConfigError if there is no room, or none
+    at the start.
+    """
+    clearance = clearance_m(grid.free & ~blocked, grid.resolution_m)
+    lattice = _lattice(grid, clearance, least_m, start_m)
+    if start_m is None:
+        centres = np.flatnonzero(lattice.centres)
+        at = int(centres[rng.integers(len(centres))])
+    else:
+        at = int(np.argmin(np.linalg.norm(lattice.points_m - start_m, axis=1)))
+    explorer = _Explorer(lattice, at, rng)
+    # The line is smooth between two turns in place.
+    segments: list[list[F64]] = [[lattice.points_m[[at]]]]
+    heading: F64 | None = None
+    driven_m = 0.0
+    # Smoothing shortens the line, so more than the length is planned.
+    while driven_m < _LONGER * length_m + _LONGER_M:
+        leg = lattice.points_m[explorer.next_path(heading)]
+        driven_m += float(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum())
+        leaving = leg[min(5, len(leg) - 1)] - leg[0]
+        if heading is not None and heading @ leaving < 0:
+            segments.append([leg[:1]])
+        segments[-1].append(leg[1:])
+        arriving = leg[-1] - leg[max(-6, -len(leg))]
+        heading = arriving / np.linalg.norm(arriving)
+    lines = [_smooth(_resample(np.concatenate(part)), grid, clearance, least_m) for part in segments]
+    points = np.concatenate([lines[0], *(line[1:] for line in lines[1:])])
+    turns = np.cumsum([len(line) - 1 for line in lines])
+    lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    last = min(int(np.searchsorted(lengths, length_m)), len(points) - 1)
+    return Route(points[: last + 1], turns[turns < last])
 
 
 @dataclass(frozen=True, slots=True)
@@ -199,7 +245,8 @@ class _Lattice:
     """Passable points some cells apart, connected with their neighbours.
 
     points_m : (N, 2). cells : (N, 2) row, column. graph : (N, N) sparse; the weight of an edge is its length,
-    and up to three times that near walls. centres : (N,) whether the clearance is about the largest around.
+    and up to three times that near walls. centres : (N,) True where the clearance is about the largest
+    around.
     """
 
     points_m: F64
@@ -211,7 +258,7 @@ class _Lattice:
 def _lattice(
     grid: OccupancyGrid, clearance: F32, least_m: float, start_m: tuple[float, float] | None
 ) -> _Lattice:
-    """The largest connected part of the passable space, or the one that contains the start.
+    """Return the largest connected part of the passable space, or the one that contains the start.
 
     Raises ConfigError if nothing is passable, or nothing within `START_M` of the start.
     """
@@ -265,7 +312,7 @@ def _lattice(
 
 
 class _Explorer:
-    """Chooses one goal after another; keeps which places were visited."""
+    """Chooses one goal after another; keeps the places that were visited."""
 
     def __init__(self, lattice: _Lattice, at: int, rng: np.random.Generator) -> None:
         self.lattice = lattice
@@ -283,7 +330,7 @@ class _Explorer:
             self.new[near] = False
 
     def next_path(self, heading: F64 | None) -> I64:
-        """Points (indices) to the next goal: near, not visited, and preferably ahead.
+        """Return the points (indices) to the next goal: near, not visited, and preferably ahead.
 
         When everything is visited, a random place far away becomes the goal and all places count as new.
         """
@@ -319,7 +366,7 @@ class _Explorer:
 
 
 def _resample(points_m: F64) -> F64:
-    """The same line with points STEP_M apart and the same ends."""
+    """Return the same line with points STEP_M apart and the same ends."""
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))))
     count = max(round(float(lengths[-1]) / STEP_M), 1)
     at = np.linspace(0, lengths[-1], count + 1)
@@ -348,49 +395,7 @@ def _smooth(points_m: F64, grid: OccupancyGrid, clearance: F32, least_m: float) 
     return band
 
 
-def plan_route(
-    grid: OccupancyGrid,
-    blocked: NDArray[np.bool_],
-    length_m: float,
-    *,
-    start_m: tuple[float, float] | None,
-    least_m: float,
-    rng: np.random.Generator,
-) -> Route:
-    """A route of `length_m` that stays `least_m` away from everything that is not free.
-
-    blocked : (H, W) cells below clutter. Places that were not visited come first; at dead ends the robot
-    turns; later it comes back to places, which closes loops.
-    Raises ConfigError if there is no room, or none at the start.
-    """
-    clearance = clearance_m(grid.free & ~blocked, grid.resolution_m)
-    lattice = _lattice(grid, clearance, least_m, start_m)
-    if start_m is None:
-        centres = np.flatnonzero(lattice.centres)
-        at = int(centres[rng.integers(len(centres))])
-    else:
-        at = int(np.argmin(np.linalg.norm(lattice.points_m - start_m, axis=1)))
-    explorer = _Explorer(lattice, at, rng)
-    # The line is smooth between two turns in place.
-    segments: list[list[F64]] = [[lattice.points_m[[at]]]]
-    heading: F64 | None = None
-    driven_m = 0.0
-    # Smoothing shortens the line, so more than the length is planned.
-    while driven_m < _LONGER * length_m + _LONGER_M:
-        leg = lattice.points_m[explorer.next_path(heading)]
-        driven_m += float(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum())
-        leaving = leg[min(5, len(leg) - 1)] - leg[0]
-        if heading is not None and heading @ leaving < 0:
-            segments.append([leg[:1]])
-        segments[-1].append(leg[1:])
-        arriving = leg[-1] - leg[max(-6, -len(leg))]
-        heading = arriving / np.linalg.norm(arriving)
-    lines = [_smooth(_resample(np.concatenate(part)), grid, clearance, least_m) for part in segments]
-    points = np.concatenate([lines[0], *(line[1:] for line in lines[1:])])
-    turns = np.cumsum([len(line) - 1 for line in lines])
-    lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
-    last = min(int(np.searchsorted(lengths, length_m)), len(points) - 1)
-    return Route(points[: last + 1], turns[turns < last])
+# Wheel odometry.
 
 
 @dataclass(frozen=True, slots=True)
@@ -409,18 +414,9 @@ class SimulatedOdometry:
         freeze(self, "poses", np.float64, (len(self.times_s), 3))
 
     def at(self, time_s: float) -> SE2:
-        """T_odom_base between two messages."""
+        """Return T_odom_base between two messages."""
         x, y, yaw = (float(np.interp(time_s, self.times_s, self.poses[:, k])) for k in range(3))
         return SE2(x, y, math.remainder(yaw, 2 * math.pi))
-
-
-def _slip(steps: int, error: float, step_s: float, memory_s: float, rng: np.random.Generator) -> F64:
-    """(steps,) relative errors of standard deviation `error`, correlated over `memory_s`."""
-    keep = math.exp(-step_s / memory_s)
-    white = rng.standard_normal(steps) * error * math.sqrt(1 - keep * keep)
-    first = error * rng.standard_normal()
-    slip = itertools.accumulate(white.tolist(), lambda before, new: keep * before + new, initial=first)
-    return np.array([*slip][1:])
 
 
 def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) -> SimulatedOdometry:
@@ -452,3 +448,12 @@ def odometry_of(drive: Drive, config: OdometryConfig, rng: np.random.Generator) 
     poses[1:, 0] = np.cumsum(forward * np.cos(middle))
     poses[1:, 1] = np.cumsum(forward * np.sin(middle))
     return SimulatedOdometry(times_s, poses)
+
+
+def _slip(steps: int, error: float, step_s: float, memory_s: float, rng: np.random.Generator) -> F64:
+    """Return relative errors (steps,) of standard deviation `error`, correlated over `memory_s`."""
+    keep = math.exp(-step_s / memory_s)
+    white = rng.standard_normal(steps) * error * math.sqrt(1 - keep * keep)
+    first = error * rng.standard_normal()
+    slip = itertools.accumulate(white.tolist(), lambda before, new: keep * before + new, initial=first)
+    return np.array([*slip][1:])

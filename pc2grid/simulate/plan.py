@@ -1,10 +1,8 @@
 """A procedural office floor as an occupancy grid: walls, doors and everything that does not move.
 
-How an office floor is divided: corridors first, then rooms in the remaining space, then doors.
-
-All lengths are whole cells of the floor plan; rectangles are half-open, x to the right and y up.
-
-The space in which a robot can pass, and objects that may be placed in it.
+The floor is divided into corridors first, then rooms in the remaining space, then doors (`lay_out`). All
+lengths are whole cells of the floor plan; rectangles are half-open, x to the right and y up. `Passages`
+places objects so that the free space stays connected for a robot.
 """
 
 from __future__ import annotations
@@ -26,32 +24,14 @@ OUTER_WALL_M = 0.3
 INNER_WALL_M = 0.1
 
 
-def _fill(cells: NDArray[np.int8], box: Box, value: int) -> None:
-    cells[max(box.y0, 0) : max(box.y1, 0), max(box.x0, 0) : max(box.x1, 0)] = value
-
-
-def _within(box: Box, other: Box) -> Box:
-    return Box(max(box.x0, other.x0), max(box.y0, other.y0), min(box.x1, other.x1), min(box.y1, other.y1))
-
-
-def _touch(box: Box, other: Box) -> bool:
-    common = _within(box, other)
-    return common.width > 0 and common.height > 0
-
-
-def _corners(box: Box) -> F64:
-    # Through the centres of the outermost cells, so that exactly the cells of the box are covered.
-    x0, y0, x1, y1 = box.x0 + 0.5, box.y0 + 0.5, box.x1 - 0.5, box.y1 - 0.5
-    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
-
-
 def office_floorplan(
     seed: int, width_m: float = 44.0, height_m: float = 32.0, *, resolution_m: float = 0.05
 ) -> OccupancyGrid:
-    """An office floor, different for each seed: corridors, rooms, doors, pillars, niches, built-in shelves.
+    """Make an office floor, different for each seed: corridors, rooms, doors, pillars, niches, built-in
+    shelves.
 
-    Cells outside and in shafts are unknown. The origin is the outer corner of the building.
-    Raises ConfigError below 20 x 20 m, where corridors and rooms do not fit, or for cells above 0.1 m.
+    Cells outside and in shafts are unknown. The origin is the outer corner of the building. Raises
+    ConfigError below 20 x 20 m, where corridors and rooms do not fit, or for cells above 0.1 m.
     """
     if min(width_m, height_m) < 20:
         raise ConfigError(f"an office of {width_m:g} x {height_m:g} m is too small", hint="20 x 20 m or more")
@@ -114,7 +94,7 @@ def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.
 
 
 def _pieces(low: int, high: int, unit: float, rng: np.random.Generator) -> Iterator[tuple[int, int, int]]:
-    """Where pieces along a wall from `low` to `high` begin and end, and how deep they are, in cells."""
+    """Yield the begin, the end and the depth, in cells, of pieces along a wall from `low` to `high`."""
     at = low + float(rng.uniform(0.3, 2.0)) * unit
     while at < high:
         slim = rng.random() < 0.5
@@ -161,6 +141,9 @@ def _shelves(passages: Passages, layout: Layout, wall: int, margin: int, rng: np
             passages.put(_corners(Box(x, y, x + width, y + height)) + margin)
 
 
+# The division of a floor.
+
+
 class Box(NamedTuple):
     """x0 <= x < x1, y0 <= y < y1, in cells."""
 
@@ -171,22 +154,41 @@ class Box(NamedTuple):
 
     @property
     def width(self) -> int:
-        """Along x."""
+        """Return the width along x."""
         return self.x1 - self.x0
 
     @property
     def height(self) -> int:
-        """Along y."""
+        """Return the height along y."""
         return self.y1 - self.y0
 
     @property
     def flipped(self) -> Box:
-        """With x and y exchanged."""
+        """Return the box with x and y exchanged."""
         return Box(self.y0, self.x0, self.y1, self.x1)
 
     def grown(self, by: int) -> Box:
-        """Larger by `by` on every side; smaller if negative."""
+        """Return a box that is larger by `by` on every side; smaller if negative."""
         return Box(self.x0 - by, self.y0 - by, self.x1 + by, self.y1 + by)
+
+
+def _fill(cells: NDArray[np.int8], box: Box, value: int) -> None:
+    cells[max(box.y0, 0) : max(box.y1, 0), max(box.x0, 0) : max(box.x1, 0)] = value
+
+
+def _within(box: Box, other: Box) -> Box:
+    return Box(max(box.x0, other.x0), max(box.y0, other.y0), min(box.x1, other.x1), min(box.y1, other.y1))
+
+
+def _touch(box: Box, other: Box) -> bool:
+    common = _within(box, other)
+    return common.width > 0 and common.height > 0
+
+
+def _corners(box: Box) -> F64:
+    # Through the centres of the outermost cells, so that exactly the cells of the box are covered.
+    x0, y0, x1, y1 = box.x0 + 0.5, box.y0 + 0.5, box.x1 - 0.5, box.y1 - 0.5
+    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
 
 class Door(NamedTuple):
@@ -198,8 +200,11 @@ class Door(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """corridors : touching or crossing each other, one space. rooms : disjoint. doors : sides are numbers of
-    rooms, or -1 for the corridor. unit : cells per metre."""
+    """The division of a floor.
+
+    corridors : touching or crossing each other, one space. rooms : disjoint. doors : sides are numbers of
+    rooms, or -1 for the corridor. unit : cells per metre.
+    """
 
     corridors: tuple[Box, ...]
     rooms: tuple[Box, ...]
@@ -207,12 +212,23 @@ class Layout:
     unit: float
 
 
+def lay_out(inside: Box, wall: int, unit: float, rng: np.random.Generator) -> Layout:
+    """Divide the inside of the outer walls.
+
+    wall : half the thickness of an inner wall, cells. Rooms without a door are shafts.
+    """
+    corridors = _corridors(inside, unit, rng)
+    rooms = [room for block in _blocks(inside, corridors, rng) for room in _rooms(block, unit, rng)]
+    doors = _doors(corridors, rooms, wall, unit, rng)
+    return Layout(tuple(corridors), tuple(rooms), tuple(doors), unit)
+
+
 def _cells(metres: float, unit: float) -> int:
     return round(metres * unit)
 
 
 def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
-    """Corridors as a ring, a ladder or a comb, with random widths and positions."""
+    """Make corridors as a ring, a ladder or a comb, with random widths and positions."""
 
     def wide() -> int:
         return _cells(float(rng.uniform(1.7, 2.5)), unit)
@@ -231,7 +247,7 @@ def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
 
 
 def _ring(inside: Box, core: Box, wide: Callable[[], int], over: int, rng: np.random.Generator) -> list[Box]:
-    """A ring around the core, a cross through it, and perhaps an arm to the outer wall.
+    """Make a ring around the core, a cross through it, and perhaps an arm to the outer wall.
 
     wide : draws the width of a corridor. over : cells by which the arm overlaps the ring.
     """
@@ -251,7 +267,7 @@ def _ring(inside: Box, core: Box, wide: Callable[[], int], over: int, rng: np.ra
 
 
 def _ladder(inside: Box, core: Box, wide: Callable[[], int], rng: np.random.Generator) -> list[Box]:
-    """Two long corridors and rungs between them."""
+    """Make two long corridors and rungs between them."""
     x0, y0, x1, y1 = core
     corridors = [Box(inside.x0, y0, x1, y0 + wide()), Box(x0, y1 - wide(), inside.x1, y1)]
     rungs = int(rng.integers(2, 5))
@@ -262,7 +278,7 @@ def _ladder(inside: Box, core: Box, wide: Callable[[], int], rng: np.random.Gene
 
 
 def _comb(inside: Box, core: Box, wide: Callable[[], int], rng: np.random.Generator) -> list[Box]:
-    """A spine with teeth to both sides."""
+    """Make a spine with teeth to both sides."""
     middle = inside.y0 + int(inside.height * rng.uniform(0.4, 0.6))
     spine = Box(inside.x0, middle, inside.x1, middle + wide())
     corridors = [spine]
@@ -283,7 +299,7 @@ def _comb(inside: Box, core: Box, wide: Callable[[], int], rng: np.random.Genera
 
 
 def _blocks(inside: Box, corridors: list[Box], rng: np.random.Generator) -> list[Box]:
-    """The space between the corridors as few large rectangles."""
+    """Divide the space between the corridors into few large rectangles."""
     xs = _lines(inside.x0, inside.x1, [v for c in corridors for v in (c.x0, c.x1)])
     ys = _lines(inside.y0, inside.y1, [v for c in corridors for v in (c.y0, c.y1)])
     left = np.ones((len(ys) - 1, len(xs) - 1), bool)
@@ -300,12 +316,13 @@ def _blocks(inside: Box, corridors: list[Box], rng: np.random.Generator) -> list
 
 
 def _lines(low: int, high: int, edges: list[int]) -> I64:
-    """The edges between two outer walls, and these, in order; each once."""
+    """Return the edges between two outer walls, and these, in order; each once."""
     return np.unique([low, high, *(v for v in edges if low < v < high)])
 
 
 def _largest(left: BoolGrid, *, along_x_first: bool) -> tuple[int, int]:
-    """Columns and rows of a rectangle of true cells at the corner, grown along one axis, then the other."""
+    """Return columns and rows of a rectangle of true cells at the corner, grown along one axis, then the
+    other."""
     wide, high = 1, 1
     for along_x in (along_x_first, not along_x_first):
         if along_x:
@@ -334,16 +351,66 @@ def _rooms(block: Box, unit: float, rng: np.random.Generator) -> list[Box]:
     return [room for part in parts for room in _rooms(part.flipped if upright else part, unit, rng)]
 
 
-def _shared_wall(a: Box, b: Box) -> tuple[int, int, int] | None:
-    """Where two boxes touch along x: the line's position, from, to."""
-    low, high = max(a.x0, b.x0), min(a.x1, b.x1)
-    if low < high and (a.y1 == b.y0 or b.y1 == a.y0):
-        return a.y1 if a.y1 == b.y0 else a.y0, low, high
-    return None
+def _doors(
+    corridors: list[Box], rooms: list[Box], wall: int, unit: float, rng: np.random.Generator
+) -> list[Door]:
+    """Open a door from every room to the corridor, or to a room that has one; some rooms get two."""
+    doors = _Doors(rooms, wall, unit, rng)
+    order = [int(k) for k in rng.permutation(len(rooms))]
+    reached = [k for k in order if doors.to_corridor(k, corridors)]
+    _through_rooms(doors, reached, [k for k in order if k not in reached])
+    for k in reached:
+        for other in reached:
+            if k < other and rng.random() < 0.1:
+                doors.to_room(k, [other])
+    return doors.opened
+
+
+class _Doors:
+    """Opens doors between rooms and corridors.
+
+    opened : the doors so far. wall : half the thickness of an inner wall, cells.
+    """
+
+    def __init__(self, rooms: list[Box], wall: int, unit: float, rng: np.random.Generator) -> None:
+        self.opened: list[Door] = []
+        self._rooms, self._wall, self._unit, self._rng = rooms, wall, unit, rng
+
+    def to_corridor(self, room: int, corridors: list[Box]) -> bool:
+        """Open one door from a room to a corridor, sometimes two; returns True if there is one."""
+        rng = self._rng
+        tried = [corridors[int(i)] for i in rng.permutation(len(corridors))]
+        count = sum(self._open(room, corridor, -1) for corridor in tried[:1])
+        for corridor in tried[1:]:
+            if count == 0 or (count == 1 and rng.random() < 0.15):
+                count += self._open(room, corridor, -1)
+        return count > 0
+
+    def to_room(self, room: int, others: Iterable[int]) -> bool:
+        """Open a door from a room to the first possible one of others; returns True if there is one."""
+        return any(self._open(room, self._rooms[other], other) for other in others)
+
+    def _open(self, room: int, other: Box, number: int) -> bool:
+        box = _door(self._rooms[room], other, self._wall, self._unit, self._rng)
+        if box is not None:
+            self.opened.append(Door(box, (room, number)))
+        return box is not None
+
+
+def _through_rooms(doors: _Doors, reached: list[int], waiting: list[int]) -> None:
+    """Open doors from waiting rooms to reached ones, and add them to these, until none is left."""
+    while waiting:
+        for k in waiting:
+            if doors.to_room(k, reached):
+                reached.append(k)
+        left = [k for k in waiting if k not in reached]
+        if left == waiting:
+            return
+        waiting = left
 
 
 def _door(a: Box, b: Box, wall: int, unit: float, rng: np.random.Generator) -> Box | None:
-    """An opening with the width of a door, sometimes of a double one, away from the corners."""
+    """Return an opening with the width of a door, sometimes of a double one, away from the corners."""
     along_x = _shared_wall(a, b)
     shared = along_x or _shared_wall(a.flipped, b.flipped)
     if shared is None:
@@ -360,100 +427,17 @@ def _door(a: Box, b: Box, wall: int, unit: float, rng: np.random.Generator) -> B
     return box if along_x else box.flipped
 
 
-class _Doors:
-    """Opens doors between rooms and corridors.
-
-    opened : so far. wall : half the thickness of an inner wall, cells.
-    """
-
-    def __init__(self, rooms: list[Box], wall: int, unit: float, rng: np.random.Generator) -> None:
-        self.opened: list[Door] = []
-        self._rooms, self._wall, self._unit, self._rng = rooms, wall, unit, rng
-
-    def to_corridor(self, room: int, corridors: list[Box]) -> bool:
-        """Open one door from a room to a corridor, sometimes two; whether there is one."""
-        rng = self._rng
-        tried = [corridors[int(i)] for i in rng.permutation(len(corridors))]
-        count = sum(self._open(room, corridor, -1) for corridor in tried[:1])
-        for corridor in tried[1:]:
-            if count == 0 or (count == 1 and rng.random() < 0.15):
-                count += self._open(room, corridor, -1)
-        return count > 0
-
-    def to_room(self, room: int, others: Iterable[int]) -> bool:
-        """Open a door from a room to the first of others that it can have one to; whether there is one."""
-        return any(self._open(room, self._rooms[other], other) for other in others)
-
-    def _open(self, room: int, other: Box, number: int) -> bool:
-        box = _door(self._rooms[room], other, self._wall, self._unit, self._rng)
-        if box is not None:
-            self.opened.append(Door(box, (room, number)))
-        return box is not None
+def _shared_wall(a: Box, b: Box) -> tuple[int, int, int] | None:
+    """Return the segment along x where two boxes touch: the line's position, from, to."""
+    low, high = max(a.x0, b.x0), min(a.x1, b.x1)
+    if low < high and (a.y1 == b.y0 or b.y1 == a.y0):
+        return a.y1 if a.y1 == b.y0 else a.y0, low, high
+    return None
 
 
-def _doors(
-    corridors: list[Box], rooms: list[Box], wall: int, unit: float, rng: np.random.Generator
-) -> list[Door]:
-    """One door from every room to the corridor, or to a room that has one; some rooms have two."""
-    doors = _Doors(rooms, wall, unit, rng)
-    order = [int(k) for k in rng.permutation(len(rooms))]
-    reached = [k for k in order if doors.to_corridor(k, corridors)]
-    _through_rooms(doors, reached, [k for k in order if k not in reached])
-    for k in reached:
-        for other in reached:
-            if k < other and rng.random() < 0.1:
-                doors.to_room(k, [other])
-    return doors.opened
-
-
-def _through_rooms(doors: _Doors, reached: list[int], waiting: list[int]) -> None:
-    """Open doors from waiting rooms to those that are reached, and add them to these, until none is left."""
-    while waiting:
-        for k in waiting:
-            if doors.to_room(k, reached):
-                reached.append(k)
-        left = [k for k in waiting if k not in reached]
-        if left == waiting:
-            return
-        waiting = left
-
-
-def lay_out(inside: Box, wall: int, unit: float, rng: np.random.Generator) -> Layout:
-    """Divide the inside of the outer walls.
-
-    wall : half the thickness of an inner wall, cells. Rooms without a door are shafts.
-    """
-    corridors = _corridors(inside, unit, rng)
-    rooms = [room for block in _blocks(inside, corridors, rng) for room in _rooms(block, unit, rng)]
-    doors = _doors(corridors, rooms, wall, unit, rng)
-    return Layout(tuple(corridors), tuple(rooms), tuple(doors), unit)
-
+# Placing objects.
 
 _WINDOW_M = 1.2  # around an object, beyond the radius of the robot
-
-
-def clearance_m(free: BoolGrid, resolution_m: float) -> F32:
-    """Distance (H, W) from each cell's centre to the edge of the nearest cell that is not free, metres.
-
-    Cells outside of the grid are not free.
-    """
-    return _distance_m(np.pad(free, 1), resolution_m)[1:-1, 1:-1]
-
-
-def _distance_m(free: BoolGrid, resolution_m: float) -> F32:
-    """The same without assuming anything outside of the grid."""
-    cells = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    distance: F32 = np.maximum(cells - np.float32(0.5), 0).astype(np.float32) * np.float32(resolution_m)
-    return distance
-
-
-def outline_mask(outline_cells: F64, shape: tuple[int, int]) -> BoolGrid:
-    """Cells of a grid that a convex outline (N, 2), as x and y in cells from the corner, touches."""
-    shift = 6
-    corners = np.round((outline_cells - 0.5) * (1 << shift)).astype(np.int32)
-    mask = np.zeros(shape, np.uint8)
-    cv2.fillConvexPoly(mask, corners, 1, lineType=cv2.LINE_8, shift=shift)
-    return mask.astype(bool)
 
 
 class Passages:
@@ -471,7 +455,7 @@ class Passages:
         self._passable = clearance_m(free, resolution_m) >= robot_m
 
     def reserve(self, cells: BoolGrid) -> None:
-        """No object may be placed on these cells (H, W) from now on; they stay passable."""
+        """Reserve cells (H, W): no object is placed on them from now on; they stay passable."""
         self.reserved |= cells
 
     def put(self, outline_cells: F64, *, overlap: bool = False) -> bool:
@@ -507,3 +491,29 @@ class Passages:
         self.free[window] &= ~mask
         self._passable[window] = after
         return True
+
+
+def outline_mask(outline_cells: F64, shape: tuple[int, int]) -> BoolGrid:
+    """Return a mask of the cells that a convex outline (N, 2), x and y in cells from the corner, touches."""
+    shift = 6
+    corners = np.round((outline_cells - 0.5) * (1 << shift)).astype(np.int32)
+    mask = np.zeros(shape, np.uint8)
+    cv2.fillConvexPoly(mask, corners, 1, lineType=cv2.LINE_8, shift=shift)
+    return mask.astype(bool)
+
+
+def clearance_m(free: BoolGrid, resolution_m: float) -> F32:
+    """Return the distance (H, W) from each cell's centre to the edge of the nearest cell that is not free,
+    metres.
+
+    Cells outside of the grid are not free.
+    """
+    return _distance_m(np.pad(free, 1), resolution_m)[1:-1, 1:-1]
+
+
+def _distance_m(free: BoolGrid, resolution_m: float) -> F32:
+    """Return the distance to cells that are not free, without an assumption about cells outside of the
+    grid."""
+    cells = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    distance: F32 = np.maximum(cells - np.float32(0.5), 0).astype(np.float32) * np.float32(resolution_m)
+    return distance

@@ -1,14 +1,10 @@
-"""A floor plan as a mesh of walls, floor and ceiling, and casting rays into it.
+"""The world of a simulated drive, and the rays that its sensor casts into it.
 
-A building to drive through: a floor plan, or a real one as a point cloud or a mesh.
-
-A plan is extruded to walls of one height. Of a cloud the faces of its occupied voxels are what rays hit;
-of a mesh, its triangles. For both the floor is found and levelled, and the robot drives where it was seen
-and nothing stands on it (`pc2grid.mapping.drawn`).
-
-The three sensors: directions and times of their rays, and noise and losses of their readings.
-
-Objects that are in other places in each session: chairs, boxes, tables, people.
+A building is a floor plan, extruded to walls of one height, or a real one as a point cloud or a mesh. Rays
+hit the faces of the occupied voxels of a cloud, or the triangles of a mesh. For both the floor is found and
+levelled, and the robot drives where it is visible and free of obstacles (`pc2grid.mapping.drawn`). Clutter is
+in other places in each session: chairs, boxes, tables, people. The three sensors have directions and times of
+their rays, and noise and losses of their readings.
 """
 
 from __future__ import annotations
@@ -40,6 +36,8 @@ from pc2grid.settings import ReadConfig
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
 from pc2grid.simulate.plan import Passages, outline_mask
 
+# Meshes and rays.
+
 
 @dataclass(frozen=True, slots=True)
 class Mesh:
@@ -57,7 +55,7 @@ class Mesh:
 
     @staticmethod
     def join(meshes: Iterable[Mesh]) -> Mesh:
-        """All of them as one."""
+        """Join meshes into one."""
         parts = list(meshes)
         starts = np.cumsum([0] + [len(part.vertices_m) for part in parts])
         return Mesh(
@@ -72,14 +70,14 @@ class Mesh:
 
 
 def quads(corners_m: F64) -> Mesh:
-    """Flat four-cornered faces (N, 4, 3), corners in order around each face."""
+    """Return flat four-cornered faces (N, 4, 3), corners in order around each face, as a mesh."""
     first = 4 * np.arange(len(corners_m))[:, None]
     triangles = np.concatenate((first + np.array([0, 1, 2]), first + np.array([0, 2, 3])))
     return Mesh(corners_m.reshape(-1, 3).astype(np.float32), triangles.astype(np.uint32))
 
 
 def prism(outline_m: F64, bottom_m: float, top_m: float) -> Mesh:
-    """A convex outline (N, 2) between two heights, with lid and bottom."""
+    """Extrude a convex outline (N, 2) between two heights, with lid and bottom."""
     n = len(outline_m)
     after = np.roll(outline_m, -1, axis=0)
     sides = np.empty((n, 4, 3))
@@ -94,7 +92,7 @@ def prism(outline_m: F64, bottom_m: float, top_m: float) -> Mesh:
 
 
 def _runs(mask: BoolGrid) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Maximal runs of True along the rows: row, first column, column after the last."""
+    """Return the maximal runs of True along the rows: row, first column, column after the last."""
     padded = np.pad(mask, ((0, 0), (1, 1)))
     rows, starts = np.nonzero(padded[:, 1:] & ~padded[:, :-1])
     _, ends = np.nonzero(~padded[:, 1:] & padded[:, :-1])
@@ -102,7 +100,7 @@ def _runs(mask: BoolGrid) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray
 
 
 def extrude(grid: OccupancyGrid, height_m: float) -> Mesh:
-    """Walls where the grid is occupied, and a floor (z = 0) and ceiling over its whole extent.
+    """Make walls where the grid is occupied, and a floor (z = 0) and ceiling over its whole extent.
 
     Faces are made only between an occupied and another cell, and faces in one line are joined: a building of
     a million cells has about ten thousand. Walls reach the ceiling, so they have no top. Unknown cells are
@@ -140,13 +138,19 @@ class Scene:
         self._scene.add_triangles(tensor(mesh.vertices_m.copy()), tensor(mesh.triangles.copy()))
 
     def cast(self, rays: F32) -> F32:
-        """Rays (N, 6), origin in metres and direction, to (N,): multiples of the direction until the
-        first hit, inf without one."""
+        """Cast rays (N, 6), origin in metres and direction.
+
+        Returns (N,) multiples of the direction until the first hit, inf without one.
+        """
         hits: F32 = self._scene.cast_rays(self._tensor.from_numpy(rays))["t_hit"].numpy()
         return hits
 
 
+# Buildings.
+
 _VOXEL_M = 0.05  # smallest voxel of a cloud that rays hit
+
+
 # A voxel is at least this many median distances between neighbours wide, so that walls have few holes: if n
 # random points lie on a square metre, this distance is 0.47 / sqrt(n) and 3 % of such voxels stay empty.
 _SPACINGS = 4.0
@@ -157,8 +161,8 @@ _LATTICE = 1.01  # the points of a lattice are equally far from their neighbours
 class Building:
     """A real building.
 
-    plan : where the robot may drive, in the map frame. shell : what rays hit, in the same frame, with the
-    floor at z = 0. T_map_file : (4, 4), the frame of the file in the map frame.
+    plan : where the robot may drive, in the map frame. shell : surfaces for the rays, in the same frame, with
+    the floor at z = 0. T_map_file : (4, 4), the frame of the file in the map frame.
     """
 
     plan: OccupancyGrid
@@ -167,7 +171,8 @@ class Building:
 
     @staticmethod
     def of_cloud(points_m: NDArray[np.floating]) -> Building:
-        """Of a cloud (N, 3) whose z axis points up. Raises MapFileError if it shows no floor."""
+        """Make a building of a cloud (N, 3) whose z axis points up. Raises MapFileError if it shows no
+        floor."""
         points = np.asarray(points_m, np.float64)
         T_map_cloud = level_cloud(points)
         # The voxels follow the axes of the cloud, in which they may have been a lattice before.
@@ -176,7 +181,7 @@ class Building:
 
     @staticmethod
     def of_mesh(mesh: Mesh) -> Building:
-        """Of a mesh whose z axis points up. Raises MapFileError if it shows no floor."""
+        """Make a building of a mesh whose z axis points up. Raises MapFileError if it shows no floor."""
         points = voxel_cloud(sampled(mesh.vertices_m.astype(np.float64), mesh.triangles.astype(np.int64)))
         T_map_mesh = level_cloud(points)
         plan = drivable_plan(transform_points(T_map_mesh, points))
@@ -204,7 +209,7 @@ def load_building(path: str | Path) -> OccupancyGrid | Building:
 
 
 def voxel_m(points_m: F64) -> float:
-    """Edge of the voxels in which a cloud (N, 3) is dense: 5 cm or more.
+    """Return the edge of the voxels in which a cloud (N, 3) is dense: 5 cm or more.
 
     The points of a lattice, such as the centres of the voxels of an octree, keep its spacing.
     """
@@ -214,7 +219,7 @@ def voxel_m(points_m: F64) -> float:
 
 
 def voxel_faces(points_m: F64, edge_m: float) -> Mesh:
-    """The faces between an occupied voxel and an empty one. The first point's corner is on the lattice."""
+    """Return the faces between occupied voxels and empty ones. The first point's corner is on the lattice."""
     first = points_m.min(axis=0)
     voxels = np.rint((points_m - first) / edge_m).astype(np.int64) + 1
     occupied = np.zeros(voxels.max(axis=0) + 2, bool)
@@ -235,6 +240,8 @@ def voxel_faces(points_m: F64, edge_m: float) -> Mesh:
 def _moved(mesh: Mesh, T: F64) -> Mesh:
     return Mesh(transform_points(T, mesh.vertices_m).astype(np.float32), mesh.triangles)
 
+
+# Sensors.
 
 OPTICAL = np.array([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
 """R_body_optical (REP-103): z forward, x right, y down, in body axes."""
@@ -270,7 +277,7 @@ class Sensor:
         freeze(self, "offsets_s", np.float64, (len(self.directions),))
 
     def measure(self, true_m: F32, rng: np.random.Generator) -> F32:
-        """True distances (R,), inf for none, to readings (R,) float32, NaN without a return."""
+        """Turn true distances (R,), inf for none, into readings (R,) float32, NaN without a return."""
         if isinstance(self.config, DepthConfig):
             return _measure_depth(true_m, self.config, rng)
         noise = rng.standard_normal(len(true_m), dtype=np.float32) * np.float32(self.config.noise_m)
@@ -280,8 +287,74 @@ class Sensor:
         return np.where(kept, reading, np.float32(np.nan))
 
 
+def make_sensor(kind: SensorKind, config: SimulationConfig) -> Sensor:
+    """Make the sensor of a kind as configured."""
+    if kind == "lidar":
+        return lidar(config.lidar)
+    if kind == "laser":
+        return laser(config.laser)
+    return depth(config.depth)
+
+
+def lidar(config: LidarConfig) -> Sensor:
+    """Make a lidar: columns of beams, fired one after another during one turn, stamped at the first
+    column."""
+    azimuth = np.arange(config.columns) * (2 * math.pi / config.columns) - math.pi
+    top = math.radians(config.elevation_deg) if config.beams > 1 else 0.0
+    elevation = np.linspace(-top, top, config.beams)
+    a, e = (v.ravel() for v in np.meshgrid(azimuth, elevation, indexing="ij"))
+    directions = np.column_stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)))
+    offsets = np.repeat(np.arange(config.columns) / (config.columns * config.rate_hz), config.beams)
+    return Sensor("lidar", "lidar_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
+
+
+def laser(config: LaserConfig) -> Sensor:
+    """Make a laser: one horizontal row of rays from right to left, one after another, stamped at the
+    first."""
+    count = round(config.field_deg / config.step_deg) + 1
+    angle = laser_angle_min(config) + np.arange(count) * math.radians(config.step_deg)
+    directions = np.column_stack((np.cos(angle), np.sin(angle), np.zeros(count)))
+    offsets = np.arange(count, dtype=np.float64) * laser_time_increment(config)
+    return Sensor("laser", "laser_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
+
+
+def laser_angle_min(config: LaserConfig) -> float:
+    """Return the bearing of the first ray, radians."""
+    return -math.radians(round(config.field_deg / config.step_deg) * config.step_deg) / 2
+
+
+def laser_time_increment(config: LaserConfig) -> float:
+    """Return the seconds between two rays."""
+    return config.step_deg / 360.0 / config.rate_hz
+
+
+def depth(config: DepthConfig) -> Sensor:
+    """Make a pinhole camera with a global shutter."""
+    K = depth_intrinsics(config)
+    u, v = (p.ravel() for p in np.meshgrid(np.arange(config.width), np.arange(config.height)))
+    directions = np.column_stack(((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.size)))
+    pose = _mount(config.mount_m)
+    pose[:3, :3] = OPTICAL
+    frame, at_once = "camera_depth_optical_frame", np.zeros(u.size)
+    return Sensor("depth", frame, pose, config.rate_hz, directions, at_once, config)
+
+
+def depth_intrinsics(config: DepthConfig) -> F64:
+    """Return K (3, 3) in pixels, pixel centres at whole numbers."""
+    fx = config.width / 2 / math.tan(math.radians(config.horizontal_deg) / 2)
+    fy = config.height / 2 / math.tan(math.radians(config.vertical_deg) / 2)
+    return np.array([(fx, 0, (config.width - 1) / 2), (0, fy, (config.height - 1) / 2), (0, 0, 1)])
+
+
+def _mount(xyz_m: tuple[float, float, float]) -> F64:
+    pose = np.eye(4)
+    pose[:3, 3] = xyz_m
+    return pose
+
+
 def _measure_depth(true_m: F32, config: DepthConfig, rng: np.random.Generator) -> F32:
-    """Noise that grows with the square of the depth, losses at depth jumps, rounding to millimetres."""
+    """Add noise that grows with the square of the depth, losses at depth jumps, and rounding to
+    millimetres."""
     depth = np.where(np.isfinite(true_m), true_m, 0).astype(np.float32)
     spread = config.noise_m + config.noise_per_m * depth**2
     lost = np.full(len(depth), config.dropout, np.float32)
@@ -295,68 +368,7 @@ def _measure_depth(true_m: F32, config: DepthConfig, rng: np.random.Generator) -
     return np.where(kept, reading, np.float32(np.nan)).astype(np.float32)
 
 
-def _mount(xyz_m: tuple[float, float, float]) -> F64:
-    pose = np.eye(4)
-    pose[:3, 3] = xyz_m
-    return pose
-
-
-def lidar(config: LidarConfig) -> Sensor:
-    """Columns of beams, fired one after another during one turn; the stamp is that of the first column."""
-    azimuth = np.arange(config.columns) * (2 * math.pi / config.columns) - math.pi
-    top = math.radians(config.elevation_deg) if config.beams > 1 else 0.0
-    elevation = np.linspace(-top, top, config.beams)
-    a, e = (v.ravel() for v in np.meshgrid(azimuth, elevation, indexing="ij"))
-    directions = np.column_stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)))
-    offsets = np.repeat(np.arange(config.columns) / (config.columns * config.rate_hz), config.beams)
-    return Sensor("lidar", "lidar_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
-
-
-def laser(config: LaserConfig) -> Sensor:
-    """One horizontal row of rays from right to left, one after another; the stamp is that of the first."""
-    count = round(config.field_deg / config.step_deg) + 1
-    angle = laser_angle_min(config) + np.arange(count) * math.radians(config.step_deg)
-    directions = np.column_stack((np.cos(angle), np.sin(angle), np.zeros(count)))
-    offsets = np.arange(count, dtype=np.float64) * laser_time_increment(config)
-    return Sensor("laser", "laser_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
-
-
-def laser_angle_min(config: LaserConfig) -> float:
-    """Bearing of the first ray, radians."""
-    return -math.radians(round(config.field_deg / config.step_deg) * config.step_deg) / 2
-
-
-def laser_time_increment(config: LaserConfig) -> float:
-    """Seconds between two rays."""
-    return config.step_deg / 360.0 / config.rate_hz
-
-
-def depth(config: DepthConfig) -> Sensor:
-    """A pinhole camera with a global shutter."""
-    K = depth_intrinsics(config)
-    u, v = (p.ravel() for p in np.meshgrid(np.arange(config.width), np.arange(config.height)))
-    directions = np.column_stack(((u - K[0, 2]) / K[0, 0], (v - K[1, 2]) / K[1, 1], np.ones(u.size)))
-    pose = _mount(config.mount_m)
-    pose[:3, :3] = OPTICAL
-    frame, at_once = "camera_depth_optical_frame", np.zeros(u.size)
-    return Sensor("depth", frame, pose, config.rate_hz, directions, at_once, config)
-
-
-def depth_intrinsics(config: DepthConfig) -> F64:
-    """K (3, 3) in pixels, pixel centres at whole numbers."""
-    fx = config.width / 2 / math.tan(math.radians(config.horizontal_deg) / 2)
-    fy = config.height / 2 / math.tan(math.radians(config.vertical_deg) / 2)
-    return np.array([(fx, 0, (config.width - 1) / 2), (0, fy, (config.height - 1) / 2), (0, 0, 1)])
-
-
-def make_sensor(kind: SensorKind, config: SimulationConfig) -> Sensor:
-    """The sensor of that kind as configured."""
-    if kind == "lidar":
-        return lidar(config.lidar)
-    if kind == "laser":
-        return laser(config.laser)
-    return depth(config.depth)
-
+# Clutter.
 
 _TRIES_PER_OBJECT = 40
 _SQUARE_SHARE = 0.5  # of the objects are aligned with the axes of the map
@@ -385,8 +397,55 @@ class Furniture:
     parts: tuple[Prism, ...]
 
     def mesh(self) -> Mesh:
-        """Its triangles in the map frame."""
+        """Return the triangles in the map frame."""
         return Mesh.join(prism(self.pose.apply(p.outline_m), p.bottom_m, p.top_m) for p in self.parts)
+
+
+def place_clutter(
+    grid: OccupancyGrid,
+    count: int,
+    rng: np.random.Generator,
+    *,
+    robot_m: float,
+    keep_free_m: tuple[tuple[float, float], ...] = (),
+) -> tuple[Furniture, ...]:
+    """Place up to `count` objects on free cells so that a robot of radius `robot_m` still gets everywhere.
+
+    keep_free_m : points of the map frame; objects stay `_KEPT_FREE_M` away from them. Returns fewer objects
+    if there is no room for all.
+    """
+    passages = Passages(grid.free, grid.resolution_m, robot_m)
+    places = np.flatnonzero(grid.free)
+    names = list(KINDS)
+    shares = np.array([KINDS[name][1] for name in names])
+    placed: list[Furniture] = []
+    for _ in range(_TRIES_PER_OBJECT * count if len(places) else 0):
+        if len(placed) == count:
+            break
+        name = names[rng.choice(len(names), p=shares / shares.sum())]
+        outline, parts = KINDS[name][0](rng)
+        cell = np.array([np.unravel_index(places[rng.integers(len(places))], grid.cells.shape)])
+        x, y = (float(v) for v in grid.to_point(cell)[0])
+        square = rng.random() < _SQUARE_SHARE
+        yaw = rng.choice(4) * math.pi / 2 if square else rng.uniform(-math.pi, math.pi)
+        candidate = Furniture(name, SE2(x, y, float(yaw)), outline, tuple(parts))
+        reach = float(np.linalg.norm(outline, axis=1).max())
+        if any(math.hypot(x - px, y - py) < _KEPT_FREE_M + reach for px, py in keep_free_m):
+            continue
+        footprint = (candidate.pose.apply(outline) - grid.origin_m) / grid.resolution_m
+        if passages.put(footprint):
+            placed.append(candidate)
+    return tuple(placed)
+
+
+def covered(grid: OccupancyGrid, clutter: tuple[Furniture, ...]) -> BoolGrid:
+    """Return a mask (H, W) of the cells below any of the objects."""
+    shape = (grid.cells.shape[0], grid.cells.shape[1])
+    mask: BoolGrid = np.zeros(shape, bool)
+    for furniture in clutter:
+        footprint = (furniture.pose.apply(furniture.outline_m) - grid.origin_m) / grid.resolution_m
+        mask |= outline_mask(footprint, shape)
+    return mask
 
 
 def _rectangle(x0: float, y0: float, x1: float, y1: float) -> F64:
@@ -442,50 +501,3 @@ KINDS: dict[str, tuple[Callable[[np.random.Generator], tuple[F64, list[Prism]]],
     "bin": (_bin, 0.10),
 }
 """For each kind the function that makes one, and its share of all objects (chosen by hand)."""
-
-
-def place_clutter(
-    grid: OccupancyGrid,
-    count: int,
-    rng: np.random.Generator,
-    *,
-    robot_m: float,
-    keep_free_m: tuple[tuple[float, float], ...] = (),
-) -> tuple[Furniture, ...]:
-    """Put up to `count` objects on free cells so that a robot of radius `robot_m` still gets everywhere.
-
-    keep_free_m : points of the map frame; objects stay `_KEPT_FREE_M` away from them.
-    Returns fewer objects if there is no room for all.
-    """
-    passages = Passages(grid.free, grid.resolution_m, robot_m)
-    places = np.flatnonzero(grid.free)
-    names = list(KINDS)
-    shares = np.array([KINDS[name][1] for name in names])
-    placed: list[Furniture] = []
-    for _ in range(_TRIES_PER_OBJECT * count if len(places) else 0):
-        if len(placed) == count:
-            break
-        name = names[rng.choice(len(names), p=shares / shares.sum())]
-        outline, parts = KINDS[name][0](rng)
-        cell = np.array([np.unravel_index(places[rng.integers(len(places))], grid.cells.shape)])
-        x, y = (float(v) for v in grid.to_point(cell)[0])
-        square = rng.random() < _SQUARE_SHARE
-        yaw = rng.choice(4) * math.pi / 2 if square else rng.uniform(-math.pi, math.pi)
-        candidate = Furniture(name, SE2(x, y, float(yaw)), outline, tuple(parts))
-        reach = float(np.linalg.norm(outline, axis=1).max())
-        if any(math.hypot(x - px, y - py) < _KEPT_FREE_M + reach for px, py in keep_free_m):
-            continue
-        footprint = (candidate.pose.apply(outline) - grid.origin_m) / grid.resolution_m
-        if passages.put(footprint):
-            placed.append(candidate)
-    return tuple(placed)
-
-
-def covered(grid: OccupancyGrid, clutter: tuple[Furniture, ...]) -> BoolGrid:
-    """Cells (H, W) below any of the objects."""
-    shape = (grid.cells.shape[0], grid.cells.shape[1])
-    mask: BoolGrid = np.zeros(shape, bool)
-    for furniture in clutter:
-        footprint = (furniture.pose.apply(furniture.outline_m) - grid.origin_m) / grid.resolution_m
-        mask |= outline_mask(footprint, shape)
-    return mask

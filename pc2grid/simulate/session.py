@@ -1,6 +1,7 @@
-"""One simulated session: a building with clutter, a drive through it, and the readings of a sensor.
+"""A simulated session, in memory or as a recording: a building with clutter, a drive, and a sensor's
+readings.
 
-A simulated session as a recording: standard ROS 2 MCAP, with the ground truth in a TUM file beside it.
+A recording is a standard ROS 2 MCAP, with the ground truth in a TUM file beside it.
 """
 
 from __future__ import annotations
@@ -38,8 +39,8 @@ from pc2grid.simulate.scene import (
 
 EPOCH_NS = 1_700_000_000_000_000_000
 """Stamp of the start of every session; constant, so that the same seed gives the same bytes."""
-
 RAYS_PER_CAST = 300_000  # bounds the memory of one call of the ray caster
+
 
 # Each purpose has its own stream of random numbers, so that more clutter does not change the noise.
 _CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
@@ -47,7 +48,7 @@ _CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """What the sensor measured in one scan.
+    """The measurements of one scan.
 
     index : number of the scan. time_s : of its stamp, since the session's start. values_m : (R,) float32, one
     per ray, NaN for a ray without a return.
@@ -59,7 +60,7 @@ class Reading:
 
     @property
     def stamp_ns(self) -> int:
-        """Its header stamp."""
+        """Return the header stamp."""
         return EPOCH_NS + round(self.time_s * 1e9)
 
 
@@ -85,11 +86,11 @@ class Session:
 
     @property
     def scan_count(self) -> int:
-        """Whole scans from start to end of the drive."""
+        """Return the number of whole scans from start to end of the drive."""
         return max(int(self.drive.duration_s * self.sensor.rate_hz), 1)
 
     def mesh(self) -> Mesh:
-        """Building and objects as triangles in the map frame."""
+        """Return building and objects as triangles in the map frame."""
         shell = extrude(self.grid, self.config.wall_height_m) if self.shell is None else self.shell
         return Mesh.join([shell, *(furniture.mesh() for furniture in (*self.clutter, *self.added))])
 
@@ -110,7 +111,7 @@ class Session:
                 yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
 
     def scan(self, reading: Reading) -> Scan:
-        """A reading as the scan that `pc2grid.io` decodes from the recording."""
+        """Return a reading as the scan that `pc2grid.io` decodes from the recording."""
         T = self.sensor.T_base_sensor
         kept = np.isfinite(reading.values_m)
         points = (reading.values_m[kept, None] * self.sensor.directions[kept]).astype(np.float32)
@@ -133,18 +134,20 @@ class Session:
         )
 
     def _odometry_at(self, time_s: float) -> F64 | None:
-        """T_odom_base (4, 4) by the odometry; None if there is none."""
+        """Return T_odom_base (4, 4) by the odometry; None if there is none."""
         return None if self.odometry is None else self.odometry.at(time_s).lift()
 
     def scans(self) -> Iterator[tuple[Scan, SE2]]:
-        """Scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
+        """Yield scans in the base frame, not deskewed, with the true T_map_base at their stamps."""
         for reading in self.readings():
             yield self.scan(reading), self.drive.pose(reading.time_s)
 
 
 def _rays(poses: F64, mount_m: F64, directions: F64) -> F32:
-    """Rays (S, R, 6) in the map frame from base poses (S, R, 3), the mounting point (3,) and directions
-    (R, 3) in base axes."""
+    """Return rays (S, R, 6) in the map frame.
+
+    They are made from base poses (S, R, 3), the mounting point (3,) and directions (R, 3) in base axes.
+    """
     x, y, yaw = poses[..., 0], poses[..., 1], poses[..., 2]
     c, s = np.cos(yaw), np.sin(yaw)
     rays = np.empty((*yaw.shape, 6), np.float32)
@@ -199,12 +202,14 @@ def iter_session(
     grid: OccupancyGrid | Building | None = None,
     config: SimulationConfig | None = None,
 ) -> Iterator[tuple[Scan, SE2]]:
-    """A session in memory: each scan with the true T_map_base at its stamp.
+    """Simulate a session in memory: yield each scan with the true T_map_base at its stamp.
 
     The same scans as in the log that `simulate_session` writes, without the log.
     """
     yield from prepare_session(sensor=sensor, grid=grid, config=config).scans()
 
+
+# Recordings.
 
 BASE_FRAME, ODOM_FRAME = "base_link", "odom"
 TOPICS: dict[SensorKind, str] = {
@@ -218,7 +223,7 @@ ODOMETRY_TOPIC = "/odom"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SimulatedSession:
-    """What was written.
+    """The files of a simulated session.
 
     path : the MCAP. truth_path : TUM file of true base poses in the floor plan's map frame, one per scan.
     scans : their number. duration_s, length_m : of the drive. clutter : how many objects could be placed.
@@ -247,11 +252,11 @@ def simulate_session(
     out : MCAP to write; the ground truth is written beside it as `.tum`. Existing files are refused without
         `overwrite`.
     grid : the floor plan, or a real building; None for the procedural office of `config.building_seed`.
-    progress : called with the share that is done, 0..1.
+    progress : called with the finished share, 0..1.
 
     Topics: the sensor's (TOPICS; a camera has INFO_TOPIC too), /tf_static base_link -> sensor and, unless
-    switched off, nav_msgs/Odometry with /tf odom -> base_link. The same arguments give the same bytes.
-    Raises ConfigError if there is no room for the robot, OutputError if a file cannot be written.
+    switched off, nav_msgs/Odometry with /tf odom -> base_link. The same arguments give the same bytes. Raises
+    ConfigError if there is no room for the robot, OutputError if a file cannot be written.
 
     >>> made = simulate_session("drive.mcap", sensor="laser", config=SimulationConfig(length_m=1.0))
     >>> made.truth_path.name, made.scans > 10
@@ -290,7 +295,8 @@ def simulate_session(
 
 
 def _write_odometry(log: LogWriter, session: Session, sent: int, until_s: float) -> int:
-    """Write the odometry up to a time, from message `sent` on; returns how many messages are written then."""
+    """Write the odometry up to a time, from message `sent` on; returns the number of messages written so
+    far."""
     odometry = session.odometry
     if odometry is None:
         return 0

@@ -1,10 +1,9 @@
-"""A map's division into submaps around the junctions of its free space (paper III-A).
+"""The division of a map into submaps around the junctions of its free space (paper III-A), and isovists.
 
-What can be seen from a place of a grid: its isovist (Benedikt 1979, "To take hold of space").
-
-Two recordings of one place agree only on what both could see: an area behind a wall may be known in one of
-them only. Both are therefore cut down to the isovist of a common centre, which makes them comparable
-whatever the sensor.
+An isovist is the area that is visible from a place (Benedikt 1979, "To take hold of space"). Two recordings
+of one place agree only on the area that is visible in both: the area behind a wall may be known in one of
+them only. Both are therefore cut down to the isovist of a common centre, which makes them comparable whatever
+the sensor.
 """
 
 from __future__ import annotations
@@ -17,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64, BoolGrid, cells_of, freeze
-from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid, Submap
+from pc2grid.libraries import compiled
+from pc2grid.model import OCCUPIED, OCCUPIED_FROM, UNKNOWN, OccupancyGrid, Submap
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.junction_graph import clearance_of, graph_of_skeleton, map_skeleton, sample_evenly
 
@@ -41,7 +41,7 @@ def partition(grid: OccupancyGrid, config: PartitionConfig = PartitionConfig()) 
 
 
 def divide(grid: OccupancyGrid, config: PartitionConfig) -> tuple[nx.Graph, tuple[Submap, ...]]:
-    """The junction graph of a map, and the submaps of `partition`, which are made around its nodes."""
+    """Return the junction graph of a map, and the submaps of `partition`, which are made around its nodes."""
     skeleton = map_skeleton(grid, config)
     graph = graph_of_skeleton(skeleton, grid, config)
     centers_m = _centers(graph, skeleton, grid, config)
@@ -53,7 +53,7 @@ def divide(grid: OccupancyGrid, config: PartitionConfig) -> tuple[nx.Graph, tupl
 def view_at(
     grid: OccupancyGrid, center_m: tuple[float, float], config: PartitionConfig, *, submap_id: int = 0
 ) -> Submap:
-    """The submap around `center_m` as `config.view` defines it: the whole disc, or its isovist.
+    """Return the submap around `center_m` as `config.view` defines it: the whole disc, or its isovist.
 
     The views of a query are made by this function, too, because only views of one kind are comparable.
     """
@@ -65,7 +65,8 @@ def view_at(
 def submap_at(
     grid: OccupancyGrid, center_m: tuple[float, float], radius_m: float, *, submap_id: int = 0
 ) -> Submap:
-    """The disc of `grid` around `center_m` (map frame); cells farther than `radius_m` become unknown."""
+    """Return the disc of `grid` around `center_m` (map frame); cells farther than `radius_m` become
+    unknown."""
     crop = grid.crop(center_m, radius_m)
     n = crop.cells.shape[0] // 2
     steps = np.arange(-n, n + 1) ** 2
@@ -80,13 +81,13 @@ def submap_at(
 
 
 def submap_centers(grid: OccupancyGrid, config: PartitionConfig) -> F64:
-    """Centres (N, 2) of the submaps in the map frame, metres, sorted by (y, x)."""
+    """Return the centres (N, 2) of the submaps in the map frame, metres, sorted by (y, x)."""
     skeleton = map_skeleton(grid, config)
     return _centers(graph_of_skeleton(skeleton, grid, config), skeleton, grid, config)
 
 
 def _centers(graph: nx.Graph, skeleton: BoolGrid, grid: OccupancyGrid, config: PartitionConfig) -> F64:
-    """The same, from the junction graph and the skeleton that it was made from."""
+    """Return the centres of the submaps, from the junction graph and the skeleton that it was made from."""
     if not grid.ground.any():
         return np.empty((0, 2))
     points_m = [node["center_m"] for _, node in graph.nodes(data=True) if node["kind"] == "junction"]
@@ -102,12 +103,14 @@ def _centers(graph: nx.Graph, skeleton: BoolGrid, grid: OccupancyGrid, config: P
     return grid.to_point(centers[np.lexsort(centers.T[::-1])])
 
 
-BEARINGS = 360
+# Isovists.
 
+BEARINGS = 360
+"""Rays of an isovist, by default."""
 WALL, OPEN, HIDDEN = 1, 0, -1
 """How a ray ends: on an occupied cell, at the limit of sight, or where nothing is known."""
-
 _STEP_CELLS = 0.5
+"""Length of the steps of a ray."""
 PATIENCE_M = 0.1
 """A ray passes this much of unknown cells: two cells of 5 cm that lay between the beams (chosen by hand)."""
 WALL_MARGIN_M = 0.15
@@ -116,10 +119,10 @@ WALL_MARGIN_M = 0.15
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Isovist:
-    """What is seen from `center_m` up to `sight_m`.
+    """The area that is visible from `center_m` up to `sight_m`.
 
-    ranges_m : (B,) float32, length of ray b; its bearing is 2 pi b / B from the map's x axis.
-    ends : (B,) int8, WALL, OPEN (nothing within sight) or HIDDEN (reached unknown cells).
+    ranges_m : (B,) float32, length of ray b; its bearing is 2 pi b / B from the map's x axis. ends : (B,)
+    int8, WALL, OPEN (nothing within sight) or HIDDEN (reached unknown cells).
     """
 
     center_m: tuple[float, float]
@@ -133,38 +136,8 @@ class Isovist:
 
     @property
     def observed(self) -> float:
-        """Share of the rays, 0..1, whose end is known (not HIDDEN)."""
+        """Return the share of the rays, 0..1, whose end is known (not HIDDEN)."""
         return float(np.mean(self.ends != HIDDEN))
-
-
-def look_around(
-    grid: OccupancyGrid,
-    centers_m: F64,
-    sight_m: float,
-    *,
-    bearings: int = BEARINGS,
-    patience_m: float = PATIENCE_M,
-) -> tuple[F32, NDArray[np.int8]]:
-    """Ranges (N, B) in metres and ends (N, B) of the isovists of many points (N, 2); see `isovist`."""
-    from pc2grid.submaps.junction_graph import cast_rays
-
-    columns, rows = ((centers_m - np.asarray(grid.origin_m)) / grid.resolution_m).T
-    ranges, ends = cast_rays(
-        grid.cells,
-        np.ascontiguousarray(rows, np.float64),
-        np.ascontiguousarray(columns, np.float64),
-        sight_m / grid.resolution_m,
-        bearings,
-        int(patience_m / grid.resolution_m / _STEP_CELLS),
-    )
-    return ranges * np.float32(grid.resolution_m), ends
-
-
-def ray_ends(ranges_m: F32) -> F64:
-    """The points (N, B, 2) where the rays of isovists (N, B) end, from the points that they are seen from."""
-    bearings_rad = 2.0 * np.pi * np.arange(ranges_m.shape[1]) / ranges_m.shape[1]
-    directions = np.stack((np.cos(bearings_rad), np.sin(bearings_rad)), axis=-1)
-    return np.asarray(ranges_m[..., None] * directions, np.float64)
 
 
 def isovist(
@@ -186,8 +159,37 @@ def isovist(
     return Isovist(center_m=center_m, sight_m=sight_m, ranges_m=ranges_m[0], ends=ends[0])
 
 
+def look_around(
+    grid: OccupancyGrid,
+    centers_m: F64,
+    sight_m: float,
+    *,
+    bearings: int = BEARINGS,
+    patience_m: float = PATIENCE_M,
+) -> tuple[F32, NDArray[np.int8]]:
+    """Return ranges (N, B) in metres and ends (N, B) of the isovists of many points (N, 2); see `isovist`."""
+    columns, rows = ((centers_m - np.asarray(grid.origin_m)) / grid.resolution_m).T
+    ranges, ends = cast_rays(
+        grid.cells,
+        np.ascontiguousarray(rows, np.float64),
+        np.ascontiguousarray(columns, np.float64),
+        sight_m / grid.resolution_m,
+        bearings,
+        int(patience_m / grid.resolution_m / _STEP_CELLS),
+    )
+    return ranges * np.float32(grid.resolution_m), ends
+
+
+def ray_ends(ranges_m: F32) -> F64:
+    """Return the ends (N, B, 2) of the rays of isovists (N, B), relative to their centres."""
+    bearings_rad = 2.0 * np.pi * np.arange(ranges_m.shape[1]) / ranges_m.shape[1]
+    directions = np.stack((np.cos(bearings_rad), np.sin(bearings_rad)), axis=-1)
+    return np.asarray(ranges_m[..., None] * directions, np.float64)
+
+
 def polygon_mask(view: Isovist, grid: OccupancyGrid, *, margin_m: float = 0.0) -> NDArray[np.bool_]:
-    """Cells (H, W) of `grid` inside the isovist's polygon; each ray is longer by `margin_m`."""
+    """Return a mask (H, W) of the cells of `grid` inside the isovist's polygon; each ray is longer by
+    `margin_m`."""
     angles = 2 * np.pi * np.arange(len(view.ranges_m)) / len(view.ranges_m)
     reach = np.minimum(view.ranges_m + margin_m, view.sight_m + margin_m)
     x = (view.center_m[0] + reach * np.cos(angles) - grid.origin_m[0]) / grid.resolution_m - 0.5
@@ -200,10 +202,10 @@ def polygon_mask(view: Isovist, grid: OccupancyGrid, *, margin_m: float = 0.0) -
 
 
 def visible_submap(grid: OccupancyGrid, view: Isovist, submap_id: int) -> Submap:
-    """The submap around the isovist's centre; cells that are not seen from there become unknown.
+    """Return the submap around the isovist's centre; cells that are not visible from there become unknown.
 
-    Of a wall that a ray ends on, the first `WALL_MARGIN_M` are kept. Free cells inside the isovist stay
-    free; the last cell of a ray that ends on a wall becomes occupied.
+    Of a wall that a ray ends on, the first `WALL_MARGIN_M` are kept. Free cells inside the isovist stay free;
+    the last cell of a ray that ends on a wall becomes occupied.
     """
     crop = grid.crop(view.center_m, view.sight_m)
     inside = polygon_mask(view, crop, margin_m=WALL_MARGIN_M)
@@ -220,3 +222,54 @@ def visible_submap(grid: OccupancyGrid, view: Isovist, submap_id: int) -> Submap
         radius_m=view.sight_m,
         grid=OccupancyGrid(cells=cells, resolution_m=crop.resolution_m, origin_m=crop.origin_m),
     )
+
+
+@compiled(nogil=True)
+def cast_rays(
+    cells: NDArray[np.int8], rows: F64, columns: F64, limit: float, bearings: int, patience: int
+) -> tuple[F32, NDArray[np.int8]]:
+    """Follow the rays of each place (N,) in steps of half a cell; all lengths in cells. Returns (N, B) each.
+
+    cells : (H, W). rows, columns : (N,) where the rays start, in cells from the grid's corner. limit : length
+    of a ray. patience : steps through unknown cells after which a ray is HIDDEN.
+
+    Returns the range up to which each ray is known to be free (or its wall), and how it ends.
+
+    Measured: 20 times as fast as the numpy form at 78 places of fr079 (4 against 87 ms); every described view
+    and every query casts rays.
+    """
+    height, width = cells.shape
+    flat = np.ascontiguousarray(cells).reshape(-1)
+    ranges = np.empty((len(rows), bearings), dtype=np.float32)
+    ends = np.empty((len(rows), bearings), dtype=np.int8)
+    for b in range(bearings):
+        angle = 2.0 * np.pi * b / bearings
+        dc, dr = np.cos(angle) * _STEP_CELLS, np.sin(angle) * _STEP_CELLS
+        for n in range(len(rows)):
+            r, c, length = rows[n], columns[n], 0.0
+            end = OPEN
+            known = 0.0
+            unknown_run = 0
+            while length < limit:
+                r += dr
+                c += dc
+                length += _STEP_CELLS
+                if not (0.0 <= r < height and 0.0 <= c < width):
+                    end = HIDDEN
+                    break
+                value = flat[np.uint64(r) * np.uint64(width) + np.uint64(c)]
+                if value >= OCCUPIED_FROM:
+                    end = WALL
+                    known = length
+                    break
+                if value < 0:
+                    unknown_run += 1
+                    if unknown_run > patience:
+                        end = HIDDEN
+                        break
+                else:
+                    unknown_run = 0
+                    known = length
+            ranges[n, b] = known
+            ends[n, b] = end
+    return ranges, ends

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64
 from pc2grid.model import OCCUPIED_FROM, UNKNOWN, OccupancyGrid
-from pc2grid.submaps.junction_graph import cast_rays
 from pc2grid.submaps.submaps import (
     _STEP_CELLS,
     HIDDEN,
     OPEN,
     WALL,
+    cast_rays,
     isovist,
     polygon_mask,
     visible_submap,
