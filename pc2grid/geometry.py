@@ -191,6 +191,13 @@ def interpolate_pose(T_a: F64, T_b: F64, fraction: float) -> F64:
     return T_a @ step
 
 
+def skew(vectors: F64) -> F64:
+    """Return the matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
+    result = np.zeros((len(vectors), 3, 3))
+    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
+    return result - result.transpose(0, 2, 1)
+
+
 def motion_size(motion: F64) -> tuple[float, float]:
     """The distance (m) and the angle (rad) of a motion (4, 4)."""
     (xx, xy, xz, x), (yx, yy, yz, y), (zx, zy, zz, z), _ = motion.tolist()

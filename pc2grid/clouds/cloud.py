@@ -53,8 +53,8 @@ def random_subset(length: int, count: int) -> NDArray[np.intp]:
     return np.sort(np.random.default_rng(length).choice(length, count, replace=False, shuffle=False))
 
 
-_AXIS_BITS = 21
-_HALF = 1 << (_AXIS_BITS - 1)  # voxels on either side of the first point: 52 km with an edge of 5 cm
+AXIS_BITS = 21
+HALF_VOXELS = 1 << (AXIS_BITS - 1)  # voxels on either side of the first point: 52 km with an edge of 5 cm
 _MERGED_POINTS = 1_000_000
 """Voxels that are collected before each is reduced to one entry; chosen by hand: 40 MB."""
 MAX_VOXELS = 200_000_000
@@ -94,13 +94,13 @@ class VoxelCloud:
             self._corner_m = points[0] - 0.5 * self.edge_m
         points = points - self._corner_m
         voxel = np.floor(points / self.edge_m)
-        if np.abs(voxel).max() >= _HALF:
+        if np.abs(voxel).max() >= HALF_VOXELS:
             raise LimitExceeded(
-                f"points are more than {_HALF * self.edge_m / 1000:.0f} km apart",
+                f"points are more than {HALF_VOXELS * self.edge_m / 1000:.0f} km apart",
                 hint="remove stray points, or use larger voxels",
             )
-        index = voxel.astype(np.int64) + _HALF
-        code = (index[:, 0] << 2 * _AXIS_BITS) + (index[:, 1] << _AXIS_BITS) + index[:, 2]
+        index = voxel.astype(np.int64) + HALF_VOXELS
+        code = (index[:, 0] << 2 * AXIS_BITS) + (index[:, 1] << AXIS_BITS) + index[:, 2]
         within = (points - voxel * self.edge_m).astype(np.float32)
         self._new.append(_reduced(code, within, np.ones(len(code), np.int32)))
         if sum(len(voxels.code) for voxels in self._new) > max(_MERGED_POINTS, len(self._merged.code) // 2):
@@ -125,9 +125,9 @@ class VoxelCloud:
             return np.empty((0, 3))
         kept = self._merged
         points: F64 = kept.sum_m / kept.count[:, None].astype(np.float64)
-        mask = (1 << _AXIS_BITS) - 1
+        mask = (1 << AXIS_BITS) - 1
         for axis in range(3):
-            index = ((kept.code >> (2 - axis) * _AXIS_BITS) & mask) - _HALF
+            index = ((kept.code >> (2 - axis) * AXIS_BITS) & mask) - HALF_VOXELS
             points[:, axis] += index * self.edge_m + self._corner_m[axis]
         return points
 

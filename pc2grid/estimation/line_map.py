@@ -26,7 +26,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from pc2grid.geometry import F32, F64, SE2, SUBPIXEL_BITS, BoolGrid, polygon_corners, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, SUBPIXEL_BITS, BoolGrid, polygon_corners, skew, wrap_angle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -419,7 +419,7 @@ def inverse_adjoint(motion: F64) -> F64:
     R = motion[:3, :3].T
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = R
-    result[:3, 3:] = -R @ _skew(motion[None, :3, 3])[0]
+    result[:3, 3:] = -R @ skew(motion[None, :3, 3])[0]
     return result
 
 
@@ -428,13 +428,6 @@ def _for_compiled(*arrays: F64) -> Iterator[F64]:
     more.
     """
     return (np.require(array, requirements=("C", "W")) for array in arrays)
-
-
-def _skew(vectors: F64) -> F64:
-    """Return the matrices (N, 3, 3) of the cross products with vectors (N, 3)."""
-    result = np.zeros((len(vectors), 3, 3))
-    result[:, 0, 1], result[:, 0, 2], result[:, 1, 2] = -vectors[:, 2], vectors[:, 1], -vectors[:, 0]
-    return result - result.transpose(0, 2, 1)
 
 
 # Compiled functions.

@@ -20,7 +20,7 @@ from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
-from pc2grid.clouds.cloud import random_subset
+from pc2grid.clouds.cloud import AXIS_BITS, HALF_VOXELS, random_subset
 from pc2grid.estimation.line_map import moved, steps, weakest
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.smoother import PoseWithCovariance
@@ -344,14 +344,10 @@ def _displacement(points_m: F64) -> F64:
     return mean + 1e-9 * np.eye(6)
 
 
-_BITS = 21
-_HALF = 1 << (_BITS - 1)
-
-
 @njit(cache=True, inline="always")
 def code_of(i: int, j: int, k: int) -> int:
     """Return the three indices of a voxel, each within a million of zero, as one number."""
-    return ((i + _HALF) << (2 * _BITS)) | ((j + _HALF) << _BITS) | (k + _HALF)
+    return ((i + HALF_VOXELS) << (2 * AXIS_BITS)) | ((j + HALF_VOXELS) << AXIS_BITS) | (k + HALF_VOXELS)
 
 
 @njit(cache=True, inline="always")
@@ -435,9 +431,9 @@ def fit_shapes(
         m, shape = moments[row], shapes[row]
         n, code = m[0], codes[row]
         x, y, z = m[1] / n, m[2] / n, m[3] / n
-        shape[0] = x + (((code >> (2 * _BITS)) & (2 * _HALF - 1)) - _HALF) * edge
-        shape[1] = y + (((code >> _BITS) & (2 * _HALF - 1)) - _HALF) * edge
-        shape[2] = z + ((code & (2 * _HALF - 1)) - _HALF) * edge
+        shape[0] = x + (((code >> (2 * AXIS_BITS)) & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
+        shape[1] = y + (((code >> AXIS_BITS) & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
+        shape[2] = z + ((code & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
         shape[3:] = 0.0
         if n < least:
             continue

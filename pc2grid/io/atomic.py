@@ -24,12 +24,12 @@ _MARK = ".pc2grid-"
 def replace_file(path: str | Path, *, alone: bool = False) -> Iterator[Path]:
     """Give the body a temporary path; when it ends well, that file becomes `path`.
 
-    The body opens, writes and closes the temporary file. If the body raises, or the process
-    dies, `path` keeps its old content; the temporary is removed (after a kill: by the next writer of the
-    same target). A symbolic link is followed, not replaced.
+    The body opens, writes and closes the temporary file. If the body raises, or the process dies, `path`
+    keeps its old content; the temporary is removed (after a kill: by the next writer of the same target). A
+    symbolic link is followed, not replaced.
 
-    The writer of a temporary file holds a lock on that file as long as it works. Its number tells
-    nothing: processes of two containers that share a folder may both be number 1.
+    The writer of a temporary file holds a lock on that file as long as it works. The number of its process
+    would not do: processes of two containers that share a folder may both be number 1.
 
     alone : the caller keeps all other writers of `path` away. Then every other temporary file was left over,
         and this one is not locked: on NFS, SQLite could not lock it.
@@ -71,7 +71,7 @@ def refuse_existing(path: str | Path, overwrite: bool) -> None:
 def require_writable(path: str | Path, overwrite: bool) -> None:
     """Refuse a target that cannot be written, before the work for it begins.
 
-    A temporary file is made in the folder of the target and removed: permissions alone do not tell, for
+    A temporary file is made in the folder of the target and removed: permissions alone are not enough, for
     example on a read-only disk.
 
     Raises OutputError if `path` exists and `overwrite` is not set, if it is a folder, or if its folder is
@@ -91,7 +91,7 @@ def require_writable(path: str | Path, overwrite: bool) -> None:
 
 
 def _create(target: Path, *, lock: bool) -> tuple[Path, int]:
-    """A new, empty file beside `target` and a descriptor of it, which may hold a lock on it."""
+    """Create an empty file beside `target`; returns it and a descriptor, which may hold a lock on it."""
     while True:
         temporary = target.with_name(f".{target.name}{_MARK}{secrets.token_hex(4)}.tmp")
         try:
@@ -109,7 +109,7 @@ def _create(target: Path, *, lock: bool) -> tuple[Path, int]:
 
 
 def is_at(descriptor: int, path: Path) -> bool:
-    """Whether `path` still names the open file."""
+    """Return True if `path` still names the open file."""
     try:
         return os.path.samestat(os.fstat(descriptor), path.stat())
     except FileNotFoundError:

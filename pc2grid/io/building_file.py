@@ -1,11 +1,9 @@
 """A building in a file: one point cloud, or a mesh, read as points block by block.
 
-Clouds in PCD and PLY are read by our own reader (`messages.cloud_files`), a block at a time from the mapped
-file, so that a map of many gigabytes needs the memory of a block. Meshes are read by Open3D, and sampled
-evenly.
-
-The folder of results that KISS-SLAM writes is read, too: `local_maps/plys` in it holds its local maps, all in
-one frame.
+Clouds in PCD and PLY are read by our own reader (`pc2grid.io.messages.clouds`), a block at a time from the
+mapped file, so that a map of many gigabytes needs the memory of a block. Meshes are read by Open3D, and
+sampled evenly. The folder of results that KISS-SLAM writes is read, too: `local_maps/plys` in it holds its
+local maps, all in one frame.
 """
 
 from __future__ import annotations
@@ -55,14 +53,14 @@ Kind = Literal["cloud", "mesh"]
 
 
 def is_building_file(path: Path) -> bool:
-    """Whether an input is a cloud, a mesh or a folder of KISS-SLAM, rather than a recording."""
+    """Return True if an input is a cloud, a mesh or a folder of KISS-SLAM, not a recording."""
     if path.is_dir():
         return os.path.isdir(path / _LOCAL_MAPS)  # noqa: PTH112 - no error for a folder that is locked
     return path.suffix.lower() in (*CLOUD_SUFFIXES, *MESH_SUFFIXES)
 
 
 def kind_of(path: Path) -> Kind:
-    """Whether a file holds points or triangles; a .ply with faces holds triangles.
+    """Return the kind of a file, points or triangles; a .ply with faces holds triangles.
 
     Raises MapFileError if there is no such file.
     """
@@ -76,9 +74,9 @@ def kind_of(path: Path) -> Kind:
 def building_points(
     path: Path, config: ReadConfig, check: Callable[[F64], None] = lambda vertices_m: None
 ) -> Iterator[F64]:
-    """The points (N, 3) of a building, metres, z up, in blocks; those of a mesh are spread evenly over it.
+    """Yield the points (N, 3) of a building, metres, z up, in blocks; those of a mesh are spread evenly.
 
-    `config.unit_m` and `config.up` say how the file's numbers are meant.
+    `config.unit_m` and `config.up` are the unit and the upward axis of the file.
 
     check : gets the vertices (V, 3) of a mesh, metres, z up, before it is sampled; may raise. A mesh in
         millimetres has a million times as many points.
@@ -109,7 +107,7 @@ def building_points(
 
 
 def axis_of_file(direction: F64, up: str) -> str:
-    """The axis of a file nearest to a direction (3,) in its points as they are read with `read.up`.
+    """Return the axis of a file nearest to a direction (3,) in its points as they are read with `read.up`.
 
     >>> axis_of_file(np.array([0.1, 0.0, -1.0]), up="y")
     '-y'
@@ -136,7 +134,7 @@ def _check_rounding(path: Path, points: F64, unit_m: float) -> None:
 
 
 def digest_of_building(path: Path) -> str:
-    """sha256 of the content, in hexadecimal digits. Raises MapFileError if it cannot be read."""
+    """Return the sha256 of the content, in hexadecimal digits. Raises MapFileError if it cannot be read."""
     digest = hashlib.sha256()
     for file in _files(path):
         with _opened(file) as content:
@@ -146,9 +144,10 @@ def digest_of_building(path: Path) -> str:
 
 
 def load_mesh(path: Path) -> tuple[F64, I64]:
-    """Vertices (V, 3) and triangles (T, 3), rows of the vertices, as they stand in a file.
+    """Read vertices (V, 3) and triangles (T, 3), rows of the vertices, as they stand in a file.
 
-    Raises MapFileError if it holds no triangles, a vertex is not finite, or a triangle has none.
+    Raises MapFileError if it holds no triangles, a vertex is not finite, or a triangle names a missing
+    vertex.
     """
     from pc2grid.open3d_core import o3d
 
@@ -186,7 +185,7 @@ def _check_counts(path: Path) -> None:
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a building. Raises MapFileError if there are none."""
+    """Return the files of a building. Raises MapFileError if there are none."""
     if path.is_dir():
         found = sorted((path / _LOCAL_MAPS).glob("*.ply"))
         if not found:
@@ -215,19 +214,19 @@ def _opened(path: Path) -> Iterator[Any]:
 
 
 def _header(path: Path) -> bytes:
-    """The beginning of a file; of a .ply its header."""
+    """Return the beginning of a file; of a .ply its header."""
     with _opened(path) as content:
         head: bytes = content.read(HEADER_BYTES)
     return head.partition(b"end_header")[0]
 
 
 def _has_faces(path: Path) -> bool:
-    """Whether the header of a .ply announces faces."""
+    """Return True if the header of a .ply announces faces."""
     return re.search(rb"^element face 0*[1-9]", _header(path), re.MULTILINE) is not None
 
 
 def _cloud_blocks(path: Path) -> Iterator[F64]:
-    """The points of a cloud file, in blocks. Raises PointCloudError if it contradicts itself."""
+    """Yield the points of a cloud file, in blocks. Raises PointCloudError if it contradicts itself."""
     if not path.stat().st_size:
         raise MapFileError(f"{path}: empty file")
     # The file stays mapped as long as there are views of it.
@@ -247,7 +246,7 @@ def _cloud_blocks(path: Path) -> Iterator[F64]:
 
 
 def sampled(vertices: F64, triangles: I64) -> Iterator[F64]:
-    """Blocks of points (N, 3) spread evenly over triangles (T, 3) of vertices (V, 3); never random."""
+    """Yield blocks of points (N, 3) spread evenly over triangles (T, 3) of vertices (V, 3); never random."""
     a, b, c = vertices[triangles].transpose(1, 0, 2)
     area_m2 = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
     # Each triangle gets its share of the points, rounded so that the sum stays right.
@@ -264,7 +263,8 @@ def sampled(vertices: F64, triangles: I64) -> Iterator[F64]:
 
 
 def neighbour_distances_m(points_m: F64, neighbour: int = 1) -> F64:
-    """Distance (M,) of some points of a cloud (N, 3), evenly chosen, to their n-th nearest neighbour."""
+    """Return the distance (M,) of some points of a cloud (N, 3), evenly chosen, to their n-th nearest
+    neighbour."""
     from scipy.spatial import cKDTree
 
     sample = points_m[:: max(len(points_m) // _SPACING_SAMPLE, 1)]

@@ -1,23 +1,17 @@
-"""Points as PLY or PCD files, as Open3D, CloudCompare and PCL read them: binary, little-endian, float32.
+"""Results as files: clouds, pose graphs, and standard ROS 2 MCAP (profile `ros2`, `cdr`, `ros2msg`).
 
-PLY: https://paulbourke.net/dataformats/ply. PCD: version 0.7, see `cloud_files`.
-
-Not written by Open3D 0.19: when the disk is full, its PLY writer reports success for a file that ends in the
+Clouds are PLY or PCD files, as Open3D, CloudCompare and PCL read them: binary, little-endian, float32. PLY:
+https://paulbourke.net/dataformats/ply. PCD: version 0.7, see `pc2grid.io.messages.clouds`. They are not
+written by Open3D 0.19: when the disk is full, its PLY writer reports success for a file that ends in the
 middle; it refuses clouds without points; and it takes 0.6 s to load for a header of ten lines.
 
-The pose graph of a session as a g2o text file (g2o, GTSAM, Ceres and SE-Sync read it).
+The pose graph of a session is a g2o text file (g2o, GTSAM, Ceres and SE-Sync read it): `VERTEX_SE2 id x y
+yaw` and `EDGE_SE2 from to dx dy dyaw`, followed by the upper triangle of the information matrix, row by row.
+Poses are planar, because loops are closed in the plane. The junction graph of a map is GraphML (Gephi, yEd,
+networkx).
 
-`VERTEX_SE2 id x y yaw` and `EDGE_SE2 from to dx dy dyaw`, followed by the upper triangle of the information
-matrix, row by row. Poses are planar, because loops are closed in the plane.
-
-The junction graph of a map as GraphML (Gephi, yEd, networkx).
-
-ROS 2 messages of what pc2grid writes and publishes, and their bytes in CDR.
-
-Messages are serialised, and their definitions written, by the type store of `rosbags` for ROS 2 Humble. Large
-arrays are handed to it as numpy arrays, which it copies as a whole.
-
-Recordings and results as standard ROS 2 MCAP (profile `ros2`, `cdr`, `ros2msg`): Foxglove opens them.
+ROS 2 messages are serialised, and their definitions written, by the type store of `rosbags` for ROS 2 Humble.
+Large arrays are handed to it as numpy arrays, which it copies as a whole. Foxglove opens the MCAP files.
 """
 
 from __future__ import annotations
@@ -46,6 +40,8 @@ if TYPE_CHECKING:
     import networkx as nx
     from rosbags.typesys.store import Typestore
 
+
+# Clouds.
 
 _PLY = """ply
 format binary_little_endian 1.0
@@ -86,6 +82,8 @@ def write_cloud(path: str | Path, points_m: ArrayLike) -> None:
         temporary.write_bytes(header.format(n=len(points)).encode("ascii") + points.tobytes())
 
 
+# Graphs.
+
 # Standard deviation of tracking as a random walk, of the order that loop closure assumes; chosen by hand.
 _WALK_M, _WALK_RAD = 0.03, math.radians(0.5)  # after one metre
 _LEAST_M, _LEAST_RAD = 1e-3, 1e-3  # without motion
@@ -94,12 +92,12 @@ _UPPER = np.triu_indices(3)
 
 
 def write_g2o(path: str | Path, trajectory: Trajectory, loops: Iterable[Loop]) -> None:
-    """Write the trajectory and the loops that were accepted.
+    """Write the trajectory and the accepted loops.
 
     Vertex k is pose k of the trajectory after loop closure. The edges between consecutive vertices are the
     steps of this trajectory; their uncertainty grows with the distance and is large where registration was
-    lost. The edges of loops are the measured relative poses with their own information.
-    Raises OutputError if the file cannot be written.
+    lost. The edges of loops are the measured relative poses with their own information. Raises OutputError if
+    the file cannot be written.
     """
     poses = list(trajectory.poses())
     health = trajectory.health or (Health.FINE,) * len(poses)
@@ -118,7 +116,7 @@ def write_g2o(path: str | Path, trajectory: Trajectory, loops: Iterable[Loop]) -
 
 
 def _information_of(step: SE2) -> F64:
-    """(3, 3) information of x, y, yaw of one step."""
+    """Return the information (3, 3) of x, y, yaw of one step."""
     root = math.sqrt(math.hypot(step.x, step.y))
     sigma_m, sigma_rad = _LEAST_M + _WALK_M * root, _LEAST_RAD + _WALK_RAD * root
     return np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
@@ -132,7 +130,7 @@ def _line(tag: str, ids: list[int], pose: SE2, information: F64 | None = None) -
 
 
 def write_graph(path: str | Path, graph: nx.Graph) -> None:
-    """Write a graph as `pc2grid.submaps.junction_graph` makes it.
+    """Write a graph of `pc2grid.submaps.junction_graph`.
 
     GraphML holds plain numbers and text only: `center_m` becomes `x_m` and `y_m`, and the pixels of the edges
     (`path_m`) are left out. Raises OutputError if the file cannot be written.
@@ -148,106 +146,7 @@ def write_graph(path: str | Path, graph: nx.Graph) -> None:
         nx.write_graphml_xml(flat, temporary)
 
 
-_UNOBSERVED = 1e6
-"""Variance of z, roll and pitch of a planar pose, as drivers of robots on wheels write it. nav2 takes 1e9 at
-most."""
-
-
-@functools.cache
-def typestore() -> Typestore:
-    """The message types of ROS 2 Humble; loading them takes 0.1 s, so only a writer does."""
-    from rosbags.typesys import Stores, get_typestore
-
-    return get_typestore(Stores.ROS2_HUMBLE)
-
-
-def new(name: str, *fields: Any) -> Any:
-    """A message of type `package/Name` from its fields, in the order of its definition."""
-    return typestore().types[name.replace("/", "/msg/")](*fields)
-
-
-def time(stamp_ns: int) -> Any:
-    """builtin_interfaces/Time."""
-    return new("builtin_interfaces/Time", *divmod(int(stamp_ns), 1_000_000_000))
-
-
-def header(stamp_ns: int, frame: str) -> Any:
-    """std_msgs/Header."""
-    return new("std_msgs/Header", time(stamp_ns), frame)
-
-
-def vector(x: float, y: float, z: float) -> Any:
-    """geometry_msgs/Vector3."""
-    return new("geometry_msgs/Vector3", float(x), float(y), float(z))
-
-
-def quaternion(T: F64) -> Any:
-    """geometry_msgs/Quaternion of a (4, 4) pose."""
-    return new("geometry_msgs/Quaternion", *(float(v) for v in quat_xyzw_from_pose(T)))
-
-
-def pose(T: F64) -> Any:
-    """geometry_msgs/Pose of a (4, 4) pose."""
-    point = new("geometry_msgs/Point", *(float(v) for v in T[:3, 3]))
-    return new("geometry_msgs/Pose", point, quaternion(T))
-
-
-def transform(T: F64) -> Any:
-    """geometry_msgs/Transform of a (4, 4) pose."""
-    return new("geometry_msgs/Transform", vector(*T[:3, 3]), quaternion(T))
-
-
-def definition(type_name: str) -> str:
-    """The definition, in the .msg language, of a type such as `nav_msgs/msg/OccupancyGrid`."""
-    return typestore().generate_msgdef(type_name, ros_version=2)[0]
-
-
-def serialized(message: Any) -> bytes:
-    """A message in CDR, little endian."""
-    return bytes(typestore().serialize_cdr(message, message.__msgtype__, little_endian=True))
-
-
-# --- whole messages -----------------------------------------------------------------------------------
-
-
-def pose_with_covariance(stamp_ns: int, planar: SE2, covariance: ArrayLike, frame: str = "map") -> Any:
-    """geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y, yaw.
-
-    Its 36 numbers are row by row of x, y, z, roll, pitch, yaw; what a plane does not show is `_UNOBSERVED`.
-    """
-    full = np.diag([0.0, 0.0, _UNOBSERVED, _UNOBSERVED, _UNOBSERVED, 0.0])
-    full[np.ix_((0, 1, 5), (0, 1, 5))] = np.asarray(covariance, dtype=np.float64).reshape(3, 3)
-    content = new("geometry_msgs/PoseWithCovariance", pose(planar.lift()), full.reshape(-1))
-    return new("geometry_msgs/PoseWithCovarianceStamped", header(stamp_ns, frame), content)
-
-
-def initialpose(stamp_ns: int, planar: SE2, covariance: ArrayLike, frame: str = "map") -> Any:
-    """The same as nav2 takes it on /initialpose: with variances alone.
-
-    nav2 refuses the message if one of its 36 numbers is negative (`validateMsg` of nav2_ros_common), and a
-    covariance of x, y and yaw mostly is. AMCL reads the variances and, of all others, that of x with y.
-    """
-    variances = np.diag(np.diagonal(np.asarray(covariance, dtype=np.float64)))
-    return pose_with_covariance(stamp_ns, planar, variances, frame)
-
-
-def occupancy_grid(stamp_ns: int, grid: OccupancyGrid, frame: str = "map", of: MapOf = "everything") -> Any:
-    """nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`. of : see its `told`."""
-    height, width = grid.cells.shape
-    origin = pose(SE2(*grid.origin_m).lift())
-    info = new("nav_msgs/MapMetaData", time(stamp_ns), grid.resolution_m, width, height, origin)
-    cells = np.ascontiguousarray(grid.told(of)).reshape(-1)
-    return new("nav_msgs/OccupancyGrid", header(stamp_ns, frame), info, cells)
-
-
-def transforms(stamp_ns: int, edges: Sequence[tuple[str, str, F64]]) -> Any:
-    """tf2_msgs/TFMessage of edges (parent, child, T_parent_child), with T (4, 4)."""
-    stamped = [
-        new("geometry_msgs/TransformStamped", header(stamp_ns, parent), child, transform(T))
-        for parent, child, T in edges
-    ]
-    return new("tf2_msgs/TFMessage", stamped)
-
+# Recordings.
 
 _FLOAT32 = 7  # sensor_msgs/PointField
 _FARTHEST_DEPTH_M = 65.0  # an image of 16UC1 ends at 65.535 m
@@ -270,7 +169,7 @@ class Marker:
 
 
 class LogWriter:
-    """Write one MCAP. The file gets its name only when the `with` block ends without an error.
+    """Writes one MCAP. The file gets its name only when the `with` block ends without an error.
 
     path : file to write; an existing one is refused with OutputError unless `overwrite` is set.
 
@@ -320,7 +219,8 @@ class LogWriter:
         points: F32,
         offsets_s: NDArray[np.floating] | None = None,
     ) -> None:
-        """sensor_msgs/PointCloud2 with float32 x y z (N, 3), and `time` (s after the stamp) if given."""
+        """Write a sensor_msgs/PointCloud2 with float32 x y z (N, 3), and `time` (s after the stamp) if
+        given."""
         names = ["x", "y", "z"] + (["time"] if offsets_s is not None else [])
         columns = np.asarray(points, dtype=np.float32).reshape(-1, 3)
         if offsets_s is not None:
@@ -344,7 +244,7 @@ class LogWriter:
         range_max: float,
         time_increment: float = 0.0,
     ) -> None:
-        """sensor_msgs/LaserScan; `inf` in ranges means no return."""
+        """Write a sensor_msgs/LaserScan; `inf` in ranges means no return."""
         values = np.asarray(ranges, dtype=np.float32).reshape(-1)
         angle_max = angle_min + angle_increment * (len(values) - 1)
         angles = (angle_min, angle_max, angle_increment)
@@ -354,7 +254,7 @@ class LogWriter:
         self._add(topic, stamp_ns, new("sensor_msgs/LaserScan", header(stamp_ns, frame), *scan))
 
     def depth_image(self, topic: str, stamp_ns: int, frame: str, depth_m: ArrayLike) -> None:
-        """sensor_msgs/Image of encoding 16UC1: millimetres, 0 without a return or beyond 65 m."""
+        """Write a sensor_msgs/Image of encoding 16UC1: millimetres, 0 without a return or beyond 65 m."""
         depth = np.asarray(depth_m, dtype=np.float64)
         millimetres = np.zeros(depth.shape, dtype=np.uint16)
         good = np.isfinite(depth) & (depth > 0) & (depth < _FARTHEST_DEPTH_M)
@@ -364,7 +264,8 @@ class LogWriter:
         self._add(topic, stamp_ns, new("sensor_msgs/Image", header(stamp_ns, frame), *image))
 
     def camera_info(self, topic: str, stamp_ns: int, frame: str, K: ArrayLike, W: int, H: int) -> None:
-        """sensor_msgs/CameraInfo of an undistorted camera with intrinsics K (3, 3) and W x H pixels."""
+        """Write a sensor_msgs/CameraInfo of an undistorted camera with intrinsics K (3, 3) and W x H
+        pixels."""
         k = np.asarray(K, dtype=np.float64).reshape(3, 3)
         distortion, rectification = np.zeros(5), np.eye(3).reshape(-1)
         projection = np.column_stack((k, np.zeros(3))).reshape(-1)
@@ -377,7 +278,7 @@ class LogWriter:
     def odometry(
         self, topic: str, stamp_ns: int, T_odom_base: F64, frame: str = "odom", child: str = "base_link"
     ) -> None:
-        """nav_msgs/Odometry with a pose (4, 4); covariance and twist zero (unknown)."""
+        """Write a nav_msgs/Odometry with a pose (4, 4); covariance and twist zero (unknown)."""
         unknown = np.zeros(36)
         uncertain = new("geometry_msgs/PoseWithCovariance", pose(T_odom_base), unknown)
         zero = vector(0.0, 0.0, 0.0)
@@ -386,17 +287,18 @@ class LogWriter:
         self._add(topic, stamp_ns, new("nav_msgs/Odometry", head, child, uncertain, twist))
 
     def tf(self, stamp_ns: int, parent: str, child: str, T_parent_child: F64) -> None:
-        """One transform (4, 4) on /tf."""
+        """Write one transform (4, 4) on /tf."""
         self._transforms("/tf", stamp_ns, [(parent, child, T_parent_child)])
 
     def tf_static(self, stamp_ns: int, parent: str, child: str, T_parent_child: F64) -> None:
-        """One transform (4, 4) on /tf_static: valid at all times."""
+        """Write one transform (4, 4) on /tf_static: valid at all times."""
         self._transforms("/tf_static", stamp_ns, [(parent, child, T_parent_child)])
 
     def path(
         self, topic: str, trajectory: Trajectory, frame: str = "map", *, stamp_ns: int | None = None
     ) -> None:
-        """nav_msgs/Path of a whole trajectory with the stamp of its first pose, so players always show it.
+        """Write a nav_msgs/Path of a whole trajectory with the stamp of its first pose, so players always
+        show it.
 
         stamp_ns : another stamp, for a path of another time.
         """
@@ -412,11 +314,12 @@ class LogWriter:
     def pose_with_covariance(
         self, topic: str, stamp_ns: int, pose: SE2, covariance: ArrayLike, frame: str = "map"
     ) -> None:
-        """geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y, yaw."""
+        """Write a geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y,
+        yaw."""
         self._add(topic, stamp_ns, pose_with_covariance(stamp_ns, pose, covariance, frame))
 
     def initialpose(self, stamp_ns: int, pose: SE2, covariance: ArrayLike, frame: str = "map") -> None:
-        """The same on /initialpose, as nav2 takes it."""
+        """Write the same on /initialpose, with variances alone for nav2."""
         self._add("/initialpose", stamp_ns, initialpose(stamp_ns, pose, covariance, frame))
 
     # --- maps and metadata ----------------------------------------------------------------------------
@@ -424,16 +327,17 @@ class LogWriter:
     def occupancy_grid(
         self, topic: str, stamp_ns: int, grid: OccupancyGrid, frame: str = "map", of: MapOf = "everything"
     ) -> None:
-        """nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`. of : see its `told`."""
+        """Write a nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`. of : see its
+        `told`."""
         self._add(topic, stamp_ns, occupancy_grid(stamp_ns, grid, frame, of))
 
     def markers(self, topic: str, stamp_ns: int, markers: Sequence[Marker], frame: str = "map") -> None:
-        """visualization_msgs/MarkerArray in the layout since ROS 2 Humble; shown until replaced."""
+        """Write a visualization_msgs/MarkerArray in the layout since ROS 2 Humble; shown until replaced."""
         drawn = [_marker(number, marker, header(stamp_ns, frame)) for number, marker in enumerate(markers)]
         self._add(topic, stamp_ns, new("visualization_msgs/MarkerArray", drawn))
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
-        """An MCAP metadata record: the configuration, the digest of the input, and the like."""
+        """Write an MCAP metadata record: the configuration, the digest of the input, and the like."""
         self._open().add_metadata(name, values)
 
     def _transforms(self, topic: str, stamp_ns: int, edges: Sequence[tuple[str, str, F64]]) -> None:
@@ -469,12 +373,12 @@ class LogWriter:
 
 
 def _bytes_of(values: NDArray[Any], dtype: str) -> NDArray[np.uint8]:
-    """The values, row by row, as the bytes of a numpy type."""
+    """Return the values, row by row, as the bytes of a numpy type."""
     return np.ascontiguousarray(values, dtype).view(np.uint8).reshape(-1)
 
 
 def _marker(number: int, marker: Marker, head: Any) -> Any:
-    """visualization_msgs/Marker without lifetime: it is shown until it is replaced."""
+    """Make a visualization_msgs/Marker without lifetime: it is shown until it is replaced."""
     points = np.asarray(marker.points_m, np.float64).reshape(-1, 3).tolist()
     no_texture = new("sensor_msgs/CompressedImage", header(0, ""), "", np.empty(0, np.uint8))
     no_mesh = new("visualization_msgs/MeshFile", "", np.empty(0, np.uint8))
@@ -500,3 +404,107 @@ def _marker(number: int, marker: Marker, head: Any) -> Any:
         no_mesh,
         False,
     )
+
+
+# Messages of ROS 2.
+
+_UNOBSERVED = 1e6
+"""Variance of z, roll and pitch of a planar pose, as drivers of robots on wheels write it. nav2 takes 1e9 at
+most."""
+
+
+# --- whole messages -----------------------------------------------------------------------------------
+
+
+def pose_with_covariance(stamp_ns: int, planar: SE2, covariance: ArrayLike, frame: str = "map") -> Any:
+    """Make a geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y, yaw.
+
+    Its 36 numbers are row by row of x, y, z, roll, pitch, yaw; directions outside of the plane have the
+    variance `_UNOBSERVED`.
+    """
+    full = np.diag([0.0, 0.0, _UNOBSERVED, _UNOBSERVED, _UNOBSERVED, 0.0])
+    full[np.ix_((0, 1, 5), (0, 1, 5))] = np.asarray(covariance, dtype=np.float64).reshape(3, 3)
+    content = new("geometry_msgs/PoseWithCovariance", pose(planar.lift()), full.reshape(-1))
+    return new("geometry_msgs/PoseWithCovarianceStamped", header(stamp_ns, frame), content)
+
+
+def initialpose(stamp_ns: int, planar: SE2, covariance: ArrayLike, frame: str = "map") -> Any:
+    """Make the message for /initialpose of nav2: the same, but with variances alone.
+
+    nav2 refuses the message if one of its 36 numbers is negative (`validateMsg` of nav2_ros_common), and a
+    covariance of x, y and yaw mostly is. AMCL reads the variances and, of all others, that of x with y.
+    """
+    variances = np.diag(np.diagonal(np.asarray(covariance, dtype=np.float64)))
+    return pose_with_covariance(stamp_ns, planar, variances, frame)
+
+
+def occupancy_grid(stamp_ns: int, grid: OccupancyGrid, frame: str = "map", of: MapOf = "everything") -> Any:
+    """Make a nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`. of : see its `told`."""
+    height, width = grid.cells.shape
+    origin = pose(SE2(*grid.origin_m).lift())
+    info = new("nav_msgs/MapMetaData", time(stamp_ns), grid.resolution_m, width, height, origin)
+    cells = np.ascontiguousarray(grid.told(of)).reshape(-1)
+    return new("nav_msgs/OccupancyGrid", header(stamp_ns, frame), info, cells)
+
+
+def transforms(stamp_ns: int, edges: Sequence[tuple[str, str, F64]]) -> Any:
+    """Make a tf2_msgs/TFMessage of edges (parent, child, T_parent_child), with T (4, 4)."""
+    stamped = [
+        new("geometry_msgs/TransformStamped", header(stamp_ns, parent), child, transform(T))
+        for parent, child, T in edges
+    ]
+    return new("tf2_msgs/TFMessage", stamped)
+
+
+@functools.cache
+def typestore() -> Typestore:
+    """Load the message types of ROS 2 Humble; it takes 0.1 s, so only a writer does."""
+    from rosbags.typesys import Stores, get_typestore
+
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def new(name: str, *fields: Any) -> Any:
+    """Make a message of type `package/Name` from its fields, in the order of its definition."""
+    return typestore().types[name.replace("/", "/msg/")](*fields)
+
+
+def time(stamp_ns: int) -> Any:
+    """Make a builtin_interfaces/Time."""
+    return new("builtin_interfaces/Time", *divmod(int(stamp_ns), 1_000_000_000))
+
+
+def header(stamp_ns: int, frame: str) -> Any:
+    """Make a std_msgs/Header."""
+    return new("std_msgs/Header", time(stamp_ns), frame)
+
+
+def vector(x: float, y: float, z: float) -> Any:
+    """Make a geometry_msgs/Vector3."""
+    return new("geometry_msgs/Vector3", float(x), float(y), float(z))
+
+
+def quaternion(T: F64) -> Any:
+    """Make a geometry_msgs/Quaternion of a (4, 4) pose."""
+    return new("geometry_msgs/Quaternion", *(float(v) for v in quat_xyzw_from_pose(T)))
+
+
+def pose(T: F64) -> Any:
+    """Make a geometry_msgs/Pose of a (4, 4) pose."""
+    point = new("geometry_msgs/Point", *(float(v) for v in T[:3, 3]))
+    return new("geometry_msgs/Pose", point, quaternion(T))
+
+
+def transform(T: F64) -> Any:
+    """Make a geometry_msgs/Transform of a (4, 4) pose."""
+    return new("geometry_msgs/Transform", vector(*T[:3, 3]), quaternion(T))
+
+
+def definition(type_name: str) -> str:
+    """Return the definition, in the .msg language, of a type such as `nav_msgs/msg/OccupancyGrid`."""
+    return typestore().generate_msgdef(type_name, ros_version=2)[0]
+
+
+def serialized(message: Any) -> bytes:
+    """Serialise a message in CDR, little endian."""
+    return bytes(typestore().serialize_cdr(message, message.__msgtype__, little_endian=True))

@@ -1,17 +1,12 @@
-"""The tree of coordinate frames of a log (tf, REP-105), and the pose of one frame in another over time.
+"""Coordinate frames over time: the tf of a log (REP-105) as a tree, and the attitude of an IMU (REP-145).
 
-The attitude of an IMU: which way is up, and how it turns (sensor_msgs/Imu, REP-145).
-
-The gyroscope tells how the IMU turns, but not which way is up. The accelerometer measures what holds the IMU
-against gravity, and how it is shaken. In the frame that the gyroscope carries on, gravity stands still, and
-the shaking of a hand or of steps cancels over a second. So the vertical is the mean of the accelerations in
-that frame over the last time: a complementary filter (Mahony, Hamel and Pflimlin, "Nonlinear complementary
-filters on the special orthogonal group", 2008) that is read behind the moment that is asked for.
-
-Assumed: no lasting acceleration, as in a car or a lift that starts; accelerations in m/s2; an error of the
-gyroscope that turns its frame little within that time.
-
-The transforms of the robot: all static ones, and as many of the moving ones as are needed.
+`Attitude` follows sensor_msgs/Imu messages. The gyroscope measures the rotation of the IMU, but not the
+vertical. The accelerometer measures the force against gravity, and the shaking. In the frame that the
+gyroscope integrates, gravity is constant, and the shaking of a hand or of steps cancels over a second. So the
+vertical is the mean of the accelerations in that frame over the last time: a complementary filter (Mahony,
+Hamel and Pflimlin, "Nonlinear complementary filters on the special orthogonal group", 2008) that is read with
+a delay. Assumed: no lasting acceleration, as in a car or a lift that starts; accelerations in m/s2; a small
+drift of the gyroscope within that time.
 """
 
 from __future__ import annotations
@@ -90,7 +85,7 @@ class PoseTrack:
         return True
 
     def emptied(self) -> PoseTrack:
-        """A track of the same kind without samples."""
+        """Return a track of the same kind without samples."""
         return PoseTrack(lasting=self._lasting)
 
     def __len__(self) -> int:
@@ -98,11 +93,12 @@ class PoseTrack:
 
     @property
     def newest_ns(self) -> int:
-        """The stamp of the newest sample; 0 if there is none."""
+        """Return the stamp of the newest sample; 0 if there is none."""
         return self._stamps[-1] if self._stamps else 0
 
     def at(self, stamp_ns: int) -> F64 | None:
-        """Pose (4, 4) at a time: between two samples, or within 0.1 s of the nearest; None elsewhere."""
+        """Return the pose (4, 4) at a time: between two samples, or within 0.1 s of the nearest; None
+        elsewhere."""
         stamps = self._stamps
         after = bisect.bisect_left(stamps, stamp_ns)
         if after < len(stamps) and stamps[after] == stamp_ns:
@@ -119,7 +115,7 @@ class PoseTrack:
         return self._pose(nearest)
 
     def longest_gap_ns(self, begin_ns: int, end_ns: int) -> int:
-        """The longest time without a sample between two times."""
+        """Return the longest time without a sample between two times."""
         inside = self._stamps[
             bisect.bisect_right(self._stamps, begin_ns) : bisect.bisect_left(self._stamps, end_ns)
         ]
@@ -146,7 +142,7 @@ class FrameTree:
 
     @property
     def frames(self) -> list[str]:
-        """All known frames."""
+        """Return all known frames."""
         return sorted({*self._parent, *self._parent.values()})
 
     def forget_moving(self) -> None:
@@ -197,12 +193,12 @@ class FrameTree:
         self._parent[child] = parent
 
     def static_root(self) -> str | None:
-        """The root of the static transforms, if these form one tree."""
+        """Return the root of the static transforms, if these form one tree."""
         roots = {self._above(child)[-1] for child in self._static}
         return roots.pop() if len(roots) == 1 else None
 
     def static_root_of(self, frame: str) -> str:
-        """Return the frame that static transforms lead to from this one."""
+        """Return the root that is reached from this frame by static transforms."""
         return self._above(frame)[-1]
 
     def rigid(self, target: str, source: str) -> bool:
@@ -210,22 +206,23 @@ class FrameTree:
         return self.connected(target, source) and not self.moving(target, source)
 
     def ambiguous(self, target: str, source: str) -> bool:
-        """Return whether static transforms between two connected frames put one of them in two places."""
+        """Return whether the static transforms between two connected frames give one of them two places."""
         return not self._moved.isdisjoint(itertools.chain(*self._branches(target, source)))
 
     def static_leaves(self, frame: str) -> list[str]:
-        """The frames that static transforms put on `frame`, and that carry no further ones."""
+        """Return the leaves of the static transforms below `frame`."""
         parents = {self._parent[child] for child in self._static}
         return [child for child in self._static if child not in parents and frame in self._above(child)]
 
     def _above(self, frame: str) -> list[str]:
-        """The frame, and those that static transforms lead to from it."""
+        """Return the frame, and those above it that static transforms reach."""
         chain = self.chain(frame)
         moving = (k for k, child in enumerate(chain) if child not in self._static)
         return chain[: next(moving, len(chain)) + 1]
 
     def chain(self, frame: str) -> list[str]:
-        """The frame, its parent, and so on to the root. Raises FrameError if the parents form a circle."""
+        """Return the frame, its parent, and so on to the root. Raises FrameError if the parents form a
+        circle."""
         chain = {frame: None}  # a dict as an ordered set
         while (parent := self._parent.get(frame)) is not None:
             if parent in chain:
@@ -235,25 +232,28 @@ class FrameTree:
         return list(chain)
 
     def connected(self, target: str, source: str) -> bool:
-        """Whether there is a path between two frames."""
+        """Return whether there is a path between two frames."""
         return target == source or bool(set(self.chain(target)) & set(self.chain(source)))
 
     def moving(self, target: str, source: str) -> bool:
-        """Whether a transform between two connected frames depends on time."""
+        """Return whether a transform between two connected frames depends on time."""
         return bool(self._moving_tracks(target, source))
 
     def newest_ns(self, target: str, source: str) -> int:
-        """The stamp up to which the moving part of the path between two connected frames is known; 0 if it
-        is not known at all, or nothing moves there."""
+        """Return the stamp up to which the moving part of the path between two connected frames is known.
+
+        It is 0 if that is not known at all, or nothing moves there.
+        """
         return min((track.newest_ns for track in self._moving_tracks(target, source)), default=0)
 
     def longest_gap_ns(self, target: str, source: str, begin_ns: int, end_ns: int) -> int:
-        """The longest time without a sample of a moving part of the path between two connected frames."""
+        """Return the longest time without a sample of a moving part of the path between two connected
+        frames."""
         tracks = self._moving_tracks(target, source)
         return max((track.longest_gap_ns(begin_ns, end_ns) for track in tracks), default=0)
 
     def lookup(self, target: str, source: str, stamp_ns: int) -> F64 | None:
-        """`T_target_source` (4, 4) at a time; None if a moving part of it is not known then.
+        """Return `T_target_source` (4, 4) at a time; None if a moving part of it is not known then.
 
         Raises FrameError if the frames are not connected.
         """
@@ -274,7 +274,7 @@ class FrameTree:
         return result
 
     def missing(self, frame: str, target: str) -> FrameError:
-        """The error for a frame that tf does not connect to `target`."""
+        """Return the error for a frame that tf does not connect to `target`."""
         known = self.frames
         close = difflib.get_close_matches(frame, known, n=1)
         guess = f"; did the driver mean {close[0]}?" if close and close[0] != frame else ""
@@ -288,18 +288,19 @@ class FrameTree:
         )
 
     def _branches(self, target: str, source: str) -> tuple[list[str], list[str]]:
-        """Children of the edges from `source`, and from `target`, up to the frame where they meet."""
+        """Return the children of the edges from `source`, and from `target`, up to the frame where they
+        meet."""
         up, down = self.chain(source), self.chain(target)
         common = next(frame for frame in up if frame in down)
         return up[: up.index(common)], down[: down.index(common)]
 
     def _moving_tracks(self, target: str, source: str) -> list[PoseTrack]:
-        """The tracks of the moving edges between two connected frames."""
+        """Return the tracks of the moving edges between two connected frames."""
         edges = itertools.chain(*self._branches(target, source))
         return [self._moving[child] for child in edges if child not in self._static]
 
     def _climb(self, children: list[str], stamp_ns: int) -> F64 | None:
-        """`T_top_bottom` from the first of `children` to the parent of the last."""
+        """Return `T_top_bottom` from the first of `children` to the parent of the last."""
         pose = np.eye(4)
         for child in children:
             edge = self._static.get(child)
@@ -315,13 +316,61 @@ class FrameTree:
             self.warnings.append(sentence)
 
 
+class Transforms:
+    """Fills a tree of frames from the tf topics of a robot: all static transforms, and the moving ones on
+    demand.
+
+    frames : the tree. moving : the topics of moving transforms. edges : those of them that were read.
+    """
+
+    def __init__(
+        self, source: MessageSource, tf: Sequence[TopicInfo], frames: FrameTree, end_ns: int
+    ) -> None:
+        """Read the static transforms of some topics. end_ns : up to which moving ones are read."""
+        self._source, self.frames = source, frames
+        self.moving = [t for t in tf if not topics.is_static(t)]
+        self.edges: list[First] = []
+        for _ in self._read([t for t in tf if topics.is_static(t)], None):
+            pass
+        self._later = self._read(self.moving, end_ns)
+
+    def read_on(self) -> bool:
+        """Read the next message of moving transforms; returns whether there is one."""
+        found = next(self._later, None)
+        self.edges += found or ()
+        return found is not None
+
+    def read_odometry(self, base: str) -> str | None:
+        """Return the frame above the base that is its odometry frame in tf, after reading enough to know its
+        clock."""
+        while (len(self.edges) < FIRST or self.odometry_frame(base) is None) and self.read_on():
+            pass
+        return self.odometry_frame(base)
+
+    def odometry_frame(self, base: str) -> str | None:
+        """Return the frame above the base that is its odometry frame in tf, as far as tf was read."""
+        above = self.frames.chain(base)[1:]
+        return next((f for f in above if f == "odom" or f.endswith(("/odom", "_odom"))), None)
+
+    def _read(self, tf: Sequence[TopicInfo], end_ns: int | None) -> Iterator[list[First]]:
+        """Read the transforms of some topics into the tree; yield those of each message."""
+        decoders = {t: decoder_for(t) for t in tf}
+        for message in self._source.messages({t.topic for t in tf}, end_ns=end_ns):
+            if message.channel in decoders:
+                at_ns, edges = message.log_time_ns, tolerant(decoders[message.channel], message.data)
+                self.frames.add_all(edges, static=topics.is_static(message.channel), log_time_ns=at_ns)
+                yield [First(at_ns, edge) for edge in edges or ()]
+
+
+# The attitude of an IMU.
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AttitudeParameters:
     """Numbers of the filter. Chosen by hand.
 
-    memory_s : time over which accelerations are averaged: two steps of somebody who walks.
-    gravity_mps2 : standard gravity. slack : an acceleration that differs from it by more than this share says
-        nothing.
+    memory_s : time over which accelerations are averaged: two steps of somebody who walks. gravity_mps2 :
+    standard gravity. slack : an acceleration that differs from it by more than this share is left out.
     """
 
     memory_s: float = 1.0
@@ -333,7 +382,7 @@ ATTITUDE = AttitudeParameters()
 
 
 class Attitude:
-    """Follows an IMU message by message. Memory is bounded.
+    """Estimates the attitude of an IMU message by message. Memory is bounded.
 
     received : messages since the beginning.
     """
@@ -344,7 +393,7 @@ class Attitude:
         self._restart()
 
     def _restart(self) -> None:
-        """Begin a new frame: how the IMU has turned is not known."""
+        """Begin a new frame, after a gap in the rotation of the IMU."""
         self._track = PoseTrack()  # T_turning_imu: the frame that the gyroscope carries on
         self._turned = np.eye(4)
         self._rate_rps = np.zeros(3)  # of the message before
@@ -353,11 +402,11 @@ class Attitude:
 
     @property
     def newest_ns(self) -> int:
-        """The stamp up to which the attitude is known; 0 if it is not."""
+        """Return the stamp up to which the attitude is known; 0 if it is not."""
         return self._track.newest_ns
 
     def add(self, imu: Imu, stamp_ns: int) -> None:
-        """Take in the next message; one that is late or repeated is ignored."""
+        """Update with the next message; one that is late or repeated is ignored."""
         p, last_ns = self._parameters, self._track.newest_ns
         self.received += 1
         if stamp_ns <= last_ns:
@@ -384,55 +433,10 @@ class Attitude:
             self._up += gain * (self._turned[:3, :3] @ felt - self._up)
 
     def at(self, stamp_ns: int) -> F64 | None:
-        """T_level_imu (4, 4) at a time, without translation: z is up, the heading drifts; None if not
+        """Return T_level_imu (4, 4) at a time, without translation: z is up, the heading drifts; None if not
         known."""
         T_turning_imu = self._track.at(stamp_ns)
         size = float(np.linalg.norm(self._up))
         if T_turning_imu is None or not self._counted or size < 1.0 - self._parameters.slack:
             return None
         return leveling(self._up / size) @ T_turning_imu
-
-
-class Transforms:
-    """Fills a tree of frames.
-
-    frames : the tree. moving : the topics of moving transforms. edges : those of them that were read.
-    """
-
-    def __init__(
-        self, source: MessageSource, tf: Sequence[TopicInfo], frames: FrameTree, end_ns: int
-    ) -> None:
-        """Take in the static transforms of some topics. end_ns : up to which moving ones are read."""
-        self._source, self.frames = source, frames
-        self.moving = [t for t in tf if not topics.is_static(t)]
-        self.edges: list[First] = []
-        for _ in self._read([t for t in tf if topics.is_static(t)], None):
-            pass
-        self._later = self._read(self.moving, end_ns)
-
-    def read_on(self) -> bool:
-        """Take in the next message of moving transforms; returns whether there is one."""
-        found = next(self._later, None)
-        self.edges += found or ()
-        return found is not None
-
-    def read_odometry(self, base: str) -> str | None:
-        """Return the frame above the base in which tf holds its odometry, after enough of it was read to know
-        its clock."""
-        while (len(self.edges) < FIRST or self.odometry_frame(base) is None) and self.read_on():
-            pass
-        return self.odometry_frame(base)
-
-    def odometry_frame(self, base: str) -> str | None:
-        """Return the frame above the base in which tf holds its odometry, as far as it was read."""
-        above = self.frames.chain(base)[1:]
-        return next((f for f in above if f == "odom" or f.endswith(("/odom", "_odom"))), None)
-
-    def _read(self, tf: Sequence[TopicInfo], end_ns: int | None) -> Iterator[list[First]]:
-        """Take in the transforms of some topics; yields those of each message."""
-        decoders = {t: decoder_for(t) for t in tf}
-        for message in self._source.messages({t.topic for t in tf}, end_ns=end_ns):
-            if message.channel in decoders:
-                at_ns, edges = message.log_time_ns, tolerant(decoders[message.channel], message.data)
-                self.frames.add_all(edges, static=topics.is_static(message.channel), log_time_ns=at_ns)
-                yield [First(at_ns, edge) for edge in edges or ()]

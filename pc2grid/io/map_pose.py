@@ -1,4 +1,4 @@
-"""Where the robot's own localization says that it is: its newest pose in the map."""
+"""The newest pose of the base in the map by the robot's own localization."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class MapPose:
 
 
 def last_map_pose(source: MessageSource, topic: str, base_frame: str, end_ns: int) -> MapPose:
-    """The last pose on a topic of a pose, an odometry or tf, recorded before `end_ns`.
+    """Return the last pose on a topic of a pose, an odometry or tf, recorded before `end_ns`.
 
     Raises TopicError, UnsupportedSchema, FrameError, or NoScans if there is no pose.
     """
@@ -42,7 +42,7 @@ def last_map_pose(source: MessageSource, topic: str, base_frame: str, end_ns: in
 
 
 def map_poses(known: Sequence[TopicInfo], topic: str, base_frame: str) -> _TopicPoses | _TfPoses:
-    """What follows the poses on a topic of a pose, an odometry or tf among those that are known.
+    """Return a follower of the poses on a topic of a pose, an odometry or tf among the known ones.
 
     Raises TopicError, UnsupportedSchema.
     """
@@ -54,7 +54,7 @@ class BelievedPose:
     """The newest pose on a topic as messages come.
 
     newest : None before the first. problem : why the last message gave none, such as tf that lacks the map.
-    topics : those whose messages are used; empty until `find` has found it.
+    topics : whose messages are used; empty until `find` has found the topic.
     """
 
     def __init__(self, topic: str) -> None:
@@ -70,7 +70,7 @@ class BelievedPose:
         self.topics = self._poses.topics
 
     def take(self, message: RawMessage) -> None:
-        """Take in a message; those of other topics are left alone."""
+        """Update with a message; those of other topics are ignored."""
         if self._poses is None or message.channel.topic not in self.topics:
             return
         self._poses.take(message)
@@ -84,7 +84,7 @@ class BelievedPose:
 
 
 class _TopicPoses:
-    """The poses of one topic. topics : whose messages are taken."""
+    """The poses of one topic. topics : whose messages are used."""
 
     def __init__(self, channel: TopicInfo) -> None:
         self._topic, self._type = channel.topic, channel.type
@@ -93,7 +93,7 @@ class _TopicPoses:
         self._last: tuple[Odometry | PoseStamped, int] | None = None
 
     def take(self, message: RawMessage) -> None:
-        """Take in a message; of other topics it is left out."""
+        """Update with a message; those of other topics are ignored."""
         if (message.channel.topic, message.channel.type) != (self._topic, self._type):
             return
         found = tolerant(self._decode, message.data, None)
@@ -101,7 +101,8 @@ class _TopicPoses:
             self._last = found, message.log_time_ns
 
     def newest(self, now_ns: int) -> MapPose:
-        """The newest pose. now_ns : see `_TfPoses`. Raises FrameError, or NoScans if there is none yet."""
+        """Return the newest pose. now_ns : see `_TfPoses`. Raises FrameError, or NoScans if there is none
+        yet."""
         if self._last is None:
             raise NoScans(f"{self._topic}: no pose in the part asked for")
         found, log_time_ns = self._last
@@ -118,11 +119,11 @@ class _TopicPoses:
 
 
 class _TfPoses:
-    """map -> base at the newest time that all transforms between them are known for.
+    """The pose map -> base at the newest time at which all transforms between them are known.
 
-    topics : whose messages are taken.
+    topics : whose messages are used.
 
-    The transform map -> odom is published ahead of time or rarely, so each one holds until the next.
+    The transform map -> odom is published ahead of time or rarely, so each one is valid until the next.
     """
 
     def __init__(self, known: Sequence[TopicInfo], channel: TopicInfo, base_frame: str) -> None:
@@ -133,7 +134,7 @@ class _TfPoses:
         self.topics = frozenset(topic for topic, _ in self._decoders)
 
     def take(self, message: RawMessage) -> None:
-        """Take in a message; of other topics it is left out."""
+        """Update with a message; those of other topics are ignored."""
         decode = self._decoders.get((message.channel.topic, message.channel.type))
         if decode is None:
             return
@@ -144,7 +145,7 @@ class _TfPoses:
                 self._newest_ns[edge.child] = edge.header.stamp_ns or message.log_time_ns
 
     def newest(self, now_ns: int) -> MapPose:
-        """The newest pose. now_ns : its time if all transforms are static.
+        """Return the newest pose. now_ns : its time if all transforms are static.
 
         Raises FrameError, or NoScans if there is none yet.
         """
@@ -178,7 +179,7 @@ def _channel(known: Sequence[TopicInfo], topic: str) -> TopicInfo:
 
 
 def _is_map(frame: str) -> bool:
-    """Whether a frame is a map by its name (REP-105), also of one robot of several."""
+    """Return True if a frame is a map by its name (REP-105), also of one robot of several."""
     name = frame.rsplit("/", 1)[-1]
     return name == "map" or name.endswith("_map")
 

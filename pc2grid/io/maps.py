@@ -3,7 +3,7 @@
 Pixels are grey: 254 free, 0 occupied, 205 unknown (trinary); image row 0 is the largest y; `origin` is the
 lower-left corner of the lower-left pixel.
 
-The image of a nav2 map: PGM and its kin, PNG, BMP or JPEG, decoded by OpenCV once its size is known.
+The image is a PGM or its kin, PNG, BMP or JPEG, decoded by OpenCV once its size is known (`read_image`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ _log = logging.getLogger(__name__)
 
 
 def is_map_file(path: Path) -> bool:
-    """Whether an input is a nav2 map rather than a recording (a rosbag2 folder's metadata.yaml is one)."""
+    """Return True if an input is a nav2 map, not a recording (a rosbag2 folder's metadata.yaml is one)."""
     return path.suffix in (".yaml", ".yml") and path.name != "metadata.yaml" and not path.is_dir()
 
 
@@ -70,8 +70,8 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
     This is `loadMapFromFile` of nav2 until Humble. Since Jazzy's 1.3.7 it weighs colours by their luminance,
     and alpha is a mask: what is not opaque is -1, in trinary maps, too.
 
-    warn : gets a sentence for the user on each of these differences, and on a map that cannot be meant so: no
-        cell is occupied, or walls and floor are exchanged.
+    warn : gets a sentence for the user on each of these differences, and on a map with a likely mistake: no
+    cell is occupied, or walls and floor are exchanged.
 
     Raises MapFileError naming the key or the image that is wrong.
 
@@ -110,7 +110,8 @@ def _unknown_shade(image: MapImage) -> int:
 
 
 def _frees_unknown(image: MapImage, keys: _Keys) -> bool:
-    """Whether the thresholds make unknown pixels free, in an image that has lighter ones for free space."""
+    """Return whether the thresholds make unknown pixels free, in an image that has lighter ones for free
+    space."""
     if keys.mode != "trinary" or image.alpha is not None:
         return False
     unknown = _unknown_shade(image)
@@ -158,10 +159,11 @@ def _cell_of(shade: F64, keys: _Keys) -> NDArray[np.int8]:
 
 
 def _turned(path: Path, grid: OccupancyGrid, yaw_rad: float) -> OccupancyGrid:
-    """The map in cells along the axes of its frame; `grid` is as if it were not rotated about its origin.
+    """Rotate a map into cells along the axes of its frame; `grid` is as if it were not rotated about its
+    origin.
 
-    A cell is what the map has at its centre, and occupied too where the centre of an occupied cell of the map
-    falls: walls of one cell stay closed.
+    A cell gets the value of the map at its centre, and is occupied, too, if the centre of an occupied cell of
+    the map falls into it: walls of one cell stay closed.
     """
     height, width = grid.cells.shape
     R = np.array([[math.cos(yaw_rad), -math.sin(yaw_rad)], [math.sin(yaw_rad), math.cos(yaw_rad)]])
@@ -191,7 +193,7 @@ def _turned(path: Path, grid: OccupancyGrid, yaw_rad: float) -> OccupancyGrid:
 
 
 def _doubts(image: MapImage, keys: _Keys, cells: NDArray[np.int8]) -> Iterator[str]:
-    """Yield sentences on a map that says something else than what was drawn."""
+    """Yield warnings about a map that is probably read in another way than it was drawn."""
     if keys.mode == "trinary" and image.alpha is not None:
         masked = _cells(image._replace(alpha=None), keys)
         masked[image.alpha[::-1] < image.opaque] = UNKNOWN
@@ -365,8 +367,10 @@ def _wrong_key(path: Path, error: ValidationError) -> MapFileError:
 
 
 def _yaml_number(value: float) -> str:
-    """A number with the fewest digits that tell it apart: -478 cells of 0.05 m are -23.9, and no
-    -23.900000000000002, by what sums and products of floats are rounded."""
+    """Format a number with the fewest digits that identify it.
+
+    -478 cells of 0.05 m are -23.9, and no -23.900000000000002, which sums and products of floats give.
+    """
     short = float(f"{value:.{_DIGITS}g}")
     text = repr(short if abs(short - value) <= _ROUNDED * math.ulp(value) else float(value))
     # PyYAML reads "1e-05" as text, because the mantissa has no decimal point.
@@ -528,7 +532,7 @@ def _size_of_jpeg(data: bytes) -> _Size:
 
 
 def encode_image(pixels: NDArray[np.uint8], suffix: str, resolution_m: float) -> bytes:
-    """Pixels (H, W) as `pgm` or `png`; a pgm carries the resolution in a comment."""
+    """Encode pixels (H, W) as `pgm` or `png`; a pgm carries the resolution in a comment."""
     if suffix == "pgm":
         height, width = pixels.shape
         header = f"P5\n# CREATOR: pc2grid {resolution_m:.3f} m/pix\n{width} {height}\n255\n"

@@ -1,10 +1,9 @@
-"""What to read of a log and how, decided from its first messages: topics, base frame, odometry, IMU.
+"""The plan of what to read of a log and how, made from its first messages: sensors, base frame, odometry,
+IMU.
 
-The base of the robot: the frame in which its scans are put together, and how the sensors sit on it.
-
-Where the odometry of the robot comes from, and without it the direction of gravity.
-
-The sensors whose scans are read: first the topics of scans, then the frames on each of them.
+The sensors are found first: the topics of scans, then the frames on each of them. Then the base of the robot,
+in which the scans are put together, and the places of the sensors on it; then the odometry, and without it an
+IMU for the direction of gravity.
 """
 
 from __future__ import annotations
@@ -38,6 +37,321 @@ from pc2grid.io.topics import FIRST, First, FirstMessages, delay_ns
 from pc2grid.model import SENSOR_MODELS, SensorKind
 from pc2grid.settings import ReadConfig
 
+LOOK_AHEAD_NS = 60_000_000_000
+"""Log time behind the first scans within which tf must connect the sensor to the base; chosen by hand."""
+_LAST_FLOAT = struct.Struct("<f")
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """What to read and how, decided once per log.
+
+    sensors : the first one, and more of the same kind, whose scans are put together with those of the first;
+    each has a topic and a frame of its own. left_out : topics and frames of scans that are not used. odometry
+    : None if there is none, or if it is in tf. odometry_frame : the parent frame of the odometry in tf; None
+    if it is not there. imu : None if there is none, or none is needed. moving_tf : the topics of tf that must
+    be read along with the scans. sensor_is_base : True if the log has no tf, so that the sensor's frame
+    serves as the base. stampless : True if the first scans have stamps of zero, so that the time of recording
+    is used instead. mounted : None, unless the points of the scans are in a fixed frame already; then the
+    frame of the sensor. period_ns : the longest time between two of the first scans; 0 if there is only one.
+    depth_unit_m : that of the depth images, by the settings or the log; None: that of their encoding.
+    """
+
+    choice: Choice
+    sensors: tuple[Sensor, ...]
+    left_out: frozenset[tuple[TopicInfo, str]]
+    odometry: TopicInfo | None
+    odometry_frame: str | None
+    imu: TopicInfo | None
+    moving_tf: tuple[TopicInfo, ...]
+    sensor_is_base: bool
+    stampless: bool
+    mounted: str | None
+    period_ns: int
+    depth_unit_m: float | None
+
+
+def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> Plan:
+    """Make the plan; fills `frames` with the static transforms and the first of the moving ones.
+
+    Raises TopicError, NoScans, UnsupportedSchema or FrameError.
+    """
+    first = FirstMessages(source)
+    found = find_sensors(config, first)
+    robot = Robot(found.topic, found.frame, first)
+    candidates = robot.names.odometry_topics(config.odometry)
+    end_ns = max((scan.log_time_ns for scan in found.first_scans), default=source.info.end_ns) + LOOK_AHEAD_NS
+    tf = Transforms(source, robot.tf(none_if_unsure=config.assume_identity), frames, end_ns)
+    bases = BaseSearch(config, first, found, tf, candidates)
+    base = bases.found()
+    motions = MotionSearch(config, first, found, robot, tf, base)
+    motion = motions.odometry(candidates)
+    imu, gravity = motions.imu(motion)
+    needs_tf = motion.frame is not None or bases.sensor_moves(base)
+    return Plan(
+        choice=Choice(
+            topic=found.topic.topic,
+            sensor=found.sensors[0].kind,
+            odometry_topic=motion.topic.topic if motion.topic else None,
+            base_frame=base or found.frame or config.base_frame or "sensor",
+            sensor_frame=found.frame or None,
+            further_frames=tuple(s.frame for s in found.seen[1:] if s.frame),
+            reason="; ".join(filter(None, (found.reason, motion.reason, gravity))),
+            imu_topic=imu.topic if imu else None,
+        ),
+        sensors=found.sensors,
+        left_out=found.left_out,
+        odometry=motion.topic if motion.frame is None else None,
+        odometry_frame=motion.frame,
+        imu=imu,
+        moving_tf=tuple(tf.moving) if needs_tf else (),
+        sensor_is_base=base is None,
+        stampless=found.stampless,
+        mounted=bases.mounted(base),
+        period_ns=found.period_ns,
+        depth_unit_m=config.depth_unit_m or _recorded_depth_unit_m(source),
+    )
+
+
+def _recorded_depth_unit_m(source: MessageSource) -> float | None:
+    """Return the unit that librealsense writes into its recordings, as a std_msgs/Float32; None without
+    it."""
+    unit = topics.depth_unit_topic(source.info.topics)
+    message = None if unit is None else next(source.messages({unit.topic}), None)
+    value = 0.0 if message is None else _LAST_FLOAT.unpack(bytes(message.data)[-_LAST_FLOAT.size :])[0]
+    if unit is None or not 0 < value <= 1:
+        return None
+    source.tally.warn(f"depths are in units of {value:.3g} m, as {unit.topic} says")
+    return float(value)
+
+
+def published_once(topic: TopicInfo) -> bool:
+    """Return whether the messages of a topic may be published only once, when the robot starts."""
+    return topic.type in topics.CAMERA_INFOS or (topic.type in topics.TF and topics.is_static(topic))
+
+
+# The sensors.
+
+_FIRST_SCANS = 20
+"""So many scans of a topic are looked at, so that each of several sensors on it is among them. By hand."""
+
+
+class Sensor(NamedTuple):
+    """The scans of one topic and frame.
+
+    camera, calibration : of depth images: the topic of its CameraInfo, and the first. frame : None if no scan
+    could be decoded. silent : True if its first scans hold no return, unlike those of another sensor; it is
+    left out until they do.
+    """
+
+    topic: TopicInfo
+    kind: SensorKind
+    camera: TopicInfo | None = None
+    calibration: CameraInfo | None = None
+    frame: str | None = None
+    silent: bool = False
+
+    def decoder(self, config: ReadConfig, **more: Any) -> ScanDecoder:
+        """Return the decoder of its scans. more : see ScanDecoder."""
+        return ScanDecoder(
+            self.topic.topic,
+            self.kind,
+            config,
+            camera_topic="" if self.camera is None else self.camera.topic,
+            camera=self.calibration,
+            **more,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class FoundSensors:
+    """The sensors that are read, the first one first, and why.
+
+    left_out : topics and frames of scans that are not used. first_scans : of the first sensor.
+    """
+
+    sensors: tuple[Sensor, ...]
+    left_out: frozenset[tuple[TopicInfo, str]]
+    first_scans: tuple[First, ...]
+    reason: str
+
+    @property
+    def topic(self) -> TopicInfo:
+        """Return the topic of the first sensor."""
+        return self.sensors[0].topic
+
+    @property
+    def frame(self) -> str:
+        """Return the frame of the first sensor; empty if no scan can be decoded (the stream counts them)."""
+        return self.sensors[0].frame or ""
+
+    @property
+    def stampless(self) -> bool:
+        """Return whether there are first scans, and all of their stamps are zero."""
+        return bool(self.first_scans) and not any(self._stamps_ns)
+
+    @property
+    def period_ns(self) -> int:
+        """Return the longest time between two of the first scans; 0 if there is only one."""
+        return max((b - a for a, b in itertools.pairwise(self._stamps_ns)), default=0)
+
+    @property
+    def _stamps_ns(self) -> list[int]:
+        return [scan.content.header.stamp_ns for scan in self.first_scans]
+
+    @property
+    def seen(self) -> list[Sensor]:
+        """Return the sensors that are not silent."""
+        return [sensor for sensor in self.sensors if not sensor.silent]
+
+    @property
+    def of_one_topic(self) -> bool:
+        """Return whether all sensors are on one topic and differ by their frames alone."""
+        return all(sensor.topic == self.topic for sensor in self.sensors)
+
+
+def find_sensors(config: ReadConfig, first: FirstMessages) -> FoundSensors:
+    """Return the sensors to read; warns of frames that are left out.
+
+    Raises TopicError, NoScans or UnsupportedSchema.
+    """
+    found, reason = _scan_topics(config.topic, first)
+    sensors = [sensor for topic in found for sensor in _of_frames(_with_camera(topic, first), config, first)]
+    lead, used = sensors[0], {(sensor.topic, sensor.frame or "") for sensor in sensors}
+    frames = [str(s.frame) for s in sensors if s.topic == lead.topic and not s.silent]
+    if len(frames) > 1:
+        reason += f", of {len(frames)} sensors by their frames: {', '.join(frames)}"
+    left_out = {(t, scan.frame) for t in found for scan in first.of(t, _FIRST_SCANS)} - used
+    scans = [s for s in first.of(lead.topic, _FIRST_SCANS) if s.frame == lead.frame]
+    return FoundSensors(tuple(sensors), frozenset(left_out), tuple(scans[:FIRST]), reason)
+
+
+# --- the topics -------------------------------------------------------------------------------------------
+
+
+def _scan_topics(wanted: str | None, first: FirstMessages) -> tuple[list[TopicInfo], str]:
+    """Return the topics to read scans from, and a sentence with the reason."""
+    try:
+        found, reason = topics.scan_topics(first.topics, wanted)
+    except NoScans:
+        image = None if wanted else _unnamed_depth(first)
+        if image is None:
+            raise
+        raise topics.proposed(image, first.topics) from None
+    if len(found) > 1 and wanted is None:
+        raise _several(found, first)
+    names = Namespaces(found[0], first.topics)
+    for topic in found[1:]:
+        if names.owns(topic) is False:
+            raise two_robots(f"{found[0].topic} and {topic.topic}", f"--topic {found[0].topic}")
+    return found, reason
+
+
+def _unnamed_depth(first: FirstMessages) -> TopicInfo | None:
+    """Return a topic of depth images whose name does not say so; None if there is none."""
+    images = (t for t in first.topics if topics.is_image(t) and t.message_count != 0)
+    return next((t for t in images if any(holds_depths(m.content) for m in first.of(t))), None)
+
+
+def _several(found: Sequence[TopicInfo], first: FirstMessages) -> TopicError:
+    """Return the error where several topics hold scans; it proposes one of them, or one of each sensor.
+
+    Topics of one frame hold the scans of one sensor, filtered or delayed: the first one is proposed. Points
+    in a fixed frame are no longer those of the sensor.
+    """
+    frame_of = {t: next((m.frame for m in first.of(t)), "") for t in found}
+    latest_first = sorted(found, key=lambda t: delay_ns(first.of(t)))[::-1]
+    of_sensor = {frame_of[t]: t for t in latest_first if not topics.is_fixed(frame_of[t])}
+    lead, *more = [t for t in found if t in of_sensor.values()] or found[:1]
+    names = Namespaces(lead, first.topics)
+    own = (t for t in more if names.owns(t) is not False and not diverge(frame_of[t], frame_of[lead]))
+    return topics.several(found, [lead, *own])
+
+
+def _with_camera(topic: TopicInfo, first: FirstMessages) -> Sensor:
+    """Return the sensor of a topic. Raises NoScans for a depth camera without a calibration."""
+    kind = topics.SENSORS[topic.type]
+    if not SENSOR_MODELS[kind].image:
+        return Sensor(topic, kind)
+    camera = camera_info_topic(topic, first.topics)
+    # It may have been published only once, at the beginning.
+    found = first.of(camera)
+    if not found:
+        raise NoScans(f"{camera.topic}: no message in the log, but the depth images need it")
+    return Sensor(topic, kind, camera, found[0].content)
+
+
+# --- the frames on a topic --------------------------------------------------------------------------------
+
+
+class _Frame(NamedTuple):
+    """The first scans of a topic in one frame.
+
+    foreign : True if the frame is of another robot than the base in the settings. empty : True if no scan
+    holds a return. delay_ns : time from their stamps to their recording; stamps of zero are another clock's,
+    too.
+    """
+
+    name: str
+    foreign: bool
+    empty: bool
+    delay_ns: int
+
+    def silence(self, lead: _Frame) -> str:
+        """Return the warning about a sensor without returns beside one with; empty if it is none."""
+        return f"beside frame {lead.name}, its scans hold no return" if self.empty > lead.empty else ""
+
+    def why_not(self, lead: _Frame, base: str | None) -> str:
+        """Return why the scans are not used at all; empty if they are."""
+        if self.foreign > lead.foreign:
+            return f"read.base_frame is {base}"
+        apart_ns = abs(self.delay_ns - lead.delay_ns)
+        if apart_ns > GAP_NS:
+            return f"its stamps are {apart_ns * 1e-9:,.0f} s apart from those of frame {lead.name}"
+        return ""
+
+
+def _of_frames(sensor: Sensor, config: ReadConfig, first: FirstMessages) -> list[Sensor]:
+    """Return the sensors whose scans are on a topic, the best one first; warns of frames that are left out.
+
+    sensor : that of the topic, as long as its frame is not known.
+    """
+    scans = first.of(sensor.topic, _FIRST_SCANS)
+    names = list(dict.fromkeys(scan.frame for scan in scans))
+    if len(names) < 2:
+        return [sensor._replace(frame=name) for name in names] or [sensor]
+    frames = [_shown(sensor, config, name, [s for s in scans if s.frame == name]) for name in names]
+    lead = min(frames, key=lambda f: (f.foreign, f.empty, abs(f.delay_ns) // GAP_NS))
+    found = []
+    for frame in sorted(frames, key=lambda f: f is not lead):
+        why = frame.why_not(lead, config.base_frame)
+        if told := "; ".join(filter(None, (frame.silence(lead), why))):
+            first.tally.warn(f"frame {frame.name} of {sensor.topic.topic} is left out: {told}")
+        if not why:
+            silent = frame.empty and frame is not lead
+            calibration = _calibration(sensor, frame.name, first)
+            found.append(sensor._replace(frame=frame.name, silent=silent, calibration=calibration))
+    return found
+
+
+def _shown(sensor: Sensor, config: ReadConfig, name: str, scans: Sequence[First]) -> _Frame:
+    returns = sensor.decoder(config).returns
+    return _Frame(
+        name,
+        foreign=diverge(name, config.base_frame or ""),
+        empty=not any(returns(scan.content) for scan in scans),
+        delay_ns=statistics.median_low(s.log_time_ns - s.content.header.stamp_ns for s in scans),
+    )
+
+
+def _calibration(sensor: Sensor, frame: str, first: FirstMessages) -> CameraInfo | None:
+    """Return the first calibration in the frame of the images, else the first one."""
+    infos = [] if sensor.camera is None else first.of(sensor.camera, _FIRST_SCANS)
+    return next((info.content for info in infos if info.frame == frame), sensor.calibration)
+
+
+# The base of the robot.
+
 _LIDARS = ("lidar", "laser", "velodyne", "livox", "ouster", "os_sensor", "hesai", "pandar", "rslidar")
 """Parts of the names of frames of lidars."""
 
@@ -53,7 +367,7 @@ def registered(frame: str) -> FrameError:
 
 
 class BaseSearch:
-    """Looks for the base by the settings, by names of frames, by odometry, and by what tf connects.
+    """Searches for the base by the settings, by names of frames, by odometry, and by the connections of tf.
 
     odometry : topics that may hold that of the robot.
     """
@@ -190,7 +504,7 @@ class BaseSearch:
         return root if root is not None and self._frames.connected(root, frame) else None
 
     def _never_had_tf(self) -> bool:
-        """Return whether there is no tf, nor may it be among what is lost: a wrong base frame would shift
+        """Return whether there never was tf: it is not among lost data either, as a wrong base would shift
         every scan."""
         tally = self._first.tally
         of_tf = any(t.type in topics.TF for t in self._first.topics)
@@ -200,9 +514,12 @@ class BaseSearch:
     # --- how the sensors sit on it --------------------------------------------------------------------
 
     def _check_sensors(self, base: str | None) -> None:
-        """Raise FrameError if the places of several sensors are not known, TopicError for the scans of one
-        sensor that are published twice, and for those of two robots. In the frame of the base, sensors are
-        not told apart."""
+        """Raise an error for sensors whose places on the base are not known, or that cannot be put together.
+
+        FrameError: the places of several sensors are not known. TopicError: the scans of one sensor are
+        published twice, or the sensors are of two robots. In the frame of the base, sensors cannot be
+        distinguished.
+        """
         lead, *further = self._sensors.seen
         if further and base is None:
             self._check_asked()
@@ -220,8 +537,8 @@ class BaseSearch:
             self._check_places(base)
 
     def _check_asked(self) -> None:
-        """Raise FrameError for several sensors without tf, unless the user asks to read the first of those on
-        one topic."""
+        """Raise FrameError for several sensors without tf, unless the user chooses the first of those on one
+        topic."""
         lead, one = self._sensors.seen[0], self._sensors.of_one_topic
         if one and self._config.assume_identity:
             return
@@ -271,6 +588,9 @@ class BaseSearch:
         return ", ".join(t.topic for t in others if frame in self._first.frames_of(t))
 
 
+# Odometry and IMU.
+
+
 class Motion(NamedTuple):
     """Where odometry comes from: a topic; of tf, the transform from a frame in it. None if there is none."""
 
@@ -280,7 +600,8 @@ class Motion(NamedTuple):
 
 
 class MotionSearch:
-    """Looks for the odometry and the IMU of a robot whose base is known. base : None: the sensor's frame."""
+    """Searches for the odometry and the IMU of a robot whose base is known. base : None: the sensor's
+    frame."""
 
     def __init__(
         self,
@@ -297,7 +618,7 @@ class MotionSearch:
     # --- odometry -------------------------------------------------------------------------------------
 
     def odometry(self, candidates: Sequence[TopicInfo]) -> Motion:
-        """Return the odometry of the best topic, or that which tf holds; warns if there is a choice.
+        """Return the odometry of the best topic, or that in tf; warns if there is a choice.
 
         candidates : the topics that may hold it. Raises TopicError if it may be of another robot.
         """
@@ -311,8 +632,8 @@ class MotionSearch:
         return self._of_one_clock(self._said(motion))
 
     def _best(self, candidates: Sequence[TopicInfo]) -> TopicInfo | None:
-        """Return the best topic of the robot; None if there is none. Raises TopicError if that cannot be
-        told."""
+        """Return the best topic of the robot; None if there is none. Raises TopicError if its robot is
+        unknown."""
         wanted = self._config.odometry is not None
         owned = {t: wanted or self._robot.owns(t, self._base, self._tf.frames) for t in candidates}
         ours = [t for t in candidates if owned[t]]
@@ -327,7 +648,7 @@ class MotionSearch:
         return base is not None and not all(frames.rigid(base, child) for child in children)
 
     def _in_tf(self) -> Motion:
-        """Return the odometry that tf holds. Raises TopicError if it may be of another robot."""
+        """Return the odometry in tf. Raises TopicError if it may be of another robot."""
         frame = None if self._base is None else self._tf.read_odometry(self._base)
         if frame is None or not self._tf.moving:
             return Motion(None, None, "no odometry topic")
@@ -337,7 +658,7 @@ class MotionSearch:
         return Motion(topic, frame, f"odometry from tf, {frame} -> {self._base}")
 
     def _said(self, motion: Motion) -> Motion:
-        """Return the odometry with a reason that names the others; of these the user is told."""
+        """Return the odometry with a reason that names the others, of which the user is warned."""
         if (wanted := self._config.odometry) is not None:
             return motion if motion.frame else motion._replace(reason=f"odometry from {wanted} as asked")
         there = topics.with_odometry(self._first.topics)
@@ -349,8 +670,8 @@ class MotionSearch:
         return motion._replace(reason=reason)
 
     def _of_one_clock(self, motion: Motion) -> Motion:
-        """Return the odometry unless its stamps are of another clock than the scans' and nobody asked for
-        it."""
+        """Return the odometry, or none if its stamps are of another clock than the scans' and the user did
+        not name it."""
         if motion.topic is None:
             return motion
         apart_ns = abs(delay_ns(self._sensors.first_scans) - delay_ns(self._readings(motion.topic)))
@@ -372,7 +693,7 @@ class MotionSearch:
     # --- the IMU --------------------------------------------------------------------------------------
 
     def imu(self, motion: Motion) -> tuple[TopicInfo | None, str]:
-        """Return the IMU, and why; beside odometry, and with a laser, none is looked for.
+        """Return the IMU, and why; beside odometry, and with a laser, none is searched for.
 
         Raises TopicError, FrameError for one that the user names.
         """
@@ -395,322 +716,9 @@ class MotionSearch:
         return None, "; ".join(why)
 
     def _check_imu(self, imu: TopicInfo) -> None:
-        """Raise FrameError if it is not known how the IMU sits on the base, UnsupportedSchema."""
+        """Raise FrameError if the place of the IMU on the base is not known, UnsupportedSchema."""
         there, frames = self._sensors.frame if self._base is None else self._base, self._tf.frames
         frame = next((m.frame for m in self._first.of(imu)), "")
         known = frame == there or (self._base is not None and frames.connected(there, frame))
         if not known or frames.moving(there, frame):
             raise frames.missing(frame, there)
-
-
-_FIRST_SCANS = 20
-"""So many scans of a topic are looked at, so that each of several sensors on it is among them. By hand."""
-
-
-class Sensor(NamedTuple):
-    """The scans of one topic and frame.
-
-    camera, calibration : of depth images: the topic of its CameraInfo, and the first.
-    frame : None if no scan could be decoded. silent : whether its first scans hold no return beside those of
-    another sensor; it is left out until they do.
-    """
-
-    topic: TopicInfo
-    kind: SensorKind
-    camera: TopicInfo | None = None
-    calibration: CameraInfo | None = None
-    frame: str | None = None
-    silent: bool = False
-
-    def decoder(self, config: ReadConfig, **more: Any) -> ScanDecoder:
-        """Return what decodes its scans. more : see ScanDecoder."""
-        return ScanDecoder(
-            self.topic.topic,
-            self.kind,
-            config,
-            camera_topic="" if self.camera is None else self.camera.topic,
-            camera=self.calibration,
-            **more,
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class FoundSensors:
-    """The sensors that are read, the first one first, and why.
-
-    left_out : topics and frames of scans that are not used. first_scans : of the first sensor.
-    """
-
-    sensors: tuple[Sensor, ...]
-    left_out: frozenset[tuple[TopicInfo, str]]
-    first_scans: tuple[First, ...]
-    reason: str
-
-    @property
-    def topic(self) -> TopicInfo:
-        """The topic of the first sensor."""
-        return self.sensors[0].topic
-
-    @property
-    def frame(self) -> str:
-        """The frame of the first sensor; empty if no scan can be decoded (the stream counts them)."""
-        return self.sensors[0].frame or ""
-
-    @property
-    def stampless(self) -> bool:
-        """Whether there are first scans, and all of their stamps are zero."""
-        return bool(self.first_scans) and not any(self._stamps_ns)
-
-    @property
-    def period_ns(self) -> int:
-        """The longest time between two of the first scans; 0 if there is only one."""
-        return max((b - a for a, b in itertools.pairwise(self._stamps_ns)), default=0)
-
-    @property
-    def _stamps_ns(self) -> list[int]:
-        return [scan.content.header.stamp_ns for scan in self.first_scans]
-
-    @property
-    def seen(self) -> list[Sensor]:
-        """The sensors that are not silent."""
-        return [sensor for sensor in self.sensors if not sensor.silent]
-
-    @property
-    def of_one_topic(self) -> bool:
-        """Whether all sensors are told apart by their frames alone."""
-        return all(sensor.topic == self.topic for sensor in self.sensors)
-
-
-def find_sensors(config: ReadConfig, first: FirstMessages) -> FoundSensors:
-    """Return the sensors to read; warns of frames that are left out.
-
-    Raises TopicError, NoScans or UnsupportedSchema.
-    """
-    found, reason = _scan_topics(config.topic, first)
-    sensors = [sensor for topic in found for sensor in _of_frames(_with_camera(topic, first), config, first)]
-    lead, used = sensors[0], {(sensor.topic, sensor.frame or "") for sensor in sensors}
-    frames = [str(s.frame) for s in sensors if s.topic == lead.topic and not s.silent]
-    if len(frames) > 1:
-        reason += f", of {len(frames)} sensors by their frames: {', '.join(frames)}"
-    left_out = {(t, scan.frame) for t in found for scan in first.of(t, _FIRST_SCANS)} - used
-    scans = [s for s in first.of(lead.topic, _FIRST_SCANS) if s.frame == lead.frame]
-    return FoundSensors(tuple(sensors), frozenset(left_out), tuple(scans[:FIRST]), reason)
-
-
-# --- the topics -------------------------------------------------------------------------------------------
-
-
-def _scan_topics(wanted: str | None, first: FirstMessages) -> tuple[list[TopicInfo], str]:
-    """Return the topics to read scans from, and a sentence that says why."""
-    try:
-        found, reason = topics.scan_topics(first.topics, wanted)
-    except NoScans:
-        image = None if wanted else _unnamed_depth(first)
-        if image is None:
-            raise
-        raise topics.proposed(image, first.topics) from None
-    if len(found) > 1 and wanted is None:
-        raise _several(found, first)
-    names = Namespaces(found[0], first.topics)
-    for topic in found[1:]:
-        if names.owns(topic) is False:
-            raise two_robots(f"{found[0].topic} and {topic.topic}", f"--topic {found[0].topic}")
-    return found, reason
-
-
-def _unnamed_depth(first: FirstMessages) -> TopicInfo | None:
-    """Return a topic of depth images whose name does not say so; None if there is none."""
-    images = (t for t in first.topics if topics.is_image(t) and t.message_count != 0)
-    return next((t for t in images if any(holds_depths(m.content) for m in first.of(t))), None)
-
-
-def _several(found: Sequence[TopicInfo], first: FirstMessages) -> TopicError:
-    """Return the error where several topics hold scans; it proposes one of them, or one of each sensor.
-
-    Topics of one frame hold the scans of one sensor, filtered or delayed: the first one is proposed. What
-    is in a fixed frame is no longer as it was measured.
-    """
-    frame_of = {t: next((m.frame for m in first.of(t)), "") for t in found}
-    latest_first = sorted(found, key=lambda t: delay_ns(first.of(t)))[::-1]
-    of_sensor = {frame_of[t]: t for t in latest_first if not topics.is_fixed(frame_of[t])}
-    lead, *more = [t for t in found if t in of_sensor.values()] or found[:1]
-    names = Namespaces(lead, first.topics)
-    own = (t for t in more if names.owns(t) is not False and not diverge(frame_of[t], frame_of[lead]))
-    return topics.several(found, [lead, *own])
-
-
-def _with_camera(topic: TopicInfo, first: FirstMessages) -> Sensor:
-    """Return the sensor of a topic. Raises NoScans for a depth camera without a calibration."""
-    kind = topics.SENSORS[topic.type]
-    if not SENSOR_MODELS[kind].image:
-        return Sensor(topic, kind)
-    camera = camera_info_topic(topic, first.topics)
-    # It may have been published only once, at the beginning.
-    found = first.of(camera)
-    if not found:
-        raise NoScans(f"{camera.topic}: no message in the log, but the depth images need it")
-    return Sensor(topic, kind, camera, found[0].content)
-
-
-# --- the frames on a topic --------------------------------------------------------------------------------
-
-
-class _Frame(NamedTuple):
-    """What the first scans of a topic in one frame show.
-
-    foreign : whether the frame is of another robot than the base that the settings name. empty : whether no
-    scan holds a return. delay_ns : how long after their stamps they were recorded; stamps of zero are another
-    clock's, too.
-    """
-
-    name: str
-    foreign: bool
-    empty: bool
-    delay_ns: int
-
-    def silence(self, lead: _Frame) -> str:
-        """Return what is said of a sensor without returns beside one with; empty if it is none."""
-        return f"beside frame {lead.name}, its scans hold no return" if self.empty > lead.empty else ""
-
-    def why_not(self, lead: _Frame, base: str | None) -> str:
-        """Return why the scans are not used at all; empty if they are."""
-        if self.foreign > lead.foreign:
-            return f"read.base_frame is {base}"
-        apart_ns = abs(self.delay_ns - lead.delay_ns)
-        if apart_ns > GAP_NS:
-            return f"its stamps are {apart_ns * 1e-9:,.0f} s apart from those of frame {lead.name}"
-        return ""
-
-
-def _of_frames(sensor: Sensor, config: ReadConfig, first: FirstMessages) -> list[Sensor]:
-    """Return the sensors whose scans are on a topic, the best one first; warns of frames that are left out.
-
-    sensor : that of the topic, as long as its frame is not known.
-    """
-    scans = first.of(sensor.topic, _FIRST_SCANS)
-    names = list(dict.fromkeys(scan.frame for scan in scans))
-    if len(names) < 2:
-        return [sensor._replace(frame=name) for name in names] or [sensor]
-    frames = [_shown(sensor, config, name, [s for s in scans if s.frame == name]) for name in names]
-    lead = min(frames, key=lambda f: (f.foreign, f.empty, abs(f.delay_ns) // GAP_NS))
-    found = []
-    for frame in sorted(frames, key=lambda f: f is not lead):
-        why = frame.why_not(lead, config.base_frame)
-        if told := "; ".join(filter(None, (frame.silence(lead), why))):
-            first.tally.warn(f"frame {frame.name} of {sensor.topic.topic} is left out: {told}")
-        if not why:
-            silent = frame.empty and frame is not lead
-            calibration = _calibration(sensor, frame.name, first)
-            found.append(sensor._replace(frame=frame.name, silent=silent, calibration=calibration))
-    return found
-
-
-def _shown(sensor: Sensor, config: ReadConfig, name: str, scans: Sequence[First]) -> _Frame:
-    returns = sensor.decoder(config).returns
-    return _Frame(
-        name,
-        foreign=diverge(name, config.base_frame or ""),
-        empty=not any(returns(scan.content) for scan in scans),
-        delay_ns=statistics.median_low(s.log_time_ns - s.content.header.stamp_ns for s in scans),
-    )
-
-
-def _calibration(sensor: Sensor, frame: str, first: FirstMessages) -> CameraInfo | None:
-    """Return the first calibration in the frame of the images, else the first one."""
-    infos = [] if sensor.camera is None else first.of(sensor.camera, _FIRST_SCANS)
-    return next((info.content for info in infos if info.frame == frame), sensor.calibration)
-
-
-LOOK_AHEAD_NS = 60_000_000_000
-"""Log time behind the first scans within which tf must connect the sensor to the base; chosen by hand."""
-_LAST_FLOAT = struct.Struct("<f")
-
-
-@dataclass(frozen=True, slots=True)
-class Plan:
-    """What to read and how, decided once per log.
-
-    sensors : the first one, and more of the same kind, whose scans are put together with those of the first;
-    each has a topic and a frame of its own. left_out : topics and frames of scans that are not used.
-    odometry : None if there is none, or if it is in tf. odometry_frame : the parent frame of the odometry in
-    tf; None if it is not there.
-    imu : None if there is none, or none is needed.
-    moving_tf : the topics of tf that must be read along with the scans.
-    sensor_is_base : whether the log has no tf, so that the sensor's frame serves as the base.
-    stampless : whether the first scans have stamps of zero, so that the time of recording is used instead.
-    mounted : None, unless the points of the scans are in a fixed frame already; then the frame of the sensor.
-    period_ns : the longest time between two of the first scans; 0 if there is only one.
-    depth_unit_m : that of the depth images, as the settings or the log say it; None: that of their encoding.
-    """
-
-    choice: Choice
-    sensors: tuple[Sensor, ...]
-    left_out: frozenset[tuple[TopicInfo, str]]
-    odometry: TopicInfo | None
-    odometry_frame: str | None
-    imu: TopicInfo | None
-    moving_tf: tuple[TopicInfo, ...]
-    sensor_is_base: bool
-    stampless: bool
-    mounted: str | None
-    period_ns: int
-    depth_unit_m: float | None
-
-
-def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> Plan:
-    """Decide what to read; fills `frames` with the static transforms and the first of the moving ones.
-
-    Raises TopicError, NoScans, UnsupportedSchema or FrameError.
-    """
-    first = FirstMessages(source)
-    found = find_sensors(config, first)
-    robot = Robot(found.topic, found.frame, first)
-    candidates = robot.names.odometry_topics(config.odometry)
-    end_ns = max((scan.log_time_ns for scan in found.first_scans), default=source.info.end_ns) + LOOK_AHEAD_NS
-    tf = Transforms(source, robot.tf(none_if_unsure=config.assume_identity), frames, end_ns)
-    bases = BaseSearch(config, first, found, tf, candidates)
-    base = bases.found()
-    motions = MotionSearch(config, first, found, robot, tf, base)
-    motion = motions.odometry(candidates)
-    imu, gravity = motions.imu(motion)
-    needs_tf = motion.frame is not None or bases.sensor_moves(base)
-    return Plan(
-        choice=Choice(
-            topic=found.topic.topic,
-            sensor=found.sensors[0].kind,
-            odometry_topic=motion.topic.topic if motion.topic else None,
-            base_frame=base or found.frame or config.base_frame or "sensor",
-            sensor_frame=found.frame or None,
-            further_frames=tuple(s.frame for s in found.seen[1:] if s.frame),
-            reason="; ".join(filter(None, (found.reason, motion.reason, gravity))),
-            imu_topic=imu.topic if imu else None,
-        ),
-        sensors=found.sensors,
-        left_out=found.left_out,
-        odometry=motion.topic if motion.frame is None else None,
-        odometry_frame=motion.frame,
-        imu=imu,
-        moving_tf=tuple(tf.moving) if needs_tf else (),
-        sensor_is_base=base is None,
-        stampless=found.stampless,
-        mounted=bases.mounted(base),
-        period_ns=found.period_ns,
-        depth_unit_m=config.depth_unit_m or _recorded_depth_unit_m(source),
-    )
-
-
-def _recorded_depth_unit_m(source: MessageSource) -> float | None:
-    """Return the unit that librealsense writes into its recordings, as a std_msgs/Float32; None if it is
-    not."""
-    unit = topics.depth_unit_topic(source.info.topics)
-    message = None if unit is None else next(source.messages({unit.topic}), None)
-    value = 0.0 if message is None else _LAST_FLOAT.unpack(bytes(message.data)[-_LAST_FLOAT.size :])[0]
-    if unit is None or not 0 < value <= 1:
-        return None
-    source.tally.warn(f"depths are in units of {value:.3g} m, as {unit.topic} says")
-    return float(value)
-
-
-def published_once(topic: TopicInfo) -> bool:
-    """Return whether the messages of a topic may be published only once, when the robot starts."""
-    return topic.type in topics.CAMERA_INFOS or (topic.type in topics.TF and topics.is_static(topic))

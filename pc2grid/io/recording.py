@@ -1,7 +1,5 @@
-"""A recording as a stream of scans, in whatever container it is stored.
-
-Which container a path is; its first bytes decide, not its name.
-"""
+"""A recording as a stream of scans, in whatever container it is stored; its first bytes decide which, not its
+name."""
 
 from __future__ import annotations
 
@@ -18,10 +16,9 @@ import numpy as np
 from pc2grid.display import html_table, short
 from pc2grid.errors import ConfigError, LogError, LogNotFound, LogTruncated, NotALog
 from pc2grid.io import topics
-from pc2grid.io.containers import bags as rosbag2_folder
-from pc2grid.io.containers import cloud_folder
+from pc2grid.io.containers import bags, cloud_folder
 from pc2grid.io.containers.bags import RosbagsFile
-from pc2grid.io.containers.mcap import McapSource
+from pc2grid.io.containers.mcap import MAGIC, McapSource
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.map_pose import MapPose, last_map_pose
 from pc2grid.io.plan import Plan, make_plan
@@ -35,7 +32,7 @@ from pc2grid.io.source import (
     guarded_stream,
     is_lfs_pointer,
 )
-from pc2grid.io.stream import Part, Stream
+from pc2grid.io.stream import LogPart, Stream
 from pc2grid.model import ReadReport, Scan
 from pc2grid.settings import ReadConfig
 
@@ -46,8 +43,8 @@ _STEP_NS = 1_000_000_000
 def open_log(path: str | Path, config: ReadConfig | None = None, *, recover: bool = False) -> Log:
     """Open a recording: an MCAP (ROS 2 or ROS 1), a ROS 1 bag, a rosbag2 folder or db3, a folder of clouds.
 
-    recover : read what is whole of a damaged MCAP file and count the rest, instead of refusing the file; of a
-    split recording, go on without the files that are missing.
+    recover : read the undamaged part of an MCAP file and count the rest, instead of refusing the file; of a
+    split recording, continue without missing files.
 
     Raises LogNotFound, NotALog, LogTruncated, LogCorrupt, LimitExceeded.
 
@@ -75,7 +72,7 @@ class Log:
 
     @functools.cached_property
     def info(self) -> LogInfo:
-        """The facts that are known without decoding a message; its times are those of the scans."""
+        """Return the facts that are known without decoding a message; its times are those of the scans."""
         try:
             return guarded(self._source.info.path, lambda: _with_scan_times(self._source, self._config.topic))
         except LogError:  # said again where the scans are read
@@ -107,11 +104,12 @@ class Log:
         self._source.close()
 
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
-        """All messages of some topics as they stand in the recording, by log time. Raises LogError."""
+        """Yield all messages of some topics as they stand in the recording, by log time. Raises LogError."""
         return guarded_stream(self._source.info.path, self._source.messages(topics))
 
     def digest(self) -> str:
-        """SHA-256 (hex) of the file, or of all files of a folder one after another, in reading order."""
+        """Return the SHA-256 (hex) of the file, or of all files of a folder one after another, in reading
+        order."""
         total = hashlib.sha256()
         for path in self._source.files:
             with path.open("rb") as file:
@@ -120,11 +118,11 @@ class Log:
         return total.hexdigest()
 
     def report(self) -> ReadReport:
-        """Counts of what was read and of what was lost, so far."""
+        """Return the counts of what was read and of what was lost, so far."""
         return self._source.tally.report(self._frames.warnings)
 
     def choose(self) -> Choice:
-        """The topic that the scans come from, and why.
+        """Choose the topics to read, and say why.
 
         Raises TopicError, NoScans, UnsupportedSchema or FrameError.
         """
@@ -136,10 +134,10 @@ class Log:
         return guarded(self._source.info.path, lambda: make_plan(*read))
 
     def map_pose(self, topic: str, end_s: float | None = None) -> MapPose:
-        """The last pose in a map that localization on the robot published, at most `end_s` seconds after the
-        log's start.
+        """Return the last pose in a map that localization on the robot published.
 
-        topic : of a pose, an odometry in the map frame, or tf, of which map -> base is taken.
+        topic : of a pose, an odometry in the map frame, or tf, of which map -> base is taken. end_s : it was
+        published at most so many seconds after the log's start; None: at any time.
 
         Raises TopicError, UnsupportedSchema, FrameError, NoScans if there is no such pose.
         """
@@ -166,21 +164,21 @@ class Log:
 
     @property
     def last_scan_ns(self) -> int:
-        """The log time of the last scan that `scans` has given; 0 before the first."""
+        """Return the log time of the last scan of `scans`; 0 before the first."""
         return 0 if self._stream is None else self._stream.stamps.last_log_ns
 
-    def _part(self, start_s: float, duration_s: float | None) -> Part:
+    def _part(self, start_s: float, duration_s: float | None) -> LogPart:
         if not start_s and duration_s is None:
-            return Part()
+            return LogPart()
         info = self.info
         start_ns = info.start_ns + round(start_s * 1e9)
         end_ns = None if duration_s is None else start_ns + round(duration_s * 1e9)
         name = f" from {start_s:g} s" + ("" if duration_s is None else f" for {duration_s:g} s")
-        return Part(start_ns if start_s else None, end_ns, name, info.duration_s)
+        return LogPart(start_ns if start_s else None, end_ns, name, info.duration_s)
 
 
 def _with_scan_times(source: MessageSource, wanted: str | None) -> LogInfo:
-    """The facts about a recording, with the times of its scans in place of those of all messages.
+    """Return the facts about a recording, with the times of its scans in place of those of all messages.
 
     Other messages may lie far from the scans: odometry that was started first, a transform of a wrong clock.
 
@@ -198,7 +196,8 @@ def _with_scan_times(source: MessageSource, wanted: str | None) -> LogInfo:
 
 
 def _last_ns(source: MessageSource, names: Collection[str], first_ns: int) -> int:
-    """The last log time of messages of these topics, found from the end without reading all of them."""
+    """Return the last log time of messages of these topics, searched from the end without reading all of
+    them."""
     low_ns, high_ns = first_ns, source.info.end_ns + 1  # the last one is not before low, and before high
     step_ns = _STEP_NS
     while high_ns - low_ns > _STEP_NS:
@@ -211,7 +210,6 @@ def _last_ns(source: MessageSource, names: Collection[str], first_ns: int) -> in
     return max(times_ns, default=first_ns)
 
 
-_MCAP = b"\x89MCAP0\r\n"
 _BAG = b"#ROSBAG V2.0\n"
 _SQLITE = b"SQLite format 3\0"
 SUBMAPS_ID = b"pcsm"
@@ -239,12 +237,12 @@ _RECORDED = "of a running robot, or a recording that comes through a pipe: pc2gr
 def open_source(path: Path, config: ReadConfig, *, recover: bool) -> MessageSource:
     """Open the container at a path.
 
-    recover : read what is whole of a damaged MCAP file, and go on without missing files of a folder.
+    recover : read the undamaged part of an MCAP file, and continue without missing files of a folder.
 
     Raises LogNotFound, NotALog, LogTruncated, or what the container's reader raises.
     """
     try:
-        if path.name == rosbag2_folder.METADATA and path.is_file():
+        if path.name == bags.METADATA and path.is_file():
             path = path.parent
         if path.is_dir():
             return _open_folder(path, config, recover)
@@ -260,18 +258,18 @@ def open_source(path: Path, config: ReadConfig, *, recover: bool) -> MessageSour
 
 
 def first_bytes(path: Path) -> bytes:
-    """The first 100 bytes of a file, by which its format is known. Raises OSError."""
+    """Return the first 100 bytes of a file, which identify its format. Raises OSError."""
     with path.open("rb") as file:
         return file.read(100)
 
 
 def is_submap_database(head: bytes) -> bool:
-    """Whether a file is a submap database, by its first 100 bytes."""
+    """Return True if a file is a submap database, by its first 100 bytes."""
     return head.startswith(_SQLITE) and head[68:72] == SUBMAPS_ID
 
 
 def is_submap_file(path: Path) -> bool:
-    """Return whether this is the file of a submap database; not if it cannot be read."""
+    """Return True if this is the file of a submap database; False if it cannot be read."""
     try:
         return is_submap_database(first_bytes(path))
     except OSError:
@@ -281,11 +279,11 @@ def is_submap_file(path: Path) -> bool:
 def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> MessageSource:
     if not head:
         raise LogTruncated(f"{path}: empty file", hint="was the recording interrupted?")
-    if _MCAP.startswith(head):
+    if MAGIC.startswith(head):
         raise LogTruncated(
             f"{path}: an MCAP that ends after its first {len(head)} bytes", hint="nothing to recover"
         )
-    if head.startswith(_MCAP):
+    if head.startswith(MAGIC):
         return McapSource(path, config, recover=recover)
     if head.startswith(_BAG):
         return RosbagsFile(path, config, is_bag=True)
@@ -301,8 +299,8 @@ def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> Me
 
 def _open_folder(path: Path, config: ReadConfig, recover: bool) -> MessageSource:
     names = sorted(entry.name for entry in path.iterdir() if entry.is_file())
-    if rosbag2_folder.METADATA in names or any(name.endswith(rosbag2_folder.SUFFIXES) for name in names):
-        return rosbag2_folder.open_folder(
+    if bags.METADATA in names or any(name.endswith(bags.SUFFIXES) for name in names):
+        return bags.open_folder(
             path, lambda file: open_source(file, config, recover=recover), recover=recover
         )
     if any(name.lower().endswith(cloud_folder.SUFFIXES) for name in names):
@@ -318,7 +316,7 @@ def _open_folder(path: Path, config: ReadConfig, recover: bool) -> MessageSource
 
 
 def _looks_like(head: bytes) -> tuple[str, str]:
-    """What a file is that begins so, and what helps."""
+    """Return the likely kind of a file that begins so, and advice."""
     if is_lfs_pointer(head):
         return "a Git LFS pointer to one", LFS_HINT
     for mark, name, advice in _OTHERS:

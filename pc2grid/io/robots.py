@@ -1,7 +1,7 @@
-"""Which topics are of the robot of the scans: by their namespaces, by the prefixes of their frames, by tf.
+"""The topics of the robot of the scans, by their namespaces, by the prefixes of their frames, and by tf.
 
-`Robot.owns` puts the three together; before the frames are known, `Namespaces.owns` tells by the names alone.
-Each answer is True, False (of another robot), or None: it cannot be told.
+`Robot.owns` combines the three; before the frames are known, `Namespaces.owns` decides by the names alone.
+Each answer is True, False (of another robot), or None: unknown.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ BASE_FRAMES = ("base_link", "base_footprint")  # REP-105 and REP-120
 
 
 def prefix(frame: str) -> str:
-    """Return the robot's name in the name of a frame, such as robot1/base_link; empty if there is none."""
+    """Return the robot's name in the name of a frame, such as robot1 in robot1/base_link; empty if there is
+    none."""
     base = next((name for name in BASE_FRAMES if frame.endswith(name)), None)
     return frame.rpartition("/")[0] if base is None else frame.removesuffix(base).rstrip("/_.-")
 
@@ -31,8 +32,10 @@ def diverge(frame: str, other: str) -> bool:
 
 
 def shared_parts(name: str, other: str) -> int:
-    """Return how many parts two names share from the beginning on, without the last part of each: 1 for
-    robot1/odom and robot1/camera/depth."""
+    """Return the number of parts that two names share from the beginning on, without the last part of each.
+
+    It is 1 for robot1/odom and robot1/camera/depth.
+    """
     parts = (n.lstrip("/").split("/")[:-1] for n in (name, other))
     return sum(1 for _ in itertools.takewhile(lambda pair: pair[0] == pair[1], zip(*parts, strict=False)))
 
@@ -47,17 +50,18 @@ def _namespace(topic: TopicInfo) -> tuple[str, ...]:
 
 
 def _are_namesakes(topic: TopicInfo, other: TopicInfo) -> bool:
-    """Return whether two topics have the same name in two namespaces that stand beside each other."""
+    """Return whether two topics have the same name in two sibling namespaces."""
     shared = shared_parts(topic.topic, other.topic)
     a, b = (t.topic.lstrip("/").split("/")[shared:] for t in (topic, other))
     return len(a) > 1 and a[0] != b[0] and a[1:] == b[1:]
 
 
 class Namespaces:
-    """The evidence of the names: the namespaces of the topics of a log, seen from one topic of scans.
+    """The evidence of the names: the namespaces of the topics of a log, relative to one topic of scans.
 
-    A namespace with transforms is a robot's, beside others with transforms; but one above it without scans is
-    shared by all. In a namespace without transforms, what stands beside other scans may be of their robot.
+    A namespace with transforms is a robot's if others with transforms stand beside it; but one above it
+    without scans is shared by all. In a namespace without transforms, topics beside other scans may be of
+    their robot.
     """
 
     def __init__(self, scans: TopicInfo, there: Sequence[TopicInfo]) -> None:
@@ -98,8 +102,8 @@ class Namespaces:
         return [t for t in found if self.owns(t) or topics.is_static(t) not in own]
 
     def odometry_topics(self, wanted: str | None) -> list[TopicInfo]:
-        """Return the topics that may hold the odometry of the robot, the best first, without tf that nobody
-        names.
+        """Return the topics that may hold the odometry of the robot, the best first; tf only if it is
+        `wanted`.
 
         Raises TopicError if `wanted` is missing.
         """
@@ -122,27 +126,34 @@ class Namespaces:
         found = [t for t in self.topics if t.message_count != 0 and t.type in topics.IMU]
         return self.nearest(sorted(found, key=lambda t: (len(t.topic), t.topic)))
 
-    def rivals(self, topic: TopicInfo) -> list[TopicInfo]:
-        """Return the topics of scans that a topic stands beside, in a namespace that the scans are not in."""
+    def scans_beside(self, topic: TopicInfo) -> list[TopicInfo]:
+        """Return the topics of scans beside a topic, in a namespace without the scans of this robot."""
         branch = self._branch(topic)
         beside = [t for t in self.topics if branch and _namespace(t)[: len(branch)] == branch]
         return [t for t in beside if topics.holds_scans(t, self.topics)]
 
     def namesakes_below(self, topic: TopicInfo) -> list[TopicInfo]:
-        """Return the topics of scans below a topic that only the name of their robot tells from the scans,
-        if these are below it, too."""
+        """Return the topics of scans below a topic that differ from the scans by the name of their robot
+        alone.
+
+        There are none unless the scans are below the topic, too.
+        """
         usable = topics.usable(self.topics, None) if self.is_above(topic) else []
         space = _namespace(topic)
         return [t for t in usable if _are_namesakes(t, self.scans) and _namespace(t)[: len(space)] == space]
 
     def _branch(self, topic: TopicInfo) -> tuple[str, ...]:
-        """Return the namespace of a topic up to where it leaves that of the scans; empty if it does not."""
+        """Return the namespace of a topic up to the part that differs from that of the scans; empty if none
+        does."""
         shared = shared_parts(topic.topic, self.scans.topic)
         return () if self.is_above(topic) else _namespace(topic)[: shared + 1]
 
     def nearest(self, found: Sequence[TopicInfo]) -> list[TopicInfo]:
-        """Return the topics that are not another robot's: first those of the robot of the scans, and of these
-        those that share most of its namespace; otherwise in their order."""
+        """Return the topics that are not another robot's, the most likely first.
+
+        First come those of the robot of the scans, and of these those that share most of its namespace;
+        otherwise the order stays.
+        """
         own = (t for t in found if self.owns(t) is not False)
         return sorted(own, key=lambda t: (self.owns(t) is None, -shared_parts(t.topic, self.scans.topic)))
 
@@ -155,10 +166,11 @@ class Robot:
         self._scans, self._frame, self._first = scans, frame, first
 
     def owns(self, topic: TopicInfo, base: str | None, frames: FrameTree) -> bool | None:
-        """Return whether a topic of odometry or of an IMU is of the robot; None: it cannot be told.
+        """Return whether a topic of odometry or of an IMU is of the robot; None: unknown.
 
-        What tf holds apart from the base is of another robot if its frame has another prefix. Else the
-        namespace tells; then whether frames have a prefix, or other scans are in a frame of the same name.
+        A frame that tf does not connect rigidly to the base is of another robot if it has another prefix.
+        Else the namespace decides; then whether frames have a prefix, or other scans are in a frame of the
+        same name.
         """
         first, mine = self._first.if_known(topic), base or self._frame
         frame = getattr(first[0].content, "child", first[0].frame) if first else ""
@@ -167,7 +179,7 @@ class Robot:
             return False
         if named is not None or apart:
             return named
-        told = prefix(mine) or (self.names.rivals(topic) and not self._stands_beside_twins(topic))
+        told = prefix(mine) or (self.names.scans_beside(topic) and not self._stands_beside_twins(topic))
         return True if told else None
 
     def tf(self, *, none_if_unsure: bool) -> list[TopicInfo]:
@@ -187,7 +199,7 @@ class Robot:
         )
 
     def unsure(self, odometry: Sequence[TopicInfo]) -> TopicError:
-        """Return the error for odometry of which it cannot be told whether it is of this robot."""
+        """Return the error for odometry that may be of another robot."""
         return TopicError(
             f"it cannot be told whether this odometry is of the robot of {self._scans.topic}: "
             f"{topics.listed(odometry)}",
@@ -195,18 +207,18 @@ class Robot:
         )
 
     def serves_several(self, topic: TopicInfo) -> bool:
-        """Return whether a topic stands above the scans, and above others that only the name of their robot
-        tells apart."""
+        """Return whether a topic stands above the scans, and above others that differ by the name of their
+        robot alone."""
         return any(self._frame in self._first.frames_of(t) for t in self.names.namesakes_below(topic))
 
     def _by_name(self, topic: TopicInfo) -> bool | None:
-        """Return whether a topic is of the robot by its namespace; None: it cannot be told."""
+        """Return whether a topic is of the robot by its namespace; None: unknown."""
         named = self.names.owns(topic)
         return None if named and self.serves_several(topic) else named
 
     def _stands_beside_twins(self, topic: TopicInfo) -> bool:
         """Return whether a topic stands beside scans in a frame of the same name, or it may."""
-        found = map(self._first.frames_of, self.names.rivals(topic))
+        found = map(self._first.frames_of, self.names.scans_beside(topic))
         return any(not frames or self._frame in frames for frames in found)
 
 

@@ -1,10 +1,9 @@
-"""The interface of everything that messages come from: topics, times and bytes.
+"""The interface of all sources of messages: topics, times and bytes; and the translation of their errors.
 
-Files of each format implement `MessageSource` (`pc2grid.io.containers`); a live source would, too. A source
-does not decode its messages: `pc2grid.io.recording` turns the bytes of any source into scans.
+Files of each format implement `MessageSource` (`pc2grid.io.containers`). A source does not decode its
+messages: `pc2grid.io.recording` turns the bytes of any source into scans.
 
-The one place where exceptions of the libraries that read recordings become errors of pc2grid.
-
+`guarded` is the one place where exceptions of the libraries that read recordings become errors of pc2grid.
 Decoders of other projects raise a dozen unrelated types for damaged bytes (17 were counted for `mcap` alone);
 a user gets one.
 """
@@ -67,13 +66,13 @@ class LogInfo:
     @computed_field  # type: ignore[prop-decorator]  # mypy has no decorated properties
     @property
     def duration_s(self) -> float:
-        """Time from the start to the end."""
+        """Return the time from the start to the end."""
         return (self.end_ns - self.start_ns) * 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Choice:
-    """Which topics a log is read from, and why.
+    """The topics that a log is read from, and why.
 
     topic, sensor : of the scans.
     odometry_topic : None if there is none; a tf topic if the odometry is the transform odom -> base.
@@ -106,9 +105,8 @@ class RawMessage(NamedTuple):
 class Tally:
     """Counts of what was read and of what could not be read.
 
-    points_dropped : without a finite position. skipped : scans left out, by reason.
-    bytes_lost : of the files, passed over for damage. topics_lost : whether these bytes may have held topics
-    that are not known from elsewhere.
+    points_dropped : without a finite position. skipped : scans left out, by reason. bytes_lost : of the
+    files, skipped for damage. topics_lost : True if these bytes may have held otherwise unknown topics.
     warnings : sentences for the user.
     """
 
@@ -125,7 +123,7 @@ class Tally:
             self.warnings.append(sentence)
 
     def report(self, more_warnings: Iterable[str] = ()) -> ReadReport:
-        """The counts so far."""
+        """Return the counts so far."""
         return ReadReport(
             scans_read=self.scans_read,
             points_dropped=self.points_dropped,
@@ -135,7 +133,7 @@ class Tally:
         )
 
     def take_over(self, other: Tally) -> None:
-        """Add what another one counts of damage, and its warnings."""
+        """Add the damage that another one counted, and its warnings."""
         self.bytes_lost += other.bytes_lost
         self.topics_lost |= other.topics_lost
         for sentence in other.warnings:
@@ -160,7 +158,7 @@ class MessageSource(Protocol):
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """Messages of the topics with start_ns <= log time < end_ns (nanoseconds; None: no bound).
+        """Yield messages of the topics with start_ns <= log time < end_ns (nanoseconds; None: no bound).
 
         Sorted by log time, as far as the memory suffices for it. May be called again, for another pass.
 
@@ -180,14 +178,16 @@ T = TypeVar("T")
 
 
 def is_lfs_pointer(head: bytes) -> bool:
-    """Whether a file that begins so is what Git leaves in place of a large file that was not fetched."""
+    """Return True if a file that begins so is the pointer that Git leaves for a large file that was not
+    fetched."""
     return head.startswith(b"version https://git-lfs")
 
 
 def translated(path: Path, error: Exception, hint: str | None = None) -> Pc2GridError:
-    """The error to show for one that a decoder raised; a LogError gets the path of its recording added.
+    """Return the error to show for one that a decoder raised; a LogError gets the path of its recording
+    added.
 
-    hint : what helps against damage in this kind of file; `--recover` if it is None.
+    hint : advice against damage in this kind of file; `--recover` if it is None.
     """
     if isinstance(error, LogError) and one_line(path.name) not in error.message:
         return type(error)(f"{path}: {error.message}", hint=error.hint or hint)
@@ -202,7 +202,7 @@ def translated(path: Path, error: Exception, hint: str | None = None) -> Pc2Grid
 
 
 def guarded(path: Path, action: Callable[[], T], hint: str | None = None) -> T:
-    """The result of an action; an exception in it is translated."""
+    """Run an action and return its result; an exception in it is translated."""
     try:
         return action()
     except MemoryError:
@@ -219,7 +219,8 @@ def guarded(path: Path, action: Callable[[], T], hint: str | None = None) -> T:
 
 
 def guarded_stream(path: Path, stream: Iterator[T], hint: str | None = None) -> Iterator[T]:
-    """The same for an iterator; exceptions of its consumer do not pass through here."""
+    """Yield the items of an iterator, with its exceptions translated; those of its consumer do not pass
+    through here."""
     end = object()
     following = partial(next, stream, end)
     while (item := guarded(path, following, hint)) is not end:

@@ -1,9 +1,8 @@
 """One pass over a part of a log: scans sorted by stamp, each with the sensor's pose and the odometry.
 
-Scans of further sensors, taken at about the same time as those of the first: two lasers, four cameras.
-
-Each has a frame and a place on the robot of its own, and mostly a topic. Their points become part of the
-first sensor's scan that is nearest in time.
+Scans of further sensors, such as a second laser or three more cameras, are taken at about the same time as
+those of the first. Each has a frame and a place on the robot of its own, and mostly a topic. Their points
+become part of the first sensor's scan that is nearest in time (`FurtherScans`, `together`).
 """
 
 from __future__ import annotations
@@ -40,100 +39,6 @@ from pc2grid.io.topics import tolerant
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ReadConfig
 
-_MOST_APART_NS = 100_000_000
-"""Stamps of scans that are put together differ by no more: a period of a usual lidar."""
-_KEPT = 50
-"""Messages of a topic that wait for the first sensor's; chosen by hand."""
-
-
-class Received(NamedTuple):
-    """A scan as it was received. size_bytes : of the message as it was recorded."""
-
-    stamp_ns: int
-    log_time_ns: int
-    size_bytes: int
-    message: ScanMessage
-
-
-class FurtherScans:
-    """The scans of one further sensor, decoded when the first sensor's scan needs them.
-
-    name : for the user. silent : whether they are left out as long as they hold no return, see `Sensor`.
-    """
-
-    def __init__(self, name: str, decoder: ScanDecoder, *, silent: bool = False) -> None:
-        self.name, self.decoder, self.silent = name, decoder, silent
-        self.newest_ns = self._used_ns = 0
-        self._received: deque[Received] = deque(maxlen=_KEPT)
-
-    def take(self, received: Received) -> None:
-        """Take in a scan."""
-        if self.silent and not self.decoder.returns(received.message):
-            return
-        self.newest_ns = max(self.newest_ns, received.stamp_ns)
-        self._received.append(received)
-
-    def unused(self) -> list[Received]:
-        """Return the scans after those that became part of another sensor's, of those that are kept."""
-        return [received for received in self._received if received.stamp_ns > self._used_ns]
-
-    def near(
-        self,
-        stamp_ns: int,
-        pose_of: Callable[[str, int], F64],
-        odometry_at: Callable[[int], F64 | None],
-    ) -> Scan | None:
-        """The scan nearest to a stamp; None if there is none of a silent sensor.
-
-        pose_of : `T_base_sensor` of a frame at a time.
-
-        Raises PointCloudError if none is near, Pc2GridError if it cannot be decoded.
-        """
-        nearest = min(self._received, key=lambda r: abs(r.stamp_ns - stamp_ns), default=None)
-        if nearest is None or abs(nearest.stamp_ns - stamp_ns) > _MOST_APART_NS:
-            if self.silent:
-                return None
-            raise PointCloudError("no scan near the first sensor's")
-        while self._received[0] is not nearest:
-            self._received.popleft()
-        self._used_ns = own_ns = nearest.stamp_ns
-        message = nearest.message
-        return self.decoder.scan(message, own_ns, pose_of(message.header.frame, own_ns), odometry_at(own_ns))
-
-
-def together(first: Scan, further: Sequence[Scan]) -> Scan:
-    """One scan with the points of all, at the stamp of the first.
-
-    Points are moved by odometry from the time of their scan to that of the first. Without odometry their
-    times tell when they were taken, and registration moves them. Rays begin in the middle of the sensors.
-    """
-    points, offsets = zip(
-        (first.points_m, first.offsets_s), *(_moved(scan, first) for scan in further), strict=True
-    )
-    timed = any(offset is not None for offset in offsets)
-    T_base_sensor = first.T_base_sensor.copy()
-    T_base_sensor[:3, 3] = np.mean([scan.T_base_sensor[:3, 3] for scan in (first, *further)], axis=0)
-    return replace(
-        first,
-        points_m=np.concatenate(points),
-        offsets_s=np.concatenate([*map(_offsets_s, points, offsets)]) if timed else None,
-        T_base_sensor=T_base_sensor,
-        dropped=first.dropped + sum(scan.dropped for scan in further),
-    )
-
-
-def _moved(scan: Scan, first: Scan) -> tuple[F32, F32 | None]:
-    """Points (N, 3) of a scan and their times, as seen from where the base was at the first."""
-    if scan.T_odom_base is None or first.T_odom_base is None:
-        apart_s = np.float32((scan.stamp_ns - first.stamp_ns) * 1e-9)
-        return scan.points_m, _offsets_s(scan.points_m, scan.offsets_s) + apart_s
-    T = (invert_pose(first.T_odom_base) @ scan.T_odom_base).astype(np.float32)
-    return scan.points_m @ T[:3, :3].T + T[:3, 3], scan.offsets_s
-
-
-def _offsets_s(points_m: F32, offsets_s: F32 | None) -> F32:
-    return np.zeros(len(points_m), np.float32) if offsets_s is None else offsets_s
-
 
 @dataclass(frozen=True, slots=True)
 class StreamParameters:
@@ -166,238 +71,6 @@ _EMPTY_HINT = (
 )
 
 
-@dataclass(slots=True)
-class Part:
-    """A part of a log: log times of its scans; None: from the first one on, to the last one.
-
-    name, log_s : for errors, which seconds of how many are wanted.
-    count, good, bad, returns : scans that were found, that were given, that cannot be used; points of those
-    given. error : why the first one cannot be used.
-    """
-
-    start_ns: int | None = None
-    end_ns: int | None = None
-    name: str = ""
-    log_s: float = 0.0
-    count: int = 0
-    good: int = 0
-    bad: int = 0
-    returns: int = 0
-    error: Pc2GridError | None = None
-
-    def holds(self, log_time_ns: int) -> bool:
-        """Whether a scan recorded then is wanted."""
-        return (self.start_ns or 0) <= log_time_ns and (self.end_ns is None or log_time_ns < self.end_ns)
-
-    def with_margin(self) -> tuple[int | None, int | None]:
-        """Log times between which odometry and tf are read: what lies farther away is not interpolated."""
-        low_ns = None if self.start_ns is None else max(self.start_ns - FRAMES.max_gap_ns, 0)
-        return low_ns, None if self.end_ns is None else self.end_ns + FRAMES.max_gap_ns
-
-    def skipped(self, error: Pc2GridError, topic: str, patience: int) -> None:
-        """Count a scan that cannot be used. Raises after too many from the beginning on."""
-        self.bad += 1
-        self.error = self.error or error
-        if self.bad >= patience and not self.good:
-            raise self._mostly_bad(topic, self.error)
-
-    def finish(self, topic: str, max_bad_share: float, empty: str) -> None:
-        """Raises NoScans if there were none or all were empty, LogCorrupt or PointCloudError if too many were
-        bad.
-
-        empty : why the last empty scan was so.
-        """
-        if self.count == 0:
-            raise NoScans(f"{topic}: no scan{self.name}", hint=f"the log lasts {self.log_s:.1f} s")
-        if self.error is not None and (self.good == 0 or self.bad > max_bad_share * self.count):
-            raise self._mostly_bad(topic, self.error)
-        if not self.returns:
-            raise NoScans(f"{topic}: none of {self.good} scans holds a return: {empty}", hint=_EMPTY_HINT)
-
-    def _mostly_bad(self, topic: str, error: Pc2GridError) -> Pc2GridError:
-        kind = LogCorrupt if self.good else PointCloudError
-        words = f"{topic}: {self.bad} of {self.count} scans are unreadable: {error.message}"
-        return kind(words, hint=error.hint)
-
-
-_Of = tuple[TopicInfo, str | None]
-"""Topic and frame of the scans of one sensor; None: a frame that is not known yet."""
-
-
-class _Waiting(NamedTuple):
-    """A scan that waits; scans with equal stamps are sorted by their number in the log.
-
-    scan : its message takes at most four times its recorded size, if it is a text of numbers.
-    """
-
-    stamp_ns: int
-    number: int
-    scan: Received
-    decoder: ScanDecoder
-
-
-class _Stamps:
-    """Whether stamps go on; compared with the time of recording.
-
-    last_ns, last_log_ns : of the last scan that was used. out_of_time : number of scans in a row that were
-    skipped because their stamps go back or jump.
-    """
-
-    def __init__(self, tally: Tally) -> None:
-        self._tally = tally
-        self.last_ns: int | None = None
-        self.last_log_ns = 0
-        self.out_of_time = 0
-
-    def used(self, stamp_ns: int, log_time_ns: int) -> None:
-        """A scan was used."""
-        self.last_ns, self.last_log_ns = stamp_ns, log_time_ns
-        self.out_of_time = 0
-
-    def check(self, stamp_ns: int, log_time_ns: int, waiting: Sequence[_Waiting]) -> None:
-        """Compare a stamp with the one before. Raises PointCloudError for a scan to be skipped."""
-        if self.last_ns is None:
-            return
-        since_ns = stamp_ns - self.last_ns
-        if not since_ns:
-            raise PointCloudError("stamp is a duplicate")
-        # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.
-        jumps = since_ns - (log_time_ns - self.last_log_ns) > GAP_NS
-        alone = not any(0 <= entry.stamp_ns - stamp_ns < GAP_NS for entry in waiting)
-        if since_ns < 0 or (jumps and alone):
-            self.out_of_time += 1
-            raise PointCloudError(
-                "stamp goes back in time" if since_ns < 0 else "stamp jumps",
-                hint="the stamps in the headers must increase: a topic for each sensor, and a clock that is "
-                "not set while it is recorded; a part in which they do: --start and --duration",
-            )
-        if jumps:
-            self._tally.warn("the clock of the scans jumps forward within the log")
-        elif since_ns > GAP_NS:
-            self._tally.warn("the log has gaps of more than 5 s between scans")
-
-
-class _Poses:
-    """The poses of the sensors on the robot, and of the robot in the odometry frame, by time.
-
-    frame : the parent frame of the odometry, such as `odom`; None as long as it is not known.
-    """
-
-    def __init__(self, plan: Plan, frames: FrameTree, tally: Tally) -> None:
-        self._plan, self._frames, self._tally = plan, frames, tally
-        self._base = plan.choice.base_frame
-        self._track = PoseTrack()
-        self._T_child_base: F64 | None = None
-        model = SENSOR_MODELS[plan.choice.sensor]
-        self._images, self._planar = model.image, model.planar
-        self._attitude = Attitude()
-        self._imu_frame = ""
-        self.frame = plan.odometry_frame
-
-    def take_odometry(self, found: Odometry | None, log_time_ns: int) -> None:
-        """Take in a message of the topic of the odometry; None: it cannot be decoded."""
-        if found is None or not self._track.add(found.header.stamp_ns or log_time_ns, found.pose):
-            self._tally.warn("some odometry messages are unreadable or not finite, and were ignored")
-        elif self._T_child_base is None:
-            self._T_child_base = self._child_to_base(found.child)
-            self.frame = found.header.frame or None
-
-    def take_imu(self, found: Imu | None, log_time_ns: int) -> None:
-        """Take in a message of the topic of the IMU."""
-        if found is None:
-            self._tally.warn("some IMU messages are unreadable or not finite, and were ignored")
-            return
-        self._imu_frame = found.header.frame
-        self._attitude.add(found, found.header.stamp_ns or log_time_ns)
-
-    def take_tf(self, edges: tuple[Transform, ...] | None, log_time_ns: int) -> None:
-        """Take in a message of moving transforms."""
-        self._frames.add_all(edges, log_time_ns=log_time_ns)
-
-    def _child_to_base(self, child: str) -> F64:
-        """`T_child_base` of the odometry's child frame; identity if it is the base, or not in tf."""
-        base, frames = self._base, self._frames
-        if not child or child == base or self._plan.sensor_is_base:
-            return np.eye(4)
-        if frames.connected(child, base) and not frames.moving(child, base):
-            found = frames.lookup(child, base, 0)
-            assert found is not None  # nothing moves there
-            return found
-        self._tally.warn(f"the odometry is of frame {child}, which is taken for {base}")
-        return np.eye(4)
-
-    def newest_ns(self) -> int | None:
-        """The stamp up to which odometry is known; 0 if none has arrived, None if there is none at all."""
-        plan = self._plan
-        if plan.odometry_frame is not None:
-            return self._frames.newest_ns(plan.odometry_frame, self._base)
-        return None if plan.odometry is None else self._track.newest_ns
-
-    def complete_ns(self) -> int | None:
-        """The stamp up to which odometry or, without it, the IMU is known; as `newest_ns`."""
-        newest_ns = self.newest_ns()
-        return self._attitude.newest_ns if newest_ns is None and self._plan.imu is not None else newest_ns
-
-    def odometry(self, stamp_ns: int) -> F64 | None:
-        """`T_odom_base` (4, 4) at a time; None if it is not known."""
-        if self._plan.odometry_frame is not None:
-            return self._frames.lookup(self._plan.odometry_frame, self._base, stamp_ns)
-        found = self._track.at(stamp_ns)
-        return found if found is None or self._T_child_base is None else found @ self._T_child_base
-
-    def newest_odometry(self) -> tuple[int, F64] | None:
-        """The newest stamp of the odometry and `T_odom_base` (4, 4) there; None if there is none."""
-        newest_ns = self.newest_ns() or 0
-        pose = self.odometry(newest_ns)
-        return None if pose is None else (newest_ns, pose)
-
-    def longest_gap_ns(self, begin_ns: int, end_ns: int) -> int:
-        """The longest time without a reading of odometry between two times."""
-        frame = self._plan.odometry_frame
-        if frame is None:
-            return self._track.longest_gap_ns(begin_ns, end_ns)
-        return self._frames.longest_gap_ns(frame, self._base, begin_ns, end_ns)
-
-    def level(self, stamp_ns: int) -> F64 | None:
-        """`T_level_base` (4, 4) at a time, see `Scan`; None if there is no IMU, or it does not tell."""
-        if not self._attitude.received:
-            return None
-        T_level_imu = self._attitude.at(stamp_ns)
-        if T_level_imu is None:
-            self._tally.warn(
-                "the IMU does not say at all scans which way is up: it must measure accelerations of about "
-                "9.81 m/s2 at their stamps"
-            )
-            return None
-        T_imu_base = invert_pose(self._in_base(self._imu_frame, stamp_ns))
-        T_imu_base[:3, 3] = 0.0
-        return T_level_imu @ T_imu_base
-
-    def sensor(self, frame: str, stamp_ns: int) -> F64:
-        """`T_base_sensor` (4, 4) of the sensor with this frame. Raises FrameError, PointCloudError."""
-        found = self._in_base(frame, stamp_ns)
-        if self._images and not self._plan.sensor_is_base and "optical" not in frame and found[2, 2] > _UP:
-            self._tally.warn(
-                f"the images are in frame {frame}, whose z axis points up, where that of a camera points "
-                "forward (REP-103): x is taken for forward; correct it to the camera's optical frame"
-            )
-            return found @ T_BODY_OPTICAL
-        return found
-
-    def _in_base(self, frame: str, stamp_ns: int) -> F64:
-        """`T_base_frame` (4, 4); without tf, axes of cameras are turned (REP-103).
-
-        A LaserScan is by its definition in the x-y plane of its frame, whatever the frame is called.
-        """
-        if self._plan.sensor_is_base:
-            named = frame.endswith("_optical") or "_optical_" in frame
-            return T_BODY_OPTICAL if self._images or (named and not self._planar) else np.eye(4)
-        found = self._frames.lookup(self._base, frame, stamp_ns)
-        if found is None:
-            raise PointCloudError("tf is unknown at the stamp")
-        return found
-
-
 class Stream:
     """One pass, to be run once; it counts in the source's tally what is read and what is lost.
 
@@ -410,13 +83,13 @@ class Stream:
         config: ReadConfig,
         frames: FrameTree,
         plan: Plan,
-        part: Part | None = None,
+        part: LogPart | None = None,
         parameters: StreamParameters | None = None,
     ) -> None:
-        """part : of the recording; None: all of it."""
+        """Prepare the pass. part : of the recording; None: all of it."""
         self._source, self._plan = source, plan
         self._parameters = parameters or PARAMETERS
-        self._part = part or Part()
+        self._part = part or LogPart()
         self._config = config
         self._decode = {sensor.topic: decoder_for(sensor.topic) for sensor in plan.sensors}
         self._decoders: dict[_Of, ScanDecoder] = {}
@@ -436,7 +109,7 @@ class Stream:
         self._handlers = self._make_handlers()
 
     def _make_handlers(self) -> dict[TopicInfo, Callable[[Any, int], None]]:
-        """By topic, what takes in its messages."""
+        """Return by topic the function that takes its messages."""
         plan, poses = self._plan, self.poses
         on: dict[TopicInfo, Callable[[Any, int], None]] = {}
         on.update((topic, functools.partial(self._take_scan, topic)) for topic in self._decode)
@@ -454,7 +127,7 @@ class Stream:
 
     @property
     def topics(self) -> frozenset[str]:
-        """The topics whose messages are used."""
+        """Return the topics whose messages are used."""
         return frozenset(topic.topic for topic in self._handlers)
 
     @property
@@ -474,7 +147,7 @@ class Stream:
             )
 
     def take(self, message: RawMessage) -> Iterator[Scan]:
-        """Take in one message, and yield the scans that need not wait any longer."""
+        """Add one message, and yield the scans that need not wait any longer."""
         take = self._handlers.get(message.channel)
         if take is not None:
             take(message.data, message.log_time_ns)
@@ -496,8 +169,8 @@ class Stream:
         )
 
     def _all_is_there(self, stamp_ns: int) -> bool:
-        """Whether what belongs to a scan has arrived: those of further sensors, and odometry or an IMU if
-        there is any."""
+        """Return whether everything that belongs to a scan has arrived: scans of further sensors, odometry,
+        or an IMU."""
         further_ns = [further.newest_ns for further in self._placed() if not further.silent]
         known_ns = self.poses.complete_ns()
         needed_ns = max([stamp_ns + self._sweep_ns, *further_ns])
@@ -530,7 +203,7 @@ class Stream:
                 self._source.tally.skip(f"{topic.topic}: {error.message}")
 
     def _queue(self, scan: Received) -> None:
-        """Let a scan of the first sensor wait."""
+        """Add a scan of the first sensor to those that wait."""
         self._alone_ns = None
         self._part.count += 1
         waiting = _Waiting(scan.stamp_ns, self._part.count, scan, self._decoder_of(self._lead))
@@ -556,7 +229,7 @@ class Stream:
             self._queue(kept)
 
     def _placed(self) -> Collection[FurtherScans]:
-        """The further sensors, if it is known where on the robot they are."""
+        """Return the further sensors, if their places on the robot are known."""
         return () if self._plan.sensor_is_base else self._further.values()
 
     def _add(self, sensor: _Of, *, silent: bool = False) -> FurtherScans:
@@ -569,7 +242,7 @@ class Stream:
         return self._further[sensor]
 
     def _sensor(self, of: _Of) -> Sensor:
-        """What the plan says of a sensor, or of another one on its topic if it is not known there."""
+        """Return the plan's entry for a sensor, or for another one on its topic if there is none."""
         alike = [sensor for sensor in self._plan.sensors if sensor.topic == of[0]]
         return next((sensor for sensor in alike if sensor.frame == of[1]), alike[0])
 
@@ -584,7 +257,7 @@ class Stream:
         return self._decoders[of]
 
     def _stamp_of(self, message: ScanMessage, log_time_ns: int) -> int:
-        """The stamp of a scan. Raises PointCloudError for one that is none."""
+        """Return the stamp of a scan. Raises PointCloudError for an invalid one."""
         stamp_ns = message.header.stamp_ns
         if self._plan.stampless:
             self._source.tally.warn("the stamps of the scans are zero: the time of recording is used instead")
@@ -635,7 +308,7 @@ class Stream:
         yield scan
 
     def _scan(self, stamp_ns: int, message: ScanMessage, decoder: ScanDecoder) -> Scan:
-        """The scan with all that belongs to it. Raises as `ScanDecoder.scan` does, and FrameError."""
+        """Return the scan with all that belongs to it. Raises as `ScanDecoder.scan` does, and FrameError."""
         T_base_points = self.poses.sensor(message.header.frame, stamp_ns)
         scan = decoder.scan(message, stamp_ns, T_base_points, self.poses.odometry(stamp_ns))
         if self._plan.mounted is not None:
@@ -648,7 +321,7 @@ class Stream:
         return self._with_motion(self._with_further(scan))
 
     def _measured(self, scan: Scan, mounted: str) -> Scan:
-        """A scan whose points were in a fixed frame, as one that the sensor with a frame measured.
+        """Return a scan with points in a fixed frame as one of the sensor with a frame.
 
         Raises FrameError if it cannot have been where tf puts it.
         """
@@ -659,7 +332,7 @@ class Stream:
         return replace(scan, T_base_sensor=T_base_sensor, offsets_s=None)
 
     def _with_further(self, scan: Scan) -> Scan:
-        """The scan together with those of the further sensors that are near in time."""
+        """Return the scan together with those of the further sensors that are near in time."""
         found = []
         for further in self._placed():
             try:
@@ -671,8 +344,10 @@ class Stream:
         return together(scan, found) if found else scan
 
     def _with_motion(self, scan: Scan) -> Scan:
-        """The scan with the motion from its first to its last point, if there is odometry at both, or with
-        the turn by an IMU."""
+        """Return the scan with the motion from its first to its last point.
+
+        It is that of odometry, if there is any at both times, or the rotation by an IMU.
+        """
         if scan.offsets_s is None or not len(scan.offsets_s):
             self._sweep_ns = 0
             return scan
@@ -691,7 +366,342 @@ class Stream:
         self._part.skipped(error, self._topic.topic, self._parameters.patience)
 
 
+_Of = tuple[TopicInfo, str | None]
+"""Topic and frame of the scans of one sensor; None: a frame that is not known yet."""
+
+
+class _Waiting(NamedTuple):
+    """A scan that waits; scans with equal stamps are sorted by their number in the log.
+
+    scan : its message takes at most four times its recorded size, if it is a text of numbers.
+    """
+
+    stamp_ns: int
+    number: int
+    scan: Received
+    decoder: ScanDecoder
+
+
 def _decoding(topic: TopicInfo, take: Callable[[Any, int], None]) -> Callable[[Any, int], None]:
-    """What decodes the messages of a topic for what takes them in; None for those that cannot be decoded."""
+    """Return a function that decodes the messages of a topic and calls `take`; with None for undecodable
+    ones."""
     decode = decoder_for(topic)
     return lambda data, log_time_ns: take(tolerant(decode, data), log_time_ns)
+
+
+@dataclass(slots=True)
+class LogPart:
+    """A part of a log: log times of its scans; None: from the first one on, to the last one.
+
+    name, log_s : for errors, which seconds of how many are wanted.
+    count, good, bad, returns : number of scans that were found, that were yielded, that cannot be used;
+    points of those yielded. error : why the first one cannot be used.
+    """
+
+    start_ns: int | None = None
+    end_ns: int | None = None
+    name: str = ""
+    log_s: float = 0.0
+    count: int = 0
+    good: int = 0
+    bad: int = 0
+    returns: int = 0
+    error: Pc2GridError | None = None
+
+    def holds(self, log_time_ns: int) -> bool:
+        """Return True if a scan recorded then is wanted."""
+        return (self.start_ns or 0) <= log_time_ns and (self.end_ns is None or log_time_ns < self.end_ns)
+
+    def with_margin(self) -> tuple[int | None, int | None]:
+        """Return the log times between which odometry and tf are read: beyond these nothing is
+        interpolated."""
+        low_ns = None if self.start_ns is None else max(self.start_ns - FRAMES.max_gap_ns, 0)
+        return low_ns, None if self.end_ns is None else self.end_ns + FRAMES.max_gap_ns
+
+    def skipped(self, error: Pc2GridError, topic: str, patience: int) -> None:
+        """Count a scan that cannot be used. Raises after too many from the beginning on."""
+        self.bad += 1
+        self.error = self.error or error
+        if self.bad >= patience and not self.good:
+            raise self._mostly_bad(topic, self.error)
+
+    def finish(self, topic: str, max_bad_share: float, empty: str) -> None:
+        """Raise NoScans, LogCorrupt or PointCloudError if the part is of no use.
+
+        NoScans: there were no scans, or all were empty. LogCorrupt, PointCloudError: too many were bad. empty
+        : reason of the last empty scan.
+        """
+        if self.count == 0:
+            raise NoScans(f"{topic}: no scan{self.name}", hint=f"the log lasts {self.log_s:.1f} s")
+        if self.error is not None and (self.good == 0 or self.bad > max_bad_share * self.count):
+            raise self._mostly_bad(topic, self.error)
+        if not self.returns:
+            raise NoScans(f"{topic}: none of {self.good} scans holds a return: {empty}", hint=_EMPTY_HINT)
+
+    def _mostly_bad(self, topic: str, error: Pc2GridError) -> Pc2GridError:
+        kind = LogCorrupt if self.good else PointCloudError
+        words = f"{topic}: {self.bad} of {self.count} scans are unreadable: {error.message}"
+        return kind(words, hint=error.hint)
+
+
+class _Stamps:
+    """Checks whether stamps continue, by comparison with the time of recording.
+
+    last_ns, last_log_ns : of the last scan that was used. out_of_time : number of scans in a row that were
+    skipped because their stamps go back or jump.
+    """
+
+    def __init__(self, tally: Tally) -> None:
+        self._tally = tally
+        self.last_ns: int | None = None
+        self.last_log_ns = 0
+        self.out_of_time = 0
+
+    def used(self, stamp_ns: int, log_time_ns: int) -> None:
+        """Set the times of the last scan that was used."""
+        self.last_ns, self.last_log_ns = stamp_ns, log_time_ns
+        self.out_of_time = 0
+
+    def check(self, stamp_ns: int, log_time_ns: int, waiting: Sequence[_Waiting]) -> None:
+        """Compare a stamp with the one before. Raises PointCloudError for a scan to be skipped."""
+        if self.last_ns is None:
+            return
+        since_ns = stamp_ns - self.last_ns
+        if not since_ns:
+            raise PointCloudError("stamp is a duplicate")
+        # If the next scan is near this stamp, too, the clock was set; else this one stamp is wrong.
+        jumps = since_ns - (log_time_ns - self.last_log_ns) > GAP_NS
+        alone = not any(0 <= entry.stamp_ns - stamp_ns < GAP_NS for entry in waiting)
+        if since_ns < 0 or (jumps and alone):
+            self.out_of_time += 1
+            raise PointCloudError(
+                "stamp goes back in time" if since_ns < 0 else "stamp jumps",
+                hint="the stamps in the headers must increase: a topic for each sensor, and a clock that is "
+                "not set while it is recorded; a part in which they do: --start and --duration",
+            )
+        if jumps:
+            self._tally.warn("the clock of the scans jumps forward within the log")
+        elif since_ns > GAP_NS:
+            self._tally.warn("the log has gaps of more than 5 s between scans")
+
+
+class _Poses:
+    """The poses of the sensors on the robot, and of the robot in the odometry frame, by time.
+
+    frame : the parent frame of the odometry, such as `odom`; None as long as it is not known.
+    """
+
+    def __init__(self, plan: Plan, frames: FrameTree, tally: Tally) -> None:
+        self._plan, self._frames, self._tally = plan, frames, tally
+        self._base = plan.choice.base_frame
+        self._track = PoseTrack()
+        self._T_child_base: F64 | None = None
+        model = SENSOR_MODELS[plan.choice.sensor]
+        self._images, self._planar = model.image, model.planar
+        self._attitude = Attitude()
+        self._imu_frame = ""
+        self.frame = plan.odometry_frame
+
+    def take_odometry(self, found: Odometry | None, log_time_ns: int) -> None:
+        """Add a message of the topic of the odometry; None: it cannot be decoded."""
+        if found is None or not self._track.add(found.header.stamp_ns or log_time_ns, found.pose):
+            self._tally.warn("some odometry messages are unreadable or not finite, and were ignored")
+        elif self._T_child_base is None:
+            self._T_child_base = self._child_to_base(found.child)
+            self.frame = found.header.frame or None
+
+    def take_imu(self, found: Imu | None, log_time_ns: int) -> None:
+        """Add a message of the topic of the IMU."""
+        if found is None:
+            self._tally.warn("some IMU messages are unreadable or not finite, and were ignored")
+            return
+        self._imu_frame = found.header.frame
+        self._attitude.add(found, found.header.stamp_ns or log_time_ns)
+
+    def take_tf(self, edges: tuple[Transform, ...] | None, log_time_ns: int) -> None:
+        """Add a message of moving transforms."""
+        self._frames.add_all(edges, log_time_ns=log_time_ns)
+
+    def _child_to_base(self, child: str) -> F64:
+        """Return `T_child_base` of the odometry's child frame; identity if it is the base, or not in tf."""
+        base, frames = self._base, self._frames
+        if not child or child == base or self._plan.sensor_is_base:
+            return np.eye(4)
+        if frames.connected(child, base) and not frames.moving(child, base):
+            found = frames.lookup(child, base, 0)
+            assert found is not None  # nothing moves there
+            return found
+        self._tally.warn(f"the odometry is of frame {child}, which is taken for {base}")
+        return np.eye(4)
+
+    def newest_ns(self) -> int | None:
+        """Return the stamp up to which odometry is known; 0 if none has arrived, None if there is none at
+        all."""
+        plan = self._plan
+        if plan.odometry_frame is not None:
+            return self._frames.newest_ns(plan.odometry_frame, self._base)
+        return None if plan.odometry is None else self._track.newest_ns
+
+    def complete_ns(self) -> int | None:
+        """Return the stamp up to which odometry or, without it, the IMU is known; as `newest_ns`."""
+        newest_ns = self.newest_ns()
+        return self._attitude.newest_ns if newest_ns is None and self._plan.imu is not None else newest_ns
+
+    def odometry(self, stamp_ns: int) -> F64 | None:
+        """Return `T_odom_base` (4, 4) at a time; None if it is not known."""
+        if self._plan.odometry_frame is not None:
+            return self._frames.lookup(self._plan.odometry_frame, self._base, stamp_ns)
+        found = self._track.at(stamp_ns)
+        return found if found is None or self._T_child_base is None else found @ self._T_child_base
+
+    def newest_odometry(self) -> tuple[int, F64] | None:
+        """Return the newest stamp of the odometry and `T_odom_base` (4, 4) there; None if there is none."""
+        newest_ns = self.newest_ns() or 0
+        pose = self.odometry(newest_ns)
+        return None if pose is None else (newest_ns, pose)
+
+    def longest_gap_ns(self, begin_ns: int, end_ns: int) -> int:
+        """Return the longest time without a reading of odometry between two times."""
+        frame = self._plan.odometry_frame
+        if frame is None:
+            return self._track.longest_gap_ns(begin_ns, end_ns)
+        return self._frames.longest_gap_ns(frame, self._base, begin_ns, end_ns)
+
+    def level(self, stamp_ns: int) -> F64 | None:
+        """Return `T_level_base` (4, 4) at a time, see `Scan`; None if there is no IMU, or it does not measure
+        it."""
+        if not self._attitude.received:
+            return None
+        T_level_imu = self._attitude.at(stamp_ns)
+        if T_level_imu is None:
+            self._tally.warn(
+                "the IMU does not say at all scans which way is up: it must measure accelerations of about "
+                "9.81 m/s2 at their stamps"
+            )
+            return None
+        T_imu_base = invert_pose(self._in_base(self._imu_frame, stamp_ns))
+        T_imu_base[:3, 3] = 0.0
+        return T_level_imu @ T_imu_base
+
+    def sensor(self, frame: str, stamp_ns: int) -> F64:
+        """Return `T_base_sensor` (4, 4) of the sensor with this frame. Raises FrameError, PointCloudError."""
+        found = self._in_base(frame, stamp_ns)
+        if self._images and not self._plan.sensor_is_base and "optical" not in frame and found[2, 2] > _UP:
+            self._tally.warn(
+                f"the images are in frame {frame}, whose z axis points up, where that of a camera points "
+                "forward (REP-103): x is taken for forward; correct it to the camera's optical frame"
+            )
+            return found @ T_BODY_OPTICAL
+        return found
+
+    def _in_base(self, frame: str, stamp_ns: int) -> F64:
+        """Return `T_base_frame` (4, 4); without tf, axes of cameras are rotated (REP-103).
+
+        A LaserScan is by its definition in the x-y plane of its frame, whatever the name of the frame.
+        """
+        if self._plan.sensor_is_base:
+            named = frame.endswith("_optical") or "_optical_" in frame
+            return T_BODY_OPTICAL if self._images or (named and not self._planar) else np.eye(4)
+        found = self._frames.lookup(self._base, frame, stamp_ns)
+        if found is None:
+            raise PointCloudError("tf is unknown at the stamp")
+        return found
+
+
+# Scans of further sensors.
+
+_MOST_APART_NS = 100_000_000
+"""Stamps of scans that are put together differ by no more: a period of a usual lidar."""
+_KEPT = 50
+"""Messages of a topic that wait for the first sensor's; chosen by hand."""
+
+
+class Received(NamedTuple):
+    """A scan as it was received. size_bytes : of the message as it was recorded."""
+
+    stamp_ns: int
+    log_time_ns: int
+    size_bytes: int
+    message: ScanMessage
+
+
+class FurtherScans:
+    """The scans of one further sensor, decoded when the first sensor's scan needs them.
+
+    name : for the user. silent : True if they are left out as long as they hold no return, see `Sensor`.
+    """
+
+    def __init__(self, name: str, decoder: ScanDecoder, *, silent: bool = False) -> None:
+        self.name, self.decoder, self.silent = name, decoder, silent
+        self.newest_ns = self._used_ns = 0
+        self._received: deque[Received] = deque(maxlen=_KEPT)
+
+    def take(self, received: Received) -> None:
+        """Add a scan."""
+        if self.silent and not self.decoder.returns(received.message):
+            return
+        self.newest_ns = max(self.newest_ns, received.stamp_ns)
+        self._received.append(received)
+
+    def unused(self) -> list[Received]:
+        """Return those of the kept scans that are later than the last one that was put together with
+        another."""
+        return [received for received in self._received if received.stamp_ns > self._used_ns]
+
+    def near(
+        self,
+        stamp_ns: int,
+        pose_of: Callable[[str, int], F64],
+        odometry_at: Callable[[int], F64 | None],
+    ) -> Scan | None:
+        """Return the scan nearest to a stamp; None if there is none of a silent sensor.
+
+        pose_of : `T_base_sensor` of a frame at a time.
+
+        Raises PointCloudError if none is near, Pc2GridError if it cannot be decoded.
+        """
+        nearest = min(self._received, key=lambda r: abs(r.stamp_ns - stamp_ns), default=None)
+        if nearest is None or abs(nearest.stamp_ns - stamp_ns) > _MOST_APART_NS:
+            if self.silent:
+                return None
+            raise PointCloudError("no scan near the first sensor's")
+        while self._received[0] is not nearest:
+            self._received.popleft()
+        self._used_ns = own_ns = nearest.stamp_ns
+        message = nearest.message
+        return self.decoder.scan(message, own_ns, pose_of(message.header.frame, own_ns), odometry_at(own_ns))
+
+
+def together(first: Scan, further: Sequence[Scan]) -> Scan:
+    """Put scans together: one scan with the points of all, at the stamp of the first.
+
+    Points are moved by odometry from the time of their scan to that of the first. Without odometry their
+    times are kept, and deskewing moves them. Rays begin in the middle of the sensors.
+    """
+    points, offsets = zip(
+        (first.points_m, first.offsets_s), *(_moved(scan, first) for scan in further), strict=True
+    )
+    timed = any(offset is not None for offset in offsets)
+    T_base_sensor = first.T_base_sensor.copy()
+    T_base_sensor[:3, 3] = np.mean([scan.T_base_sensor[:3, 3] for scan in (first, *further)], axis=0)
+    return replace(
+        first,
+        points_m=np.concatenate(points),
+        offsets_s=np.concatenate([*map(_offsets_s, points, offsets)]) if timed else None,
+        T_base_sensor=T_base_sensor,
+        dropped=first.dropped + sum(scan.dropped for scan in further),
+    )
+
+
+def _moved(scan: Scan, first: Scan) -> tuple[F32, F32 | None]:
+    """Return the points (N, 3) of a scan and their times, relative to the pose of the base at the first
+    scan."""
+    if scan.T_odom_base is None or first.T_odom_base is None:
+        apart_s = np.float32((scan.stamp_ns - first.stamp_ns) * 1e-9)
+        return scan.points_m, _offsets_s(scan.points_m, scan.offsets_s) + apart_s
+    T = (invert_pose(first.T_odom_base) @ scan.T_odom_base).astype(np.float32)
+    return scan.points_m @ T[:3, :3].T + T[:3, 3], scan.offsets_s
+
+
+def _offsets_s(points_m: F32, offsets_s: F32 | None) -> F32:
+    return np.zeros(len(points_m), np.float32) if offsets_s is None else offsets_s

@@ -1,7 +1,4 @@
-"""What is on the topics of a log, by their types and names, and which of them hold scans.
-
-The first messages of the topics of a log, by which it is decided what to read.
-"""
+"""The topics of a log by their types and names, which of them hold scans, and their first messages."""
 
 from __future__ import annotations
 
@@ -131,7 +128,7 @@ def usable(topics: Sequence[TopicInfo], wanted: str | None) -> list[TopicInfo]:
 
 
 def may_be_used(topic: TopicInfo, topics: Sequence[TopicInfo], wanted: str | None) -> bool:
-    """Return whether the messages of a topic are of use, as far as one can say before the first message.
+    """Return whether the messages of a topic may be of use, before the first message is known.
 
     wanted : the topic that scans are to be read from; None: any.
     """
@@ -249,7 +246,7 @@ class First(NamedTuple):
 
     @property
     def frame(self) -> str:
-        """The frame in its header."""
+        """Return the frame in its header."""
         return str(self.content.header.frame)
 
 
@@ -296,7 +293,7 @@ def tolerant(decode: Callable[[Any], Any], data: Any, otherwise: Any = None) -> 
 
 
 def delay_ns(first: Sequence[First]) -> int:
-    """Return how long after their stamps messages were recorded, one with another; 0 for messages without
+    """Return the median time from the stamps of messages to their recording; 0 for messages without
     stamps."""
     delays_ns = [m.log_time_ns - (m.content.header.stamp_ns or m.log_time_ns) for m in first]
     return statistics.median_low(delays_ns) if delays_ns else 0

@@ -22,7 +22,8 @@ TrajectoryFormat = Literal["tum", "kitti"]
 
 
 def stamp_ns_from_text(text: str) -> int:
-    """Seconds as decimal text to int64 nanoseconds, exactly (a float would lose the last three digits).
+    """Convert seconds as decimal text to int64 nanoseconds, exactly (a float would lose the last three
+    digits).
 
     Raises ValueError if it is not a finite decimal number that fits.
     """
@@ -39,7 +40,7 @@ def stamp_ns_from_text(text: str) -> int:
 
 
 def stamp_text(stamp_ns: int) -> str:
-    """Nanoseconds to seconds with 9 decimals, exactly."""
+    """Convert nanoseconds to seconds with 9 decimals, exactly."""
     sign = "-" if stamp_ns < 0 else ""
     seconds, rest = divmod(abs(int(stamp_ns)), 1_000_000_000)
     return f"{sign}{seconds}.{rest:09d}"
@@ -118,7 +119,7 @@ def write_trajectory(path: str | Path, trajectory: Trajectory, kind: TrajectoryF
 
 
 def lines_of(path: str | Path) -> list[str]:
-    """The lines of a text file of poses or times.
+    """Return the lines of a text file of poses or times.
 
     Raises TrajectoryFileError if it cannot be read, is larger than 128 MiB, or not text.
     """

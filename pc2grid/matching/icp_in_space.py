@@ -28,6 +28,7 @@ from pc2grid.geometry import (
     invert_pose,
     pose_from_rotation_vector,
     rotation_vector,
+    skew,
     transform_points,
 )
 from pc2grid.model import PointMap
@@ -222,7 +223,7 @@ class SpatialFit:
         """
         away = (self.T_map_query @ T_query_base)[:3, 3] - self.center_m
         motion = np.eye(6)
-        motion[:3, 3:] = -_cross(away)
+        motion[:3, 3:] = -skew(away[None])[0]
         values, axes = np.linalg.eigh(self.information)
         covariance = axes @ np.diag(1.0 / np.maximum(values, 1e-6)) @ axes.T
         moved: F64 = motion @ covariance @ motion.T
@@ -470,9 +471,3 @@ def _directions(away: F64, bin_rad: float) -> tuple[NDArray[np.int64], F64]:
     width = math.ceil(2 * math.pi / bin_rad) + 1
     bins = (elevation / bin_rad).astype(np.int64) * width + (azimuth / bin_rad).astype(np.int64)
     return bins, range_m
-
-
-def _cross(vector: F64) -> F64:
-    """Return the matrix (3, 3) of the cross product with a vector (3,) from the left."""
-    x, y, z = vector
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,9 +1,8 @@
-"""A rosbag2 folder: metadata.yaml and the .mcap or .db3 files that it lists.
+"""ROS 1 bags, rosbag2 .db3 files and rosbag2 folders as message sources, read by `rosbags`.
 
-ROS 1 bags and rosbag2 .db3 files as message sources, read by `rosbags`.
-
-Both formats are without checksums, of which the reader warns. `rosbags` believes what a file says of itself:
-so its reads and decompressions are bounded, and an index or a table that misses messages is refused.
+A folder has a metadata.yaml that lists its .mcap or .db3 files. Bags and .db3 are without checksums, so the
+reader warns. `rosbags` trusts the sizes in a file: so its reads and decompressions are bounded, and an index
+or a table that misses messages is refused.
 """
 
 from __future__ import annotations
@@ -27,6 +26,8 @@ from pc2grid.settings import ReadConfig
 
 METADATA = "metadata.yaml"
 SUFFIXES = (".mcap", ".db3")
+
+
 # Chosen by hand: PyYAML needs half a kilobyte per item, and a recording in 10,000 files has 70,000 items.
 _MAX_YAML_BYTES, _MAX_YAML_ITEMS = 8 << 20, 200_000
 
@@ -62,7 +63,7 @@ def open_folder(folder: Path, open_file: Callable[[Path], MessageSource], *, rec
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files that the metadata lists, by the names that they have when they are not compressed."""
+    """Return the files that the metadata lists, by their uncompressed names."""
     if (folder / METADATA).is_file():
         return [folder / name.removesuffix(".zstd") for name in _listed(folder / METADATA)]
     found = [path for path in folder.iterdir() if path.suffix in SUFFIXES]
@@ -76,7 +77,8 @@ def _files(folder: Path) -> list[Path]:
 
 
 def _listed(metadata: Path) -> list[str]:
-    """Names of the files, without folders: no path leads out of the recording. Raises LogCorrupt."""
+    """Return the names of the files, without folders: no path leads out of the recording. Raises
+    LogCorrupt."""
     with metadata.open("rb") as file:
         content = file.read(_MAX_YAML_BYTES + 1)
     try:
@@ -111,7 +113,7 @@ class SplitSource:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """See MessageSource.messages; parts outside of the time range are not read."""
+        """Yield the messages, see MessageSource.messages; parts outside of the time range are not read."""
         for part in self._parts:
             if start_ns is not None and part.info.end_ns < start_ns:
                 continue
@@ -121,7 +123,7 @@ class SplitSource:
 
 
 def _info(path: Path, infos: Sequence[LogInfo], tally: Tally) -> LogInfo:
-    """The facts about the whole recording, by those about its parts."""
+    """Return the facts about the whole recording, from those about its parts."""
     spans = [info for info in infos if info.message_count != 0]
     topics = _merged([t for info in infos for t in info.topics])
     return LogInfo(
@@ -137,7 +139,7 @@ def _info(path: Path, infos: Sequence[LogInfo], tally: Tally) -> LogInfo:
 
 
 def _merged(topics: Iterable[TopicInfo]) -> list[TopicInfo]:
-    """The topics of the whole recording, with all messages counted."""
+    """Return the topics of the whole recording, with all messages counted."""
     groups: dict[TopicInfo, list[TopicInfo]] = {}
     for topic in topics:
         groups.setdefault(topic, []).append(topic)
@@ -151,7 +153,7 @@ def _merged(topics: Iterable[TopicInfo]) -> list[TopicInfo]:
 
 
 def _total(counts: Iterable[int | None]) -> int | None:
-    """The sum; None if one is unknown."""
+    """Return the sum; None if one is unknown."""
     known = list(counts)
     return None if None in known else sum(count for count in known if count is not None)
 
@@ -186,7 +188,7 @@ class RosbagsFile:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """See MessageSource.messages; exactly by log time."""
+        """Yield the messages, see MessageSource.messages; exactly by log time."""
         if not self._whole:
             guarded(self._path, self._check_pages, self._hint)
         wanted = [c for c in self._reader.connections if self._topic_of[c.id].topic in topics]
@@ -205,7 +207,7 @@ class RosbagsFile:
             yield RawMessage(self._topic_of[connection.id], time_ns, plain)
 
     def _topics(self) -> dict[int, TopicInfo]:
-        """The topic of each connection; a topic of ROS 1 has one for each publisher."""
+        """Return the topic of each connection; a topic of ROS 1 has one for each publisher."""
         groups: dict[tuple[str, str], list[Any]] = {}
         for connection in self._reader.connections:
             groups.setdefault((connection.topic, connection.msgtype), []).append(connection)
@@ -247,7 +249,7 @@ class RosbagsFile:
 
 
 def _bag(path: Path, config: ReadConfig) -> Any:
-    """A reader of a ROS 1 bag, open. Raises LogTruncated for one without an index, LogCorrupt."""
+    """Open a reader of a ROS 1 bag. Raises LogTruncated for one without an index, LogCorrupt."""
     from rosbags.rosbag1 import Reader, ReaderError
     from rosbags.rosbag1.reader import decompressors
 
@@ -280,7 +282,7 @@ class _BoundedPath(type(Path())):  # type: ignore[misc]
 
 
 def _db3(path: Path) -> Any:
-    """A reader of a .db3, open. Raises LogTruncated if its recorder was killed, LogCorrupt, NotALog."""
+    """Open a reader of a .db3. Raises LogTruncated if its recorder was killed, LogCorrupt, NotALog."""
     from rosbags.rosbag2 import ReaderError
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 

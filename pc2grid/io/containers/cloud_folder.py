@@ -58,12 +58,12 @@ class CloudFolder:
         )
 
     def close(self) -> None:
-        """Nothing stays open."""
+        """Do nothing: no file stays open."""
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """See MessageSource.messages; each file is read when its message is due."""
+        """Yield the messages, see MessageSource.messages; each file is read when its message is due."""
         clouds, poses = self.info.topics[0], self.info.topics[-1]
         entries: list[tuple[int, int, Any]] = []  # poses come before the clouds of their stamps
         if POSES in topics and self._poses is not None:
@@ -97,7 +97,7 @@ class CloudFolder:
 
 
 def _clouds_of(folder: Path, tally: Tally) -> list[Path]:
-    """The clouds of the most frequent kind, in the order of the numbers in their names."""
+    """Return the clouds of the most frequent kind, in the order of the numbers in their names."""
     found = [path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES and path.is_file()]
     counts = Counter(path.suffix.lower() for path in found)
     kind = min(counts, key=lambda suffix: (-counts[suffix], suffix))
@@ -108,7 +108,7 @@ def _clouds_of(folder: Path, tally: Tally) -> list[Path]:
 
 
 def _tum_of(folder: Path) -> Path | None:
-    """The file of poses in a folder or beside it; None if there is none."""
+    """Return the file of poses in a folder or beside it; None if there is none."""
     beside = folder.with_name(folder.name + ".tum")
     found = sorted(folder.glob("*.tum")) or [beside]
     if len(found) > 1:
@@ -117,14 +117,14 @@ def _tum_of(folder: Path) -> Path | None:
 
 
 def _times_of(folder: Path) -> Path | None:
-    """The file of times in a folder; KITTI keeps it beside the folder velodyne/ of the clouds."""
+    """Return the file of times in a folder; KITTI keeps it beside the folder velodyne/ of the clouds."""
     places = [folder, folder.parent] if folder.name in ("velodyne", "velodyne_points") else [folder]
     files = [place / name for place in places for name in ("times.txt", "timestamps.txt")]
     return next((path for path in files if path.is_file()), None)
 
 
 def _stamps_of(clouds: list[Path], times: Path | None, poses: Trajectory | None, tally: Tally) -> list[int]:
-    """A stamp (ns) for each cloud. Raises TrajectoryFileError if a file does not fit the clouds."""
+    """Return a stamp (ns) for each cloud. Raises TrajectoryFileError if a file does not fit the clouds."""
     count, folder = len(clouds), clouds[0].parent
     stamps = _from_names(clouds) if times is None else _listed(times, count)
     if stamps is None and poses is not None:
@@ -142,7 +142,7 @@ def _stamps_of(clouds: list[Path], times: Path | None, poses: Trajectory | None,
 
 
 def _listed(path: Path, count: int) -> list[int]:
-    """The stamps that a file of times lists."""
+    """Return the stamps in a file of times."""
     try:
         stamps = [stamp_ns_from_text(word) for line in lines_of(path) for word in line.split()]
     except (ValueError, ArithmeticError) as error:
@@ -155,12 +155,13 @@ def _listed(path: Path, count: int) -> list[int]:
 
 
 def natural(name: str) -> list[tuple[int, str]]:
-    """A sort key by which `scan_10` comes after `scan_9`."""
+    """Return a sort key by which `scan_10` comes after `scan_9`."""
     return [(int(part), "") if part.isdecimal() else (0, part) for part in re.split(r"(\d+)", name)]
 
 
 def _from_names(clouds: list[Path]) -> list[int] | None:
-    """Stamps from names such as 1305031102.175304.pcd (s) or 1305031102175304000.pcd (ns, us); else None."""
+    """Return stamps from names such as 1305031102.175304.pcd (s) or 1305031102175304000.pcd (ns, us); else
+    None."""
     stamps = []
     for path in clouds:
         if not (kind := re.fullmatch(r"(\d{9,10}\.\d+)|(\d{18,19})|\d{15,16}", path.stem)):

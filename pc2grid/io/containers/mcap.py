@@ -1,18 +1,14 @@
 """MCAP files as a message source, read by `mcap` with checksums compared.
 
-By the index in its summary, a part of a long log costs what that part costs. A file whose recorder was
-killed, or whose summary is damaged, is read once up to its end or its first damage, and indexed meanwhile.
-Messages that rosbag2 compressed one by one are decompressed.
-
-What is where in an MCAP: as its summary says, or by reading it up to its end or its first damage.
+With the index in the summary, a part of a long log costs what that part costs (`read_summary`). A file whose
+recorder was killed, or whose summary is damaged, is read once up to its end or its first damage, and indexed
+meanwhile (`Survey`). Messages that rosbag2 compressed one by one are decompressed.
 
 `mcap` parses the records. It takes whatever memory a chunk claims, does not compare the checksum of the
-summary, and raises many unrelated errors for damage; that is done here.
-
-Bounds on what a file claims of itself: reads and decompressions stop at a limit.
-
-The readers of `mcap` and `rosbags` read as many bytes as a record says it has, and Python sets the memory
-aside before it reads: a damaged length of 4 GB costs 4 GB. `mcap` takes fewer bytes than it asked for.
+summary, and raises many unrelated errors for damage; that is done here. The readers of `mcap` and `rosbags`
+read as many bytes as a record claims, and Python reserves the memory before it reads: a damaged length of 4
+GB costs 4 GB, and `mcap` accepts fewer bytes than it asked for. So `BoundedFile` and `expand` stop at a
+limit.
 """
 
 from __future__ import annotations
@@ -49,7 +45,8 @@ class McapSource:
     """One MCAP file, open.
 
     Raises LogTruncated, LogCorrupt, LimitExceeded or UnsupportedSchema when it is opened or read. With
-    `recover`, damaged chunks are left out and counted in `tally`; without an index, all behind the damage is.
+    `recover`, damaged chunks are left out and counted in `tally`; without an index, everything behind the
+    damage is left out.
     """
 
     def __init__(self, path: Path, config: ReadConfig, *, recover: bool = False) -> None:
@@ -74,7 +71,7 @@ class McapSource:
     # --- opening --------------------------------------------------------------------------------------
 
     def _indexed(self, recover: bool) -> McapIndex | None:
-        """The index in the summary; None if there is none, it is damaged, or it lists no chunks."""
+        """Return the index in the summary; None if there is none, it is damaged, or it lists no chunks."""
         try:
             index = read_summary(self._stream)
         except MemoryError:
@@ -95,7 +92,7 @@ class McapSource:
         return index if index.chunks or is_empty else None
 
     def _surveyed(self, recover: bool) -> McapIndex:
-        """An index made by reading the file. Raises LogError for damage, unless `recover`."""
+        """Make an index by reading the file. Raises LogError for damage, unless `recover`."""
         found = Survey(self._stream, self._config.max_chunk_bytes)
         size = self._path.stat().st_size
         if found.damage is not None:
@@ -115,7 +112,7 @@ class McapSource:
         return found.index
 
     def _topics(self) -> dict[int, TopicInfo]:
-        """The topic of each channel; one that several programs publish may have several channels."""
+        """Return the topic of each channel; one that several programs publish may have several channels."""
         index = self._index
         of_channel = {key: index.topic(channel) for key, channel in index.channels.items()}
         groups: dict[tuple[str, str, str], list[int]] = {}
@@ -147,7 +144,7 @@ class McapSource:
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None
     ) -> Iterator[RawMessage]:
-        """See MessageSource.messages."""
+        """Yield the messages, see MessageSource.messages."""
         wanted = {key for key, topic in self._topic_of.items() if topic.topic in topics}
         low_ns, high_ns = start_ns or 0, _LAST_NS if end_ns is None else end_ns
 
@@ -167,7 +164,7 @@ class McapSource:
         yield from pending
 
     def _load(self, listed: ChunkIndex, index: McapIndex) -> list[Message]:
-        """The messages of a chunk that the index lists. Raises LogError if it is damaged."""
+        """Return the messages of a chunk that the index lists. Raises LogError if it is damaged."""
         try:
             records = self._records(listed)
             messages = [record for record in records if isinstance(record, Message)]
@@ -180,7 +177,7 @@ class McapSource:
         return messages
 
     def _records(self, listed: ChunkIndex) -> list[McapRecord]:
-        """The records of a chunk, or of a run of messages."""
+        """Return the records of a chunk, or of a run of messages."""
         self._stream.seek(listed.chunk_start_offset)
         end, reader = listed.chunk_start_offset + listed.chunk_length, records_of(self._stream)
         records = [next(reader)]
@@ -200,7 +197,7 @@ class McapSource:
 
 
 def _wanted(chunks: list[ChunkIndex], channels: set[int], low_ns: int, high_ns: int) -> list[ChunkIndex]:
-    """The chunks that may hold messages of these channels and times, by their first times."""
+    """Return the chunks that may hold messages of these channels and times, by their first times."""
     found = [
         chunk
         for chunk in chunks
@@ -212,7 +209,9 @@ def _wanted(chunks: list[ChunkIndex], channels: set[int], low_ns: int, high_ns: 
     return sorted(found, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
 
 
-_MAGIC = b"\x89MCAP0\r\n"
+# The index of a file.
+
+MAGIC = b"\x89MCAP0\r\n"
 _FOOTER = struct.Struct("<9xQQI8s")  # offsets of the summary and of its parts, checksum, magic
 _RECORD = struct.Struct("<BQ")  # kind, length
 _CHUNK_BYTES = 49  # of a chunk's record, without the name of the compression and the data
@@ -227,10 +226,10 @@ class Run(ChunkIndex):
 
 @dataclass(slots=True)
 class McapIndex:
-    """What is where in an MCAP file.
+    """The position of everything in an MCAP file.
 
     chunks : and runs of messages outside of them. counts : of messages, by channel; complete if `counted`.
-    start_ns, end_ns : first and last log time. checked : whether there is a checksum on it.
+    start_ns, end_ns : first and last log time. checked : True if it has a checksum.
     """
 
     schemas: dict[int, Schema] = field(default_factory=dict)
@@ -243,7 +242,7 @@ class McapIndex:
     checked: bool = True
 
     def topic(self, channel: Channel) -> TopicInfo:
-        """The topic of a channel."""
+        """Return the topic of a channel."""
         schema = self.schemas.get(channel.schema_id)
         return TopicInfo(
             topic=channel.topic,
@@ -254,71 +253,9 @@ class McapIndex:
         )
 
 
-def records_of(stream: BoundedFile, *, whole_file: bool = False) -> Iterator[McapRecord]:
-    """The records of a stream, chunks as they are stored; `stream` bounds what is read at once.
-
-    whole_file : from the start of the file, the checksum of its data compared; else from where it stands.
-    """
-    reader = StreamReader(
-        stream,
-        skip_magic=not whole_file,
-        emit_chunks=True,
-        validate_crcs=whole_file,
-        record_size_limit=None,
-    )
-    return reader.records
-
-
-def open_chunk(chunk: Chunk, most_bytes: int) -> list[McapRecord]:
-    """The schemas, channels and messages in a chunk.
-
-    Raises LimitExceeded for one that would expand to more than `most_bytes`, UnsupportedSchema for a
-    compression that pc2grid does not read, and other errors for damage.
-    """
-    if chunk.uncompressed_size > most_bytes:
-        raise LimitExceeded(
-            f"a chunk would expand to {chunk.uncompressed_size} bytes; the limit is {most_bytes}",
-            hint="--set read.max_chunk_bytes=N raises it",
-        )
-    if chunk.compression not in ("", "zstd", "lz4"):
-        raise UnsupportedSchema(
-            f"a chunk is compressed with {chunk.compression!r:.40}",
-            hint="pc2grid reads zstd, lz4 and uncompressed chunks; `mcap convert` can change it",
-        )
-    # One byte more than declared, so that a longer content is noticed.
-    content = expand(chunk.compression or "none", chunk.data, chunk.uncompressed_size + 1)
-    if len(content) != chunk.uncompressed_size:
-        raise LogCorrupt(f"a chunk does not hold {chunk.uncompressed_size} bytes, as it says")
-    return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
-
-
-def named(error: Exception, where: str, behind: str = "") -> LogError:
-    """The error to show for one that was raised while a place was read."""
-    if isinstance(error, CRCValidationError):
-        what = "the checksum (CRC) is wrong"
-    elif isinstance(error, LogError):
-        what = error.message
-    else:
-        what = f"damaged ({type(error).__name__}: {' '.join(str(error).split())[:120]})"
-    kind = type(error) if isinstance(error, LogError) else LogCorrupt
-    return kind(f"{where}: {what}{behind}", hint=getattr(error, "hint", None) or RECOVER_HINT)
-
-
-def _has_checksum(stream: BoundedFile) -> bool:
-    """Whether the summary has a checksum. Raises LogError if it is wrong, or there is no summary."""
-    size = stream.seek(0, io.SEEK_END)
-    stream.seek(max(size - _FOOTER.size, 0))
-    start, _, crc, magic = _FOOTER.unpack(stream.read(_FOOTER.size))
-    if magic != _MAGIC:
-        raise LogTruncated("the recording was not finished")
-    stream.seek(start)
-    if start and crc and zlib.crc32(stream.read(size - start - len(_MAGIC) - 4)) != crc:
-        raise LogCorrupt("its checksum (CRC) is wrong")
-    return bool(crc)
-
-
 def read_summary(stream: BoundedFile) -> McapIndex:
-    """The index in the summary at the end of a file. Raises LogError if there is none, or it is damaged."""
+    """Read the index in the summary at the end of a file. Raises LogError if there is none, or it is
+    damaged."""
     checked = _has_checksum(stream)
     stream.seek(0)
     summary = SeekingReader(stream, record_size_limit=None).get_summary()
@@ -344,10 +281,23 @@ def read_summary(stream: BoundedFile) -> McapIndex:
     )
 
 
+def _has_checksum(stream: BoundedFile) -> bool:
+    """Return True if the summary has a checksum. Raises LogError if it is wrong, or there is no summary."""
+    size = stream.seek(0, io.SEEK_END)
+    stream.seek(max(size - _FOOTER.size, 0))
+    start, _, crc, magic = _FOOTER.unpack(stream.read(_FOOTER.size))
+    if magic != MAGIC:
+        raise LogTruncated("the recording was not finished")
+    stream.seek(start)
+    if start and crc and zlib.crc32(stream.read(size - start - len(MAGIC) - 4)) != crc:
+        raise LogCorrupt("its checksum (CRC) is wrong")
+    return bool(crc)
+
+
 def _has_messages_outside(stream: BoundedFile, chunks: list[ChunkIndex]) -> bool:
-    """Whether messages stand between the chunks, as far as the records there can be told apart."""
+    """Return True if messages stand between the chunks, as far as the records there can be parsed."""
     listed = {c.chunk_start_offset: c.chunk_length + c.message_index_length for c in chunks}
-    at, kind = len(_MAGIC), 0
+    at, kind = len(MAGIC), 0
     while kind not in (Opcode.MESSAGE, Opcode.DATA_END):
         length = listed.pop(at, 0)
         if not length:
@@ -364,8 +314,8 @@ def _has_messages_outside(stream: BoundedFile, chunks: list[ChunkIndex]) -> bool
 class Survey:
     """The index of a file, made by reading it up to its end or its first damage.
 
-    damage : what ended the reading, or None. at : the offset up to which the file is whole. closed : whether
-    the recorder wrote the end of the data. missing : how many of the messages that it counted are not there:
+    damage : the error that ended the reading, or None. at : the offset up to which the file is whole. closed
+    : True if the recorder wrote the end of the data. missing : number of counted messages that are not there:
     chunks that were cut out completely leave no other trace.
     """
 
@@ -400,7 +350,7 @@ class Survey:
                 self.missing = record.message_count - sum(self.index.counts.values())
 
     def _take(self, record: McapRecord, end: int) -> None:
-        """Take up a record that ends at an offset; raises whatever is wrong with it."""
+        """Add a record that ends at an offset; raises any damage of it."""
         if not isinstance(record, Chunk):
             self._take_content(record)
             if isinstance(record, Message):
@@ -413,7 +363,7 @@ class Survey:
         self.index.chunks.append(_indexed(record, end, there))
 
     def _list(self, run: Run) -> None:
-        """Add a run of messages to the index, to the one before if it goes on there."""
+        """Add a run of messages to the index, or to the run before if it continues that."""
         last = self.index.chunks[-1] if self.index.chunks else run
         goes_on = last.chunk_start_offset + last.chunk_length == run.chunk_start_offset
         if not isinstance(last, Run) or not goes_on or last.chunk_length > _RUN_BYTES:
@@ -439,7 +389,7 @@ class Survey:
 
 
 def _indexed(chunk: Chunk, end: int, channels: set[int]) -> ChunkIndex:
-    """The place of a chunk that ends at an offset, and what is in it."""
+    """Return the place of a chunk that ends at an offset, and its content."""
     size = _CHUNK_BYTES + len(chunk.compression.encode()) + len(chunk.data)
     return ChunkIndex(
         chunk_length=size,
@@ -455,7 +405,7 @@ def _indexed(chunk: Chunk, end: int, channels: set[int]) -> ChunkIndex:
 
 
 def _as_run(message: Message, end: int) -> Run:
-    """The place of a message outside of chunks that ends at an offset."""
+    """Return the place of a message outside of chunks that ends at an offset."""
     size = _MESSAGE_BYTES + len(message.data)
     return Run(
         chunk_length=size,
@@ -469,6 +419,62 @@ def _as_run(message: Message, end: int) -> Run:
         uncompressed_size=size,
     )
 
+
+# Records and chunks.
+
+
+def records_of(stream: BoundedFile, *, whole_file: bool = False) -> Iterator[McapRecord]:
+    """Return the records of a stream, chunks as they are stored; `stream` bounds a single read.
+
+    whole_file : from the start of the file, with the checksum of its data compared; else from the present
+    position.
+    """
+    reader = StreamReader(
+        stream,
+        skip_magic=not whole_file,
+        emit_chunks=True,
+        validate_crcs=whole_file,
+        record_size_limit=None,
+    )
+    return reader.records
+
+
+def open_chunk(chunk: Chunk, most_bytes: int) -> list[McapRecord]:
+    """Return the schemas, channels and messages in a chunk.
+
+    Raises LimitExceeded for one that would expand to more than `most_bytes`, UnsupportedSchema for a
+    compression that pc2grid does not read, and other errors for damage.
+    """
+    if chunk.uncompressed_size > most_bytes:
+        raise LimitExceeded(
+            f"a chunk would expand to {chunk.uncompressed_size} bytes; the limit is {most_bytes}",
+            hint="--set read.max_chunk_bytes=N raises it",
+        )
+    if chunk.compression not in ("", "zstd", "lz4"):
+        raise UnsupportedSchema(
+            f"a chunk is compressed with {chunk.compression!r:.40}",
+            hint="pc2grid reads zstd, lz4 and uncompressed chunks; `mcap convert` can change it",
+        )
+    # One byte more than declared, so that a longer content is noticed.
+    content = expand(chunk.compression or "none", chunk.data, chunk.uncompressed_size + 1)
+    if len(content) != chunk.uncompressed_size:
+        raise LogCorrupt(f"a chunk does not hold {chunk.uncompressed_size} bytes, as it says")
+    return breakup_chunk(replace(chunk, compression="", data=content), validate_crc=True)
+
+
+def named(error: Exception, where: str, behind: str = "") -> LogError:
+    """Return the error to show for one that was raised while a place was read."""
+    if isinstance(error, CRCValidationError):
+        what = "the checksum (CRC) is wrong"
+    elif isinstance(error, LogError):
+        what = error.message
+    else:
+        what = f"damaged ({type(error).__name__}: {' '.join(str(error).split())[:120]})"
+    kind = type(error) if isinstance(error, LogError) else LogCorrupt
+    return kind(f"{where}: {what}{behind}", hint=getattr(error, "hint", None) or RECOVER_HINT)
+
+
+# Bounded reading and decompression.
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
@@ -485,10 +491,10 @@ class BoundedFile(io.BufferedReader):
         self._size = os.fstat(raw.fileno()).st_size
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """See io.BufferedReader.
+        """Read bytes, see io.BufferedReader.
 
         Raises LogTruncated if fewer bytes are left, LogCorrupt if `size` is negative (a length was smaller
-        than what it counts), LimitExceeded if it is above the limit.
+        than the fields it counts), LimitExceeded if it is above the limit.
         """
         if size is None or size < 0:
             raise LogCorrupt(f"a length of {size} bytes where a record should begin")
@@ -503,7 +509,8 @@ class BoundedFile(io.BufferedReader):
 
 
 def plain_message(data: bytes | memoryview, limit: int) -> bytes | memoryview:
-    """A message; decompressed if rosbag2 compressed it by itself. No encoding of messages begins like zstd.
+    """Return a message, decompressed if rosbag2 compressed it by itself. No encoding of messages begins like
+    zstd.
 
     Raises as `unpacked` does.
     """
@@ -511,7 +518,7 @@ def plain_message(data: bytes | memoryview, limit: int) -> bytes | memoryview:
 
 
 def unpacked(compression: str, limit: int, data: bytes) -> bytes:
-    """Decompressed data. Raises LimitExceeded above `limit` bytes, LogCorrupt for damage."""
+    """Decompress data. Raises LimitExceeded above `limit` bytes, LogCorrupt for damage."""
     try:
         found = expand(compression, data, limit + 1)
     except ValueError as error:
@@ -525,7 +532,7 @@ def unpacked(compression: str, limit: int, data: bytes) -> bytes:
 
 
 def expand(compression: str, data: bytes | memoryview, most: int) -> bytes:
-    """The first `most` bytes (> 0) of the decompressed data; `compression` is bz2, lz4, zstd or none.
+    """Return the first `most` bytes (> 0) of the decompressed data; `compression` is bz2, lz4, zstd or none.
 
     Raises ValueError for damage.
     """

@@ -1,4 +1,4 @@
-"""What every feed is: topics, the subscriptions to those that are wanted, and the queue of their messages."""
+"""The base class of feeds: topics, subscriptions to those that are wanted, and a queue of their messages."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Arrived(NamedTuple):
 
 @dataclass(slots=True)
 class FeedCounts:
-    """What happened to the messages of a feed so far.
+    """The counts of the messages of a feed so far.
 
-    arrived : messages. dropped : scans that waited too long because the computer is too slow, and were left
-    out. reconnected : how often a lost connection was made again.
+    arrived : messages. dropped : scans that waited too long because the computer is too slow. reconnected :
+    number of times that a lost connection was made again.
     """
 
     arrived: int = 0
@@ -56,7 +56,7 @@ INBOX = InboxParameters()
 class Inbox:
     """A queue that drops scans rather than letting them wait. One thread fills it, another one empties it.
 
-    Transforms and odometry are small and rest on each other, so they are kept.
+    Transforms and odometry are small and depend on each other, so they are kept.
     """
 
     def __init__(
@@ -73,7 +73,8 @@ class Inbox:
         self._patient_until_s = math.inf  # before that, scans are not dropped for their lag
 
     def prepared(self) -> None:
-        """The preparations are over: once what waits now is used up, scans that wait too long are dropped."""
+        """End the preparations: once the messages that wait now are used up, scans that wait too long are
+        dropped."""
         with self._changed:
             self._patient_until_s = self._clock() + self._parameters.catch_up_s
 
@@ -108,7 +109,7 @@ class Inbox:
         self._counts.dropped += 1
 
     def get(self, timeout_s: float) -> Arrived | None:
-        """The oldest message; None if there is none within `timeout_s` seconds."""
+        """Return the oldest message; None if there is none within `timeout_s` seconds."""
         end_s = self._clock() + timeout_s
         with self._changed:
             while not self._entries:
@@ -120,7 +121,7 @@ class Inbox:
             return self._take(next(iter(self._entries)))
 
     def wake(self) -> None:
-        """Let `get` return: nothing more will come."""
+        """Wake up `get`: nothing more will come."""
         with self._changed:
             self._changed.notify_all()
 
@@ -142,18 +143,18 @@ class News:
             self._waiting.append(sentence)
 
     def take(self) -> list[str]:
-        """The sentences since the last call."""
+        """Return the sentences since the last call."""
         taken, self._waiting = self._waiting, []
         return taken
 
 
 class Feed:
-    """Where messages arrive from.
+    """A source of messages that arrive while they are used.
 
     A kind of connection derives from it. It calls `_offer` for each topic, `_refresh` when topics came or
     went, and puts messages into `_inbox`, also from other threads.
 
-    name : for the user. counts, news : of what happened. connected : whether messages can arrive now.
+    name : for the user. counts, news : for reports. connected : True if messages can arrive now.
     """
 
     def __init__(self, name: str, config: ReadConfig, inbox: InboxParameters = INBOX) -> None:
@@ -171,24 +172,23 @@ class Feed:
 
     @property
     def ended(self) -> bool:
-        """Whether no message will arrive any more, and those that have arrived are received."""
+        """Return whether the feed is over and all of its messages are received."""
         return self._over and not len(self._inbox)
 
     def topics(self) -> tuple[TopicInfo, ...]:
-        """The topics that are known so far; their message_count is None."""
+        """Return the topics that are known so far; their message_count is None."""
         with self._lock:
             return tuple(self._topics.values())
 
     def want(self, topics: Collection[str]) -> None:
-        """From now on, only messages of these topics are asked for, and scans that wait too long are
-        dropped."""
+        """Subscribe to these topics only, and drop scans that wait too long from now on."""
         with self._lock:
             self._wanted = frozenset(topics)
         self._inbox.prepared()
         self._refresh()
 
     def receive(self, timeout_s: float) -> Arrived | None:
-        """The next message; None if none arrives within `timeout_s` seconds.
+        """Return the next message; None if none arrives within `timeout_s` seconds.
 
         Raises LogError if the feed is damaged or cannot be read any more.
         """
@@ -202,12 +202,13 @@ class Feed:
     # --- for the kinds of connections -----------------------------------------------------------------
 
     def _offer(self, key: Hashable, topic: TopicInfo) -> None:
-        """A topic can be subscribed to, by a key of the connection's own; it stays as it was known first."""
+        """Add a topic that can be subscribed to, by a key of the connection's own; its first description
+        stays."""
         with self._lock:
             self._offered[key] = self._topics.setdefault((topic.topic, topic.type), topic)
 
     def _withdraw(self, keys: Collection[Hashable] | None = None) -> None:
-        """These topics cannot be subscribed to any more; None: all, as the connection is lost."""
+        """Remove topics that cannot be subscribed to any more; None: all, as the connection is lost."""
         with self._lock:
             for key in list(self._offered) if keys is None else keys:
                 self._offered.pop(key, None)
@@ -233,14 +234,14 @@ class Feed:
         return topics.may_be_used(topic, there, self._scans_topic)
 
     def _subscribe(self, new: Mapping[Hashable, TopicInfo]) -> Mapping[Hashable, Any]:
-        """Ask for the messages of topics; what is returned for each is given to `_unsubscribe`."""
+        """Subscribe to topics; the value that is returned for each is given to `_unsubscribe`."""
         return new
 
     def _unsubscribe(self, old: Mapping[Hashable, Any]) -> None:
-        """Ask for them no longer."""
+        """Cancel subscriptions."""
 
     def _set_connected(self, connected: bool) -> None:
-        """Take note of whether there is a connection, and say so when it is lost."""
+        """Set the state of the connection, and tell the user when it is lost."""
         if self.connected and not connected and not self._over:
             self.news.tell(f"{self.name}: the connection is lost; trying again", again=True)
         elif connected and not self.connected:

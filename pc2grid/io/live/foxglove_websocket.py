@@ -1,7 +1,7 @@
 """A robot with foxglove_bridge, through its websocket: https://github.com/foxglove/ws-protocol.
 
-The bridge hands out the definition of each type, replays topics that are published once to whoever subscribes
-late, and publishes what it is sent, with any middleware (RMW) of the robot.
+The bridge sends the definition of each type, replays topics that are published once to late subscribers, and
+publishes messages of its clients, with any middleware (RMW) of the robot.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class _Link:
         take: Callable[[str | bytes], None],
         changed: Callable[[bool], None],
     ) -> None:
-        """Raises LiveError if the first connection fails."""
+        """Connect. Raises LiveError if the first connection fails."""
         self._url, self._parameters, self._take, self._changed = url, parameters, take, changed
         self._closing = threading.Event()
         self._connection: ClientConnection | None = self._connect_first()
@@ -168,7 +168,7 @@ class _Advertised:
     last: bytes | None
 
     def document(self, topic: str) -> dict[str, Any]:
-        """The channel as the protocol describes it."""
+        """Return the channel as the protocol describes it."""
         return {
             "id": self.number,
             "topic": topic,
@@ -192,7 +192,7 @@ class FoxgloveWebsocket(Feed):
         parameters: ConnectionParameters = CONNECTION,
         inbox: InboxParameters = INBOX,
     ) -> None:
-        """Raises LiveError if the first connection fails."""
+        """Connect. Raises LiveError if the first connection fails."""
         super().__init__(url, config, inbox)
         self._introduced_s = parameters.open_s
         self._advertised: dict[str, _Advertised] = {}
@@ -219,7 +219,7 @@ class FoxgloveWebsocket(Feed):
     # --- Publisher ------------------------------------------------------------------------------------
 
     def advertise(self, topic: str, type_name: str, definition: str, *, keep_last: bool) -> None:
-        """Announce a topic that `publish` will be called for.
+        """Announce a topic before `publish` is called for it.
 
         type_name : such as `nav_msgs/msg/OccupancyGrid`. definition : of the type, in the .msg language.
         keep_last : send the last message again after each new connection.
@@ -302,7 +302,7 @@ class FoxgloveWebsocket(Feed):
 
 
 def _topic_of(channel: dict[str, Any]) -> TopicInfo:
-    """The topic of a channel; the definition of a type of protobuf is sent in base64."""
+    """Return the topic of a channel; the definition of a type of protobuf is sent in base64."""
     encoding, text = str(channel["encoding"]), str(channel.get("schema", ""))
     plain = "ros2msg" if encoding == "cdr" else encoding
     return TopicInfo(

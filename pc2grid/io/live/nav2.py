@@ -1,4 +1,4 @@
-"""What nav2 takes from a localization: /initialpose, the transform map -> odom, /map."""
+"""Publishing to nav2 in the place of its localization: /initialpose, the transform map -> odom, /map."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from pc2grid.geometry import F64, SE2
-from pc2grid.io import export as ros
+from pc2grid.io import export
 from pc2grid.model import OccupancyGrid
 
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
@@ -18,10 +18,10 @@ MAP = "nav_msgs/msg/OccupancyGrid"
 
 @dataclass(frozen=True, slots=True)
 class BroadcastParameters:
-    """How map -> odom is published: as often as AMCL is asked for poses, and as far ahead.
+    """How map -> odom is published: at the rate and with the lead of AMCL.
 
-    period_s : between two messages. ahead_s : by which the stamp lies in the future, so that a transform is
-    there for poses that are asked for before the next message (`transform_tolerance` of AMCL).
+    period_s : between two messages. ahead_s : by which the stamp lies in the future, so that a transform
+    exists for poses before the next message (`transform_tolerance` of AMCL).
     """
 
     period_s: float = 0.05
@@ -47,9 +47,9 @@ class Outlet(Protocol):
 
 
 class Nav2Publisher:
-    """Tells nav2 where the robot is. Use as a context manager: leaving it ends the broadcast.
+    """Publishes the place of the robot to nav2. Use as a context manager: leaving it ends the broadcast.
 
-    outlet : where messages go. map_frame : the frame of nav2's map.
+    outlet : target of the messages. map_frame : the frame of nav2's map.
     """
 
     def __init__(
@@ -73,18 +73,18 @@ class Nav2Publisher:
             if topic not in self._advertised:
                 self._advertised.add(topic)
                 kind = kinds[topic]
-                self._outlet.advertise(topic, kind, ros.definition(kind), keep_last=topic == "/map")
+                self._outlet.advertise(topic, kind, export.definition(kind), keep_last=topic == "/map")
 
     def initialpose(self, stamp_ns: int, T_map_base: SE2, covariance: F64) -> None:
         """Publish the pose of the base once, as AMCL and slam_toolbox take it; covariance (3, 3)."""
         self.announce("/initialpose")
-        message = ros.initialpose(stamp_ns, T_map_base, covariance, self._frame)
-        self._outlet.publish("/initialpose", ros.serialized(message))
+        message = export.initialpose(stamp_ns, T_map_base, covariance, self._frame)
+        self._outlet.publish("/initialpose", export.serialized(message))
 
     def map(self, stamp_ns: int, grid: OccupancyGrid) -> None:
         """Publish the map, also for those who subscribe later."""
         self.announce("/map")
-        self._outlet.publish("/map", ros.serialized(ros.occupancy_grid(stamp_ns, grid, self._frame)))
+        self._outlet.publish("/map", export.serialized(export.occupancy_grid(stamp_ns, grid, self._frame)))
 
     def start_tf(self, odom_frame: str, T_map_odom: SE2, now_ns: Callable[[], int]) -> None:
         """Publish map -> odom from now on, in place of what was published before.
@@ -99,8 +99,8 @@ class Nav2Publisher:
         def broadcast() -> None:
             ahead_ns = round(self._parameters.ahead_s * 1e9)
             while True:
-                edges = ros.transforms(now_ns() + ahead_ns, [(self._frame, odom_frame, T)])
-                self._outlet.publish("/tf", ros.serialized(edges))
+                edges = export.transforms(now_ns() + ahead_ns, [(self._frame, odom_frame, T)])
+                self._outlet.publish("/tf", export.serialized(edges))
                 if stop.wait(self._parameters.period_s):
                     return
 
@@ -108,7 +108,7 @@ class Nav2Publisher:
         self._thread.start()
 
     def stop_tf(self) -> None:
-        """Publish map -> odom no longer: the robot's place is not known."""
+        """Stop publishing map -> odom: the robot's place is not known."""
         if self._stop is not None and self._thread is not None:
             self._stop.set()
             self._thread.join()

@@ -1,12 +1,9 @@
-"""The messages that a folder of clouds is read as, so that it can pass for a recording.
+"""Files of clouds and poses as messages, so that a folder of clouds is read like a recording.
 
 A cloud is its stamp (int64, nanoseconds) and the bytes of its file; a pose is its stamp, the position (m) and
-the quaternion (x, y, z, w), as float64.
-
-One cloud from the bytes of a PCD, PLY or KITTI .bin file, as a PointCloud2.
-
-Only the header is interpreted here. The points stay the bytes of the file; `pointcloud2` finds coordinates
-and times in them, as in every other cloud.
+the quaternion (x, y, z, w), as float64. The bytes of a PCD, PLY or KITTI .bin file become a PointCloud2. Only
+the header is interpreted here. The points stay the bytes of the file; `pc2grid.io.sensors.pointcloud2` finds
+coordinates and times in them, as in every other cloud.
 
 PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, version 0.7.
 PLY: https://paulbourke.net/dataformats/ply.
@@ -43,17 +40,17 @@ _POSE = struct.Struct("<q7d")
 
 
 def pack_cloud(stamp_ns: int, content: bytes) -> bytes:
-    """The message of a cloud; `content` is its file."""
+    """Pack the message of a cloud; `content` is its file."""
     return _STAMP.pack(stamp_ns) + content
 
 
 def pack_pose(stamp_ns: int, T_odom_sensor: F64) -> bytes:
-    """The message of a pose, (4, 4)."""
+    """Pack the message of a pose, (4, 4)."""
     return _POSE.pack(stamp_ns, *T_odom_sensor[:3, 3], *quat_xyzw_from_pose(T_odom_sensor))
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
-    """A function from such a message to a PointCloud2 or an Odometry, by the channel's encoding."""
+    """Return a function from such a message to a PointCloud2 or an Odometry, by the channel's encoding."""
     if channel.encoding == "pose":
         return _decode_pose
     parse = parser(channel.encoding)
@@ -84,15 +81,16 @@ _PLY_TYPES = {
 
 
 def parser(suffix: str) -> Callable[[Bytes, Header], PointCloud2]:
-    """The function for files of a suffix: `pcd`, `ply` or `bin`.
+    """Return the parser for files of a suffix: `pcd`, `ply` or `bin`.
 
-    It raises PointCloudError for a file that contradicts itself, UnsupportedSchema for a kind we do not read.
+    It raises PointCloudError for a file that contradicts itself, UnsupportedSchema for a kind that is not
+    supported.
     """
     return {"pcd": _pcd, "ply": _ply, "bin": _kitti}[suffix]
 
 
 def _kitti(data: Bytes, header: Header) -> PointCloud2:
-    """float32 x y z and reflectance, without any header."""
+    """Parse float32 x y z and reflectance, without any header."""
     if len(data) % 16:
         raise PointCloudError(f"{len(data)} bytes are not whole points of 16 bytes")
     fields = tuple((name, 4 * i, 7, 1) for i, name in enumerate("xyz"))
@@ -117,7 +115,7 @@ def _pcd(data: Bytes, header: Header) -> PointCloud2:
 
 
 def _pcd_columns(head: str) -> tuple[Columns, int]:
-    """The columns that the header of a PCD declares, and the number of points. Raises PointCloudError."""
+    """Parse the columns and the number of points in the header of a PCD. Raises PointCloudError."""
     lines = [line.split() for line in head.splitlines()]
     keys = {line[0]: line[1:] for line in lines if line and not line[0].startswith("#")}
     try:
@@ -153,7 +151,7 @@ def _ply(data: Bytes, header: Header) -> PointCloud2:
 
 
 def _ply_elements(head: str) -> tuple[str, list[tuple[str, int, Columns]]]:
-    """The format that the header of a PLY declares, and name, count and columns of its elements.
+    """Parse the format, and name, count and columns of the elements in the header of a PLY.
 
     Raises PointCloudError.
     """
@@ -176,14 +174,15 @@ def _ply_elements(head: str) -> tuple[str, list[tuple[str, int, Columns]]]:
 
 
 def _ply_packed(name: str, count: int, columns: Columns) -> tuple[Fields, int]:
-    """The fields of an element, and the bytes of one. Raises PointCloudError if it has no fixed size."""
+    """Return the fields of an element, and the bytes of one. Raises PointCloudError if it has no fixed
+    size."""
     if count < 0 or any(code == 0 for _, code, _ in columns):
         raise PointCloudError(f"element {name} of a PLY stands before the points or in them, and has lists")
     return _packed(columns)
 
 
 def _packed(columns: Columns) -> tuple[Fields, int]:
-    """The fields of columns (name, datatype, count) without gaps, and the bytes of a point."""
+    """Return the fields of columns (name, datatype, count) without gaps, and the bytes of a point."""
     fields, at = [], 0
     for name, datatype, count in columns:
         fields.append((name, at, datatype, count))
@@ -192,7 +191,7 @@ def _packed(columns: Columns) -> tuple[Fields, int]:
 
 
 def _from_text(body: bytes, header: Header, columns: list[tuple[str, int]], points: int) -> PointCloud2:
-    """A cloud whose values stand as text, a point in each line. columns : (name, count of values)."""
+    """Parse a cloud whose values stand as text, a point in each line. columns : (name, count of values)."""
     width = sum(count for _, count in columns)
     if width * points > len(body):
         raise PointCloudError(f"{len(body)} bytes of text where {width * points} numbers are declared")

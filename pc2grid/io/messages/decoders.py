@@ -5,18 +5,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from pc2grid.io.messages import clouds as cloud_messages
-from pc2grid.io.messages import foxglove, ros
+from pc2grid.io.messages import clouds, foxglove, ros
 from pc2grid.io.source import TopicInfo
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
-    """A function from a message's bytes to one of the classes of `types`.
+    """Return a function from a message's bytes to one of the classes of `types`.
 
     Raises UnsupportedSchema for a type or encoding that is not supported.
     """
     if channel.encoding in ("protobuf", "json"):
         return foxglove.decoder_for(channel)
     if channel.type.startswith("cloud/"):
-        return cloud_messages.decoder_for(channel)
+        return clouds.decoder_for(channel)
     return ros.decoder_for(channel)

@@ -50,7 +50,7 @@ _NUMERIC_NAMES = ("UNKNOWN", *_NUMERIC)
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
-    """A function from the bytes of this topic's messages to one of the classes of `types`.
+    """Return a function from the bytes of this topic's messages to one of the classes of `types`.
 
     Raises UnsupportedSchema for a type that is not supported or a descriptor that is damaged. The function
     raises PointCloudError for a message that is not of its type.
@@ -132,12 +132,12 @@ def _size(value: Any) -> int:
 
 
 def _floats(values: Sequence[Any]) -> tuple[float, ...]:
-    """Numbers as floats. JSON has no NaN; writers use null instead."""
+    """Return numbers as floats. JSON has no NaN; writers use null instead."""
     return tuple(math.nan if v is None else float(v) for v in values)
 
 
 def _pose(pose: Any) -> Seven | None:
-    """None for a pose that is not set; a quaternion of zeros, protobuf's default, is the identity."""
+    """Convert a pose, None if it is not set; a quaternion of zeros, protobuf's default, is the identity."""
     if pose is None:
         return None
     return _seven(pose.position, pose.orientation)
@@ -200,7 +200,7 @@ def _camera_info(m: Any) -> CameraInfo:
 
 
 def _pose_in_frame(m: Any) -> Odometry:
-    """The message does not name the child frame; it is taken to be the base."""
+    """Convert a pose; the message does not name the child frame, which is taken to be the base."""
     return Odometry(_header(m), "", _seven(m.pose.position, m.pose.orientation))
 
 

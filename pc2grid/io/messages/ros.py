@@ -1,11 +1,8 @@
 """ROS messages, decoded by `rosbags` from CDR (ROS 2) or ROS 1 serialisation.
 
-A recording's own definition of a type counts, where it has one: its fields may stand in another order, and
-there may be more of them. Large arrays stay views of the log's bytes.
-
-Definitions of ROS message types, parsed by `rosbags`: those of a recording, or of ROS where it has none.
-
-Texts are bounded before they are parsed, and only names and types of fields are registered.
+If a recording has its own definition of a type, it is used: its fields may stand in another order, and there
+may be more of them; else that of ROS is used. The texts are bounded before `rosbags` parses them, and only
+names and types of fields are registered. Large arrays stay views of the log's bytes.
 """
 
 from __future__ import annotations
@@ -50,6 +47,68 @@ _MOST_CLOUD_FIELDS = 1000
 _MOST_DISTORTION = 100
 
 
+def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
+    """Return a function from the bytes of this topic's messages to one of the classes of `types`.
+
+    Raises UnsupportedSchema for a type, an encoding or a definition of the type in the log that is not
+    supported. The function raises PointCloudError for a message that is not of the type.
+    """
+    if channel.type not in _CONVERTERS:
+        raise UnsupportedSchema(
+            f"{channel.topic}: messages of type {channel.type or 'unknown'} are not read",
+            hint="supported: PointCloud2, LaserScan, depth Image or CompressedImage",
+        )
+    if channel.encoding not in ("cdr", "ros1"):
+        raise UnsupportedSchema(
+            f"{channel.topic}: message encoding {channel.encoding!r:.40} is not read",
+            hint="supported: cdr (ROS 2), ros1, and protobuf or json of Foxglove's types",
+        )
+    ros1, (convert, needed) = channel.encoding == "ros1", _CONVERTERS[channel.type]
+    name, store = _store_of(channel, ros1, needed)
+    parse = store.deserialize_ros1 if ros1 else store.deserialize_cdr
+
+    def decode(data: Bytes) -> Any:
+        try:
+            return convert(parse(memoryview(data), name))
+        except (SerdeError, TypesysError, AttributeError, TypeError) as error:
+            raise PointCloudError(f"the message is no whole {channel.type}") from error
+
+    return decode
+
+
+def _store_of(channel: TopicInfo, ros1: bool, needed: str) -> tuple[str, Any]:
+    """Return the name of the type, and a store with the log's definition of it, or that of ROS without one.
+
+    Raises UnsupportedSchema if it cannot be read, or lacks a field that is needed.
+    """
+    text = channel.schema.decode("utf-8", "replace").replace("\r\n", "\n").strip()
+    encoding = "ros1msg" if ros1 else "ros2msg"
+    if text and channel.schema_encoding != encoding:
+        raise UnsupportedSchema(
+            f"{channel.topic}: schema encoding {channel.schema_encoding!r:.40} is not read",
+            hint=f"supported: {encoding}",
+        )
+    # tf/tfMessage is called so today.
+    short = channel.type if text else channel.type.replace("tf/tfMessage", "tf2_msgs/TFMessage")
+    name = short.replace("/", "/msg/")
+    try:
+        store = store_of(short, encoding, text)
+    except ValueError as error:
+        raise UnsupportedSchema(
+            f"{channel.topic}: the schema of {channel.type} is not readable: {error}"
+        ) from error
+    there = {field for field, _ in store.fielddefs[name][1]}
+    missing = [field for field in needed.split() if field not in there]
+    if missing:
+        raise UnsupportedSchema(
+            f"{channel.topic}: the log defines {channel.type} differently from ROS: "
+            f"without {', '.join(missing)}"
+        )
+    return name, store
+
+
+# Converters of messages with the names of their fields in small letters.
+
 # --- messages with the names of their fields in small letters -----------------------------------------
 
 
@@ -91,7 +150,8 @@ def _odometry(m: Any) -> Odometry:
 
 
 def _imu(m: Any) -> Imu:
-    """Raises PointCloudError for numbers that are not finite; a quaternion of zeros is none."""
+    """Convert an IMU message; a quaternion of zeros is none. Raises PointCloudError for non-finite
+    numbers."""
     q, w, a = m.orientation, m.angular_velocity, m.linear_acceleration
     orientation = (q.x, q.y, q.z, q.w) if _measured(m.orientation_covariance) else None
     turn_rate = (w.x, w.y, w.z) if _measured(m.angular_velocity_covariance) else None
@@ -104,7 +164,7 @@ def _imu(m: Any) -> Imu:
 
 
 def _measured(covariance: Any) -> bool:
-    """Whether an IMU measures what this is the covariance of, see sensor_msgs/Imu."""
+    """Return True unless the covariance marks a quantity of an IMU as not measured, see sensor_msgs/Imu."""
     return bool(covariance[0] != -1.0)
 
 
@@ -160,71 +220,14 @@ _CONVERTERS: dict[str, tuple[Callable[[Any], Any], str]] = {
 """Of each type what makes one of the classes of `types` of it, and the fields that this needs."""
 
 
-def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
-    """A function from the bytes of this topic's messages to one of the classes of `types`.
-
-    Raises UnsupportedSchema for a type, an encoding or a definition of the type in the log that is not
-    supported. The function raises PointCloudError for a message that is none of the type.
-    """
-    if channel.type not in _CONVERTERS:
-        raise UnsupportedSchema(
-            f"{channel.topic}: messages of type {channel.type or 'unknown'} are not read",
-            hint="supported: PointCloud2, LaserScan, depth Image or CompressedImage",
-        )
-    if channel.encoding not in ("cdr", "ros1"):
-        raise UnsupportedSchema(
-            f"{channel.topic}: message encoding {channel.encoding!r:.40} is not read",
-            hint="supported: cdr (ROS 2), ros1, and protobuf or json of Foxglove's types",
-        )
-    ros1, (convert, needed) = channel.encoding == "ros1", _CONVERTERS[channel.type]
-    name, store = _store_of(channel, ros1, needed)
-    parse = store.deserialize_ros1 if ros1 else store.deserialize_cdr
-
-    def decode(data: Bytes) -> Any:
-        try:
-            return convert(parse(memoryview(data), name))
-        except (SerdeError, TypesysError, AttributeError, TypeError) as error:
-            raise PointCloudError(f"the message is no whole {channel.type}") from error
-
-    return decode
-
-
-def _store_of(channel: TopicInfo, ros1: bool, needed: str) -> tuple[str, Any]:
-    """The name of the type, and a store with the log's definition of it, or that of ROS if the log has none.
-
-    Raises UnsupportedSchema if it cannot be read, or lacks a field that is needed.
-    """
-    text = channel.schema.decode("utf-8", "replace").replace("\r\n", "\n").strip()
-    encoding = "ros1msg" if ros1 else "ros2msg"
-    if text and channel.schema_encoding != encoding:
-        raise UnsupportedSchema(
-            f"{channel.topic}: schema encoding {channel.schema_encoding!r:.40} is not read",
-            hint=f"supported: {encoding}",
-        )
-    # tf/tfMessage is called so today.
-    short = channel.type if text else channel.type.replace("tf/tfMessage", "tf2_msgs/TFMessage")
-    name = short.replace("/", "/msg/")
-    try:
-        store = store_of(short, encoding, text)
-    except ValueError as error:
-        raise UnsupportedSchema(
-            f"{channel.topic}: the schema of {channel.type} is not readable: {error}"
-        ) from error
-    there = {field for field, _ in store.fielddefs[name][1]}
-    missing = [field for field in needed.split() if field not in there]
-    if missing:
-        raise UnsupportedSchema(
-            f"{channel.topic}: the log defines {channel.type} differently from ROS: "
-            f"without {', '.join(missing)}"
-        )
-    return name, store
-
+# Definitions of types.
 
 _TIME = "builtin_interfaces/msg/Time"
 _TF = (
     "tf2_msgs/msg/TFMessage",
     "geometry_msgs/TransformStamped[] transforms",
 )  # rosbags knows it of ROS 2 only
+
 
 # The known types flatten to some tens of fields; their published definitions with all comments have up to
 # 15,000 characters. The limits bound the time for a crafted text to half a second.
@@ -234,16 +237,16 @@ _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 
 def short_name(type_name: str) -> str:
-    """`sensor_msgs/msg/PointCloud2` and `sensor_msgs/PointCloud2` to the latter."""
+    """Shorten `sensor_msgs/msg/PointCloud2` to `sensor_msgs/PointCloud2`."""
     return type_name.replace("/msg/", "/").replace("::msg::", "/").replace("::", "/")
 
 
 @functools.lru_cache(maxsize=32)  # a log's topics share types, and each is looked at several times
 def store_of(type_name: str, encoding: str, text: str) -> Typestore:
-    """A store with a type and all that it consists of; the names of fields in small letters.
+    """Return a store with a type and all types that it consists of; the names of fields in small letters.
 
-    encoding : of the schema in the log, `ros2msg` or `ros1msg`. text : the schema; empty: as ROS
-    defines the type. Raises ValueError if the text cannot be understood.
+    encoding : of the schema in the log, `ros2msg` or `ros1msg`. text : the schema; empty: the definition of
+    ROS. Raises ValueError if the text cannot be understood.
     """
     store, name = Typestore(), short_name(type_name)
     types = _parsed(name, encoding, text) if text else _of_ros(encoding)
@@ -258,7 +261,8 @@ def _of_ros(encoding: str) -> Typesdict:
 
 
 def _parsed(name: str, encoding: str, text: str) -> Typesdict:
-    """The types in a definition in the .msg language, of which `name` is the first. Raises ValueError."""
+    """Parse the types in a definition in the .msg language, of which `name` is the first. Raises
+    ValueError."""
     if len(text) > _MOST_CHARACTERS:
         raise ValueError(f"{name}: a definition of {len(text)} characters")
     try:
@@ -274,7 +278,7 @@ def _parsed(name: str, encoding: str, text: str) -> Typesdict:
 
 
 def _check_names(types: Typesdict) -> None:
-    """Raises ValueError for a name that is not one of ROS: rosbags makes Python code of them."""
+    """Raise ValueError for a name that is not one of ROS: rosbags makes Python code of them."""
     names = [part for kind in types for part in kind.split("/")]
     names += [field for _, fields in types.values() for field, _ in fields]
     for name in names:
@@ -283,7 +287,8 @@ def _check_names(types: Typesdict) -> None:
 
 
 def _needed(top: str, types: Typesdict) -> Typesdict:
-    """A type and those that it consists of, without constants, in small letters: ROS 1 has a CameraInfo.D.
+    """Return a type and those that it consists of, without constants, in small letters: ROS 1 has a
+    CameraInfo.D.
 
     Raises ValueError for one that nests without end, into too many fields, or into a type without a
     definition: a few lines can nest into billions, and rosbags writes code for each item of an array.

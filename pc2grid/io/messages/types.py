@@ -26,7 +26,7 @@ _QUATERNION_SQUARED = (1e-12, 1e12)
 
 
 def valid_pose(pose: Seven) -> bool:
-    """Whether a pose is finite, within `FARTHEST_M`, and its quaternion has a direction."""
+    """Return True if a pose is finite, within `FARTHEST_M`, and its quaternion has a direction."""
     if not all(map(math.isfinite, pose)) or max(map(abs, pose[:3])) > FARTHEST_M:
         return False
     return _QUATERNION_SQUARED[0] < sum(v * v for v in pose[3:]) < _QUATERNION_SQUARED[1]
@@ -136,10 +136,10 @@ class Odometry:
 
 @dataclass(frozen=True, slots=True)
 class Imu:
-    """sensor_msgs/Imu: each of the three is None where its covariance says that it is not measured (-1).
+    """sensor_msgs/Imu: each of the three is None if its covariance marks it as not measured (-1).
 
     orientation : quaternion x y z w in a frame whose z axis is up. turn_rate_rps : (3,) of the gyroscope.
-    acceleration_mps2 : (3,) with what holds against gravity: at rest it points up.
+    acceleration_mps2 : (3,) specific force: at rest it points up.
     """
 
     header: Header

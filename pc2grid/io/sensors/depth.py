@@ -4,11 +4,9 @@ Open3D's `create_from_depth_image` gives the same points in half the time (0.8 i
 second pixel of 640 x 480), but cannot undistort, so it would be a second path beside this one. The png takes
 2.9 ms.
 
-The rays of a camera's pixels, by its CameraInfo, which is checked: a wrong one draws a wrong map.
-
-Depths in another unit than their encoding says, noticed by the floor.
-
-What the header of a PNG claims, checked before OpenCV takes memory for it. https://www.w3.org/TR/png-3/
+The CameraInfo is checked: a wrong one draws a wrong map (`pixel_rays`). The floor is compared with tf, to
+detect depths in another unit than that of their encoding (`FloorDepth`). The size in the header of a PNG is
+checked before OpenCV takes memory for it (`read_header`, https://www.w3.org/TR/png-3/).
 """
 
 from __future__ import annotations
@@ -38,8 +36,9 @@ _CONFIG_HEADER = struct.Struct("<iff")  # compressed_depth_image_transport: form
 
 
 class _Depths(NamedTuple):
-    """values : those of the used pixels, of which one is `unit_m` metres if nothing else is said.
-    shape : rows and columns of all pixels.
+    """The depths of an image, as they are stored.
+
+    values : of the used pixels. unit_m : their usual unit, metres. shape : rows and columns of all pixels.
     """
 
     values: F32
@@ -57,10 +56,10 @@ def decode(
     unit_m: float | None = None,
     camera: str = "CameraInfo",
 ) -> Points:
-    """Points of a depth image; pixels without a return (0, NaN, inf, 65535 of 16 bits) are dropped.
+    """Decode a depth image; pixels without a return (0, NaN, inf, 65535 of 16 bits) are dropped.
 
-    rectified : the image is undistorted already, so `info.p` describes it and not `info.k` with `info.d`.
-    stride : use every n-th row and column. unit_m : of a depth; None: millimetres in 16 bits, metres in
+    rectified : the image is undistorted already, so that `info.p` and not `info.k` with `info.d` describes
+    it. stride : use every n-th row and column. unit_m : of a depth; None: millimetres in 16 bits, metres in
     floats (REP 118). camera : how errors name `info`.
 
     Raises PointCloudError if image and camera do not fit, UnsupportedSchema for another encoding.
@@ -82,7 +81,8 @@ def decode(
 
 
 def holds_depths(image: Image | CompressedImage) -> bool:
-    """Whether an image is one of depths, by its encoding or content: the name of a topic may not say so."""
+    """Return True if an image is one of depths, by its encoding or content; the name of a topic may not show
+    it."""
     if isinstance(image, Image):
         return image.encoding in ("16UC1", "32FC1")
     if image.format.partition(";")[0].strip() in _LAYOUTS:
@@ -118,17 +118,17 @@ def _raw_depth(image: Image, max_points: int, stride: int) -> _Depths:
 
 
 def _floats(values: NDArray[Any]) -> F32:
-    """Depths as float32; 65535 means "too far" for some sensors."""
+    """Return depths as float32; 65535 means "too far" for some sensors."""
     if values.dtype.kind == "u":
         values = np.where(values == 65535, 0, values)
     return values.astype(np.float32)
 
 
 def _compressed_depth(image: CompressedImage, max_points: int, stride: int) -> _Depths:
-    """Of image_transport's compressedDepth, or a plain png.
+    """Decode image_transport's compressedDepth, or a plain png.
 
-    The format is a text such as `16UC1; compressedDepth png`, but other writers say only `png`, or nothing:
-    a png of 16 bits is what it is. Before it there may be 12 bytes: a format code and the parameters a and b
+    The format is a text such as `16UC1; compressedDepth png`, but other writers write only `png`, or nothing:
+    then a png of 16 bits decides. Before it there may be 12 bytes: a format code and the parameters a and b
     by which 32FC1 was quantised, `depth = a / (value - b)`, zero for 16UC1.
     """
     encoding, _, transport = (part.strip() for part in image.format.partition(";"))
@@ -152,12 +152,13 @@ def _compressed_depth(image: CompressedImage, max_points: int, stride: int) -> _
 
 
 def _png_start(data: Bytes) -> int:
-    """Where the image begins: behind the header of compressedDepth, unless the data is a plain png."""
+    """Return the offset of the image: behind the header of compressedDepth, unless the data is a plain
+    png."""
     return 0 if bytes(data[: len(MAGIC)]) == MAGIC else _CONFIG_HEADER.size
 
 
 def _pixels(data: memoryview, max_points: int) -> NDArray[np.uint16]:
-    """(H, W) the values of a png of 16 bits."""
+    """Return the values (H, W) of a png of 16 bits."""
     try:
         found = read_header(data)
     except ValueError as error:
@@ -175,7 +176,7 @@ def _pixels(data: memoryview, max_points: int) -> NDArray[np.uint16]:
 
 
 def _dequantised(values: NDArray[np.uint16], a: float, b: float) -> F32:
-    """Metres of values that image_transport made of float metres; 0 is no return."""
+    """Return metres of the values that image_transport made of float metres; 0 is no return."""
     with np.errstate(divide="ignore", invalid="ignore"):
         metres = np.float32(a) / (values.astype(np.float32) - np.float32(b))
     return np.where(values == 0, np.float32(0), metres).astype(np.float32)
@@ -189,13 +190,19 @@ def _check_size(height: int, width: int, max_points: int) -> None:
         )
 
 
+# The rays of the pixels.
+
 _STEEPEST = 1e3  # largest x / z and y / z of a ray: 0.06 degrees from the image plane
+
+
 # What no camera has, chosen by hand: pixels so much longer than wide, and an image so many focal lengths wide
 # (half a degree and 160 degrees).
 _MOST_OBLONG = 3.0
 _NARROWEST, _WIDEST = 0.01, 12.0
 _FISHEYE = ("equidistant", "fisheye")
 _OF_OPENCV = (4, 5, 8, 12, 14)
+
+
 # Names of sensor_msgs/distortion_models.hpp: the number of coefficients there, and those that OpenCV reads.
 _COEFFICIENTS: dict[str, tuple[int, tuple[int, ...]]] = {
     "": (5, _OF_OPENCV),
@@ -221,10 +228,11 @@ def pixel_rays(
     stride: int,
     camera: str,
 ) -> F32:
-    """(n, 3) directions of the used pixels, row-major, scaled to z = 1; computed once for a camera.
+    """Return the directions (n, 3) of the used pixels, row-major, scaled to z = 1; computed once for a
+    camera.
 
-    rectified : the image is undistorted already, so `p` describes it and not `k` with `d`.
-    stride : every n-th row and column is used. camera : how errors name the CameraInfo.
+    rectified : the image is undistorted already, so that `p` and not `k` with `d` describes it. stride :
+    every n-th row and column is used. camera : how errors name the CameraInfo.
 
     Raises PointCloudError for numbers that no camera has, UnsupportedSchema for another distortion model.
     """
@@ -250,7 +258,7 @@ def pixel_rays(
 
 
 def _impossible(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> str | None:
-    """Why no camera has this matrix; None if one may."""
+    """Return why no camera has this matrix; None if one may."""
     if not (np.isfinite([fx, fy, cx, cy]).all() and fx > 0 and fy > 0):
         return f"a camera without focal length (fx {fx:g}, fy {fy:g})"
     if not 1 / _MOST_OBLONG <= fx / fy <= _MOST_OBLONG:
@@ -263,7 +271,8 @@ def _impossible(width: int, height: int, fx: float, fy: float, cx: float, cy: fl
 
 
 def _check_distortion(model: str, d: tuple[float, ...], camera: str) -> None:
-    """Raise UnsupportedSchema for an unknown model, PointCloudError for coefficients that are none of it."""
+    """Raise UnsupportedSchema for an unknown model, PointCloudError if the coefficients do not fit the
+    model."""
     if model not in _COEFFICIENTS:
         raise UnsupportedSchema(
             f"{camera}: the distortion model {model!r:.40} is not read",
@@ -287,6 +296,8 @@ def _undistorted(u: F64, v: F64, k: F64, d: F64, model: str) -> tuple[F64, F64]:
     return x, y
 
 
+# The unit of the depths.
+
 # In most scans of a camera on a robot that sees the floor, a tenth of the returns are on it. Chosen by hand;
 # cameras whose unit is not the millimetre have one of 0.25, 0.2 or 0.1 mm.
 _LOWEST_PERCENT = 10
@@ -295,7 +306,7 @@ _LEAST_HEIGHT_M, _LEAST_SCANS, _DEEP = 0.1, 5, 3.0
 
 
 class FloorDepth:
-    """Compares how far the floor lies under a camera with what tf says, over many scans."""
+    """Compares the depth of the floor under a camera with tf, over many scans."""
 
     def __init__(self) -> None:
         self._scans = 0
@@ -303,7 +314,7 @@ class FloorDepth:
         self._warned = False
 
     def warnings(self, points_m: F32, T_base_sensor: F64, unit_m: float) -> Iterator[str]:
-        """A sentence for the user, once most scans so far show it.
+        """Yield a sentence for the user, once most scans so far show a deviation.
 
         points_m : (N, 3) in the base frame. unit_m : the one that the depths were read in.
         """
@@ -324,9 +335,13 @@ class FloorDepth:
         )
 
 
+# The header of a PNG.
+
 MAGIC = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">8s4x4sIIBB")  # the first chunk of every PNG
 _CHANNELS = {0: 1, 2: 3, 3: 1, 4: 2, 6: 4}  # by colour type; 3 is a palette
+
+
 # Deflate expands one byte to 1032 at most (https://zlib.net/zlib_tech.html).
 _MOST_INFLATED = 1032
 
@@ -341,7 +356,8 @@ class PngHeader(NamedTuple):
 
 
 def read_header(content: bytes | memoryview) -> PngHeader:
-    """The header of a PNG. Raises ValueError if there is none, or the file is too short for its claims."""
+    """Read the header of a PNG. Raises ValueError if there is none, or the file is too short for its
+    claims."""
     if len(content) < _HEADER.size:
         raise ValueError("it is cut off")
     magic, kind, width, height, bits, colour = _HEADER.unpack_from(content)

@@ -71,7 +71,8 @@ def check_metres(ranges: NDArray[np.floating], hint: str) -> None:
 
 
 def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_000) -> Points:
-    """Points of a cloud: finite, and not exactly at the origin, where drivers put beams without a return.
+    """Decode the points of a cloud: finite, and not exactly at the origin, where drivers put beams without a
+    return.
 
     unit : of the time field: `s`, `ms`, `us`, `ns`, `auto` (from the span), `none` (times are ignored).
 
@@ -95,7 +96,7 @@ def decode(cloud: PointCloud2, *, unit: str = "auto", max_points: int = 20_000_0
 
 
 def _returns(rows: NDArray[Any]) -> tuple[F32 | F64, NDArray[np.integer]]:
-    """Usable returns (N, 3), and which rows they are (N,); float32 if the message's numbers fit in it."""
+    """Return usable returns (N, 3), and their rows (N,); float32 if the message's numbers fit in it."""
     exact = all(np.can_cast(rows.dtype[name], np.float32) for name in ("x", "y", "z"))
     # One row for each coordinate: numpy works along rows of thousands, not along points of three numbers.
     xyz = np.empty((3, rows.size), dtype=np.float32 if exact else np.float64)
@@ -109,7 +110,8 @@ def _returns(rows: NDArray[Any]) -> tuple[F32 | F64, NDArray[np.integer]]:
 
 
 def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
-    """The message's data as a structured (H, W) view of the fields that are used; nothing is copied."""
+    """Return the message's data as a structured (H, W) view of the fields that are used; nothing is
+    copied."""
     height, width, step = cloud.height, cloud.width, cloud.point_step
     if height * width > max_points:
         raise LimitExceeded(
@@ -130,7 +132,7 @@ def _rows(cloud: PointCloud2, max_points: int) -> NDArray[Any]:
 
 @functools.lru_cache(maxsize=16)
 def _layout(fields: tuple[tuple[str, int, int, int], ...], step: int, big: bool) -> np.dtype[Any]:
-    """The fields that are used as a type of `step` bytes; the same for all clouds of a topic."""
+    """Return the fields that are used as a type of `step` bytes; the same for all clouds of a topic."""
     if step >= 1 << 31:
         raise PointCloudError(f"points of {step} bytes")
     names, formats, offsets = [], [], []
@@ -165,9 +167,9 @@ def _time_field(cloud: PointCloud2) -> str | None:
 
 
 def _timed(values: NDArray[Any]) -> NDArray[np.bool_] | slice:
-    """Which of the times (N,) are finite, and near those of the other points.
+    """Return a mask of the times (N,) that are finite, and near those of the other points.
 
-    Drivers leave the time of some points at zero: it must not decide in which unit the others are.
+    Drivers leave the time of some points at zero: these must not decide on the unit of the others.
     """
     low, high = -math.inf, math.inf
     sample = values[:: max(len(values) // _SAMPLED_TIMES, 1)].astype(np.float64)
@@ -188,7 +190,8 @@ def _timed(values: NDArray[Any]) -> NDArray[np.bool_] | slice:
 
 
 def _scale(span: float, unit: str, name: str) -> float:
-    """Seconds of a unit. Raises PointCloudError if none fits, or they span longer than any scan."""
+    """Return the seconds of a unit. Raises PointCloudError if none fits, or the times span longer than any
+    scan."""
     if unit == "auto":
         fitting = [u for u, s in _SECONDS.items() if _SWEEP_S[0] <= span * s <= _SWEEP_S[1]]
         if not fitting:
@@ -209,7 +212,7 @@ def _scale(span: float, unit: str, name: str) -> float:
 def _offsets(
     values: NDArray[Any], stamp_ns: int, unit: str, name: str
 ) -> tuple[NDArray[Any] | None, str | None]:
-    """Seconds relative to the stamp from finite times, or None if all times are the same; and a note.
+    """Return seconds relative to the stamp from finite times, or None if all times are the same; and a note.
 
     Raises PointCloudError if no unit fits, or the times span longer than any scan.
     """

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pc2grid.estimation.line_map import Steps, _skew, moved, steps
+from pc2grid.estimation.line_map import Steps, moved, skew, steps
 from pc2grid.estimation.smoother import (
     IN_THE_HAND,
     PLANAR,
@@ -43,10 +43,10 @@ def steps_plain(first: F64, second: F64) -> Steps:
     step[:, :3] = np.einsum("nab,nb->na", R, second[:, :3, 3] - first[:, :3, 3])
     step[:, 3:] = rotation_vectors(turn)
     # Of the rotation vector only the first term of the series is needed: steps are small, or count little.
-    right = np.eye(3) + 0.5 * _skew(step[:, 3:])
+    right = np.eye(3) + 0.5 * skew(step[:, 3:])
     by_first, by_second = np.zeros((len(first), 6, 6)), np.zeros((len(first), 6, 6))
     by_first[:, :3, :3] = -np.eye(3)
-    by_first[:, :3, 3:] = _skew(step[:, :3])
+    by_first[:, :3, 3:] = skew(step[:, :3])
     by_first[:, 3:, 3:] = -right @ turn.transpose(0, 2, 1)
     by_second[:, :3, :3] = turn
     by_second[:, 3:, 3:] = right
