@@ -1,4 +1,5 @@
-"""Converts many recordings for one database: a job for each, here, in several processes, or on a cluster.
+"""Conversion of many recordings for one database: a job for each, here, in several processes, or on a
+cluster.
 
 Recordings are independent of each other, so each is mapped wherever a worker is free. One process stores the
 results, in the order of the jobs. So the database has the same bytes wherever the jobs ran.
@@ -20,9 +21,9 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 from typing import Any
 
-from pc2grid import libraries as extras
 from pc2grid._version import __version__
 from pc2grid.errors import ClusterError, DatabaseError
+from pc2grid.libraries import require
 from pc2grid.mapping.drawn import is_drawn_map
 from pc2grid.observer import Observer, TimeSpan
 from signature.config import Config
@@ -37,9 +38,8 @@ CONNECT_TIMEOUT_S = 10.0
 class Job:
     """One recording or map to convert: the arguments of `signature.sessions.build_sessions`.
 
-    stored : provenance of the session of this name that the database holds already and that shall stay; None
-        if there is no such session.
-    version : of the pc2grid that made the job; a worker must have the same.
+    stored : provenance of the session of this name that is in the database already and shall stay; None if
+    there is no such session. version : of the pc2grid that made the job; a worker must have the same.
     """
 
     path: Path
@@ -52,7 +52,7 @@ class Job:
     version: str = __version__
 
     def made_from(self, digest: str) -> Provenance:
-        """The provenance that the session of this job will have if its file has this digest."""
+        """Return the provenance that the session of this job will have if its file has this digest."""
         span = TimeSpan() if is_drawn_map(self.path) else self.span
         return provenance(self.path, digest, self.config, span=span, label=self.label)
 
@@ -61,9 +61,8 @@ class Job:
 class Outcome:
     """The result of a job.
 
-    entries : what is to be stored, a session for each part of the recording that hangs together; empty if it
-        is stored already, or if the job failed.
-    error : why the job failed; None if it did not.
+    entries : the sessions to be stored, one for each part of the recording; empty if it is stored already, or
+    if the job failed. error : why the job failed; None if it did not.
     """
 
     job: Job
@@ -76,7 +75,7 @@ Submit = Callable[..., Any]
 
 
 def convert(job: Job, observer: Observer = Observer()) -> tuple[Entry, ...]:
-    """Do a job: everything there is to store of it, nothing if it is stored already.
+    """Do a job; returns its sessions to be stored, none if it is stored already.
 
     Raises the errors of `build_sessions`; ClusterError if the job was made by another version of pc2grid;
     DatabaseError if the stored session was made from another file.
@@ -131,7 +130,7 @@ def at_once(
 
 @contextlib.contextmanager
 def processes_here(count: int) -> Iterator[Submit]:
-    """Processes of this machine.
+    """Start processes on this machine, and end them afterwards.
 
     A terminal sends Ctrl-C to all processes, but only this one may react, because it ends the others. So they
     are started while SIGINT is blocked, and inherit this.
@@ -159,11 +158,11 @@ def processes_here(count: int) -> Iterator[Submit]:
 
 @contextlib.contextmanager
 def on_cluster(address: str) -> Iterator[Submit]:
-    """The workers of a Dask scheduler. It starts a job again that a worker died on.
+    """Connect to the workers of a Dask scheduler. It starts a job again that a worker died on.
 
     Raises ClusterError if it does not answer, or if dask is not installed.
     """
-    extras.require({"cluster": "a cluster"})
+    require({"cluster": "a cluster"})
     import distributed
 
     class Client(distributed.Client):
@@ -218,7 +217,7 @@ def _attempt(job: Job, observer: Observer = Observer()) -> Outcome:
 
 
 def _outcome(job: Job, future: Any) -> Outcome:
-    """What a worker made of a job, whose own error is a part of it.
+    """Return the result of a worker for a job; the job's own error is a part of it.
 
     Raises ClusterError for every other error: the worker, or the way to it, is gone.
     """

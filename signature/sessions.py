@@ -1,6 +1,7 @@
-"""Recordings and maps become session maps, whose submaps are described and stored in a database.
+"""Recordings and maps as sessions: mapped, described, stored in a database, and located in one.
 
-From file to file: what `pc2grid convert` and `pc2grid relocalize` do with one recording, as functions.
+`convert` and `relocalize` are the work of `pc2grid convert` and `pc2grid relocalize` with one recording, as
+functions.
 """
 
 from __future__ import annotations
@@ -51,220 +52,7 @@ if TYPE_CHECKING:
     from signature.localization.posterior import Prior
 
 
-_LIBRARIES = (
-    "kiss-icp",
-    "mcap",
-    "networkx",
-    "numba",
-    "numpy",
-    "open3d-cpu",
-    "open3d",
-    "opencv-python-headless",
-    "scikit-learn",
-    "scipy",
-)
-"""The distributions that compute a session. open3d has two names, of which one is installed."""
-
-
-def provenance(
-    source: str | Path,
-    digest: str,
-    config: Config,
-    *,
-    span: TimeSpan = TimeSpan(),
-    label: Label | None = None,
-) -> Provenance:
-    """What makes a session: the source, the settings, and the versions of the libraries that compute.
-
-    source : path of the recording or map; only its name is kept. digest : its sha256.
-    The time of day is left out, so that the same input gives the same bytes.
-
-    >>> import pc2grid, signature
-    >>> with pc2grid.open_log("monday.mcap") as log:
-    ...     origin = provenance(log.info.path, log.digest(), signature.Config())
-    >>> origin.source, len(origin.digest), origin.versions["pc2grid"] == pc2grid.__version__
-    ('monday.mcap', 64, True)
-    """
-    return Provenance(
-        source=Path(source).name,
-        digest=digest,
-        config=config,
-        start_s=span.start_s,
-        duration_s=span.duration_s,
-        versions={"pc2grid": __version__, "python": platform.python_version(), **_versions()},
-        label=label or Label(),
-    )
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for name in _LIBRARIES:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            versions[name] = metadata.version(name)
-    return versions
-
-
-def build_session(
-    path: str | Path,
-    name: str,
-    config: Config,
-    *,
-    span: TimeSpan = TimeSpan(),
-    recover: bool = False,
-    label: Label | None = None,
-    observer: Observer = Observer(),
-) -> tuple[SessionMap, Provenance]:
-    """Turn a recording or a map into a session map, and say what it was made from.
-
-    path : of a recording, or of a nav2 map, point cloud or mesh of a building.
-    span : the part of the recording to use; a map is always used as a whole.
-    recover : use what is whole of a damaged recording.
-    observer : gets the progress, each scan with its tracked pose, and a note with the topic that was chosen.
-    Of a recording that does not hang together the part with the longest travel is returned;
-    `build_sessions` returns all.
-
-    Raises LogError and its subclasses, NoScans, MapFileError.
-
-    >>> import signature
-    >>> session, origin = build_session("map.yaml", "plan", signature.Config())
-    >>> session.sensor, len(session.trajectory), origin.source
-    ('map', 0, 'map.yaml')
-    """
-    maps, origin = build_sessions(
-        path, name, config, span=span, recover=recover, label=label, observer=observer
-    )
-    return longest_of(maps), origin
-
-
-@one_blas_thread
-def build_sessions(
-    path: str | Path,
-    name: str,
-    config: Config,
-    *,
-    span: TimeSpan = TimeSpan(),
-    recover: bool = False,
-    label: Label | None = None,
-    observer: Observer = Observer(),
-) -> tuple[tuple[SessionMap, ...], Provenance]:
-    """Turn a recording into one session map, or into several if it does not hang together.
-
-    See `pc2grid.build_maps`, which names them. Parameters and errors are those of `build_session`.
-
-    >>> import signature
-    >>> sessions, origin = build_sessions("map.yaml", "plan", signature.Config())
-    >>> [session.session for session in sessions]
-    ['plan']
-    """
-    path = Path(path)
-    if is_drawn_map(path):
-        drawn = load_drawn_map(path, config)
-        origin = provenance(path, drawn.digest, config, label=label)
-        return (session_of_map(drawn, name, config),), origin
-
-    with open_log(path, config.read, recover=recover) as log:
-        choice = log.choose()
-        observer.on_note(f"{path}: {choice.topic} ({choice.sensor}): {choice.reason}")
-        length_s = span.length_ns(log.info.start_ns, log.info.end_ns) * 1e-9
-        with observer.step(f"map {path.name}", length_s):
-            maps = build_maps(
-                log,
-                config,
-                session=name,
-                span=span,
-                observer=observer,
-                recognizer=recognizer_for(config),
-            )
-        origin = provenance(path, log.digest(), config, span=span, label=label)
-    return maps, origin
-
-
-def digest_of(path: Path, config: Config) -> str:
-    """The sha256 in the provenance of a session that is made from this recording or map."""
-    if is_drawn_map(path):
-        return digest_of_map(path)
-
-    with open_log(path, config.read) as log:
-        return log.digest()
-
-
-def session_of_map(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
-    """A session of a map, in the frame of that map and without a trajectory."""
-    no_poses = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
-    graph, submaps = divide(drawn.grid, config.partition)
-    return SessionMap(
-        session=name,
-        sensor="map",
-        grid=drawn.grid,
-        submaps=submaps,
-        trajectory=no_poses,
-        graph=graph,
-        points=_points(drawn, config),
-        report=ReadReport(warnings=drawn.warnings),
-    )
-
-
-def _points(drawn: DrawnMap, config: Config) -> PointMap | None:
-    """The points of a cloud or mesh in space, if they are to be kept; never finer than the map."""
-    voxel_m = config.projection.points_voxel_m
-    if voxel_m is None or not len(drawn.level_points_m):
-        return None
-    cloud = VoxelCloud(max(voxel_m, config.projection.resolution_m))
-    cloud.add(drawn.level_points_m)
-    return PointMap.of(cloud.points_m(), cloud.edge_m, cloud.corner_m)
-
-
-@one_blas_thread
-def describe_all(session_map: SessionMap, config: Config, observer: Observer = Observer()) -> list[Signature]:
-    """Signatures of all submaps of a session, in the order of the submaps."""
-    signatures = []
-    for done, submap in enumerate(session_map.submaps, start=1):
-        signatures.append(describe(submap, config.signature))
-        observer.on_progress(done / len(session_map.submaps))
-    return signatures
-
-
-def add_session(
-    database: str | Path,
-    session_map: SessionMap,
-    config: Config,
-    provenance: Provenance,
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Describe a session and add it to a database file, which is created if it does not exist.
-
-    overwrite : replace a session of the same name.
-
-    Raises the errors of `SubmapDatabase.add`.
-
-    >>> import pc2grid, signature
-    >>> config = signature.Config()
-    >>> with pc2grid.open_log("monday.mcap") as log:
-    ...     monday = pc2grid.build_map(log, config, session="monday", span=pc2grid.TimeSpan(0.0, 2.0))
-    ...     add_session("new.submaps", monday, config, provenance(log.info.path, log.digest(), config))
-    >>> with signature.open_database("new.submaps") as database:
-    ...     [session.name for session in database.sessions()]
-    ['monday']
-    """
-    add_sessions(database, [(session_map, provenance)], config, keep=True, overwrite=overwrite)
-
-
-def add_sessions(
-    database: str | Path,
-    sessions: Sequence[tuple[SessionMap, Provenance]],
-    config: Config,
-    *,
-    keep: bool = True,
-    overwrite: bool = False,
-    observer: Observer = Observer(),
-) -> None:
-    """Describe several sessions and store them in one transaction.
-
-    keep : add them to the sessions of the file; otherwise they replace them.
-    """
-    entries = [(m, describe_all(m, config, observer), origin) for m, origin in sessions]
-    store(database, entries, keep=keep, overwrite=overwrite)
+# From file to file.
 
 
 def convert(
@@ -282,8 +70,8 @@ def convert(
 ) -> SessionMap:
     """Make a session of a recording or a map, and store it in a database.
 
-    Of a recording that does not hang together every part becomes a session, and the one with the longest
-    travel is returned.
+    Of a recording in several parts every part becomes a session, and the one with the longest travel is
+    returned.
 
     source : a recording, the map.yaml of a nav2 map, or a point cloud or mesh of a building.
     database : the file to make, such as `building.submaps`, or a postgresql:// URL.
@@ -334,8 +122,8 @@ def relocalize(
     query : a recording, or a map as in `convert`.
     database : file or postgresql:// URL; or a map, which is converted for this one query.
     config : its sections `read`, `registration` and `relocalize` are used; see `query_config`.
-    span : the part of the recording to use. recover : use what is whole of a damaged recording.
-    prior : what is known of the robot's pose beforehand; other places are no answers.
+    span : the part of the recording to use. recover : use the undamaged part of a recording.
+    prior : prior knowledge of the robot's pose; other places are no answers.
     until_located : stop at the first estimate that is `located`; otherwise the recording is read to its end,
         and the answer is about its last metres.
     observer : gets the progress, and each scan with its tracked pose; None: a progress bar on a terminal
@@ -375,10 +163,10 @@ def relocalize(
 def open_places(
     place: str | Path, config: Config = Config(), warn: Callable[[str], object] = lambda sentence: None
 ) -> Iterator[SubmapDatabase]:
-    """Where to look: a database, or a map, which becomes a database for as long as it is used.
+    """Open a database, or a map, which becomes a database for as long as it is used.
 
     place : file or postgresql:// URL of a database; or the map.yaml of a nav2 map, a point cloud or a mesh.
-    config : how a map is read and divided. warn : gets what the user should know of a map.
+    config : how a map is read and divided. warn : gets warnings about a map.
 
     Raises the errors of `signature.open_database`, and MapFileError for a map.
 
@@ -411,10 +199,9 @@ def find(
 ) -> Found:
     """Locate a map, or a recording, or the part of it that `span` names, in an open database.
 
-    config, span, recover, until_located, observer : as in `relocalize`.
-    prior : what is known of the pose; it may say so by the recording.
-    see : called with each scan, and with what `Localizer.add` returned for it.
-    index : of the database, if it is prepared.
+    config, span, recover, until_located, observer : as in `relocalize`. prior : returns prior knowledge of
+    the pose, perhaps from the recording. see : called with each scan, and with the result of `Localizer.add`
+    for it. index : of the database, if it is prepared.
 
     Raises the errors of `pc2grid.open_log`, MapFileError, NoScans, and what `prior` raises.
     """
@@ -446,16 +233,26 @@ def find(
 def tracked(
     log: Log, config: Config, span: TimeSpan, observer: Observer
 ) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
-    """The registered scans of a part of a recording. observer : gets the share that is done."""
+    """Yield the registered scans of a part of a recording. observer : gets the progress."""
     for registered, planar_scan in follow(log.scans(span.start_s, span.duration_s), config, observer):
         yield registered, planar_scan
         observer.on_progress(span.share_done(registered.scan.stamp_ns, log.info.start_ns, log.info.end_ns))
 
 
+def query_config(database: SubmapDatabase, config: Config) -> Config:
+    """Return the settings for a query.
+
+    It is drawn and described with those of the database; the settings of reading, registration and answers
+    are taken from `config`.
+    """
+    own = {section: getattr(config, section) for section in ("read", "registration", "relocalize")}
+    return database.config().model_copy(update=own)
+
+
 def about_log(
     path: Path, query: Log, answer: Answer | PoseCheck, span: TimeSpan, health: Sequence[Health]
 ) -> QueryRecording:
-    """The description of a recording, or of a part of it, in the JSON document of the answer.
+    """Return the description of a recording, or of a part of it, in the JSON document of the answer.
 
     health : of its scans.
     """
@@ -474,7 +271,7 @@ def about_log(
 
 
 def about_map(path: Path, drawn: DrawnMap, answer: Answer) -> QueryRecording:
-    """The same of a map."""
+    """Return the description of a map in the JSON document of the answer."""
     return {
         "path_m": answer.path_m,
         "stamp_ns": answer.stamp_ns,
@@ -488,11 +285,218 @@ def about_map(path: Path, drawn: DrawnMap, answer: Answer) -> QueryRecording:
     }
 
 
-def query_config(database: SubmapDatabase, config: Config) -> Config:
-    """The settings for a query.
+# From a recording or a map to a session.
 
-    It is drawn and described with those that made the database; how it is read and registered, and how the
-    answer is found, is taken from `config`.
+_LIBRARIES = (
+    "kiss-icp",
+    "mcap",
+    "networkx",
+    "numba",
+    "numpy",
+    "open3d-cpu",
+    "open3d",
+    "opencv-python-headless",
+    "scikit-learn",
+    "scipy",
+)
+"""The distributions that compute a session. open3d has two names, of which one is installed."""
+
+
+def provenance(
+    source: str | Path,
+    digest: str,
+    config: Config,
+    *,
+    span: TimeSpan = TimeSpan(),
+    label: Label | None = None,
+) -> Provenance:
+    """Return the provenance of a session: the source, the settings, and the versions of the libraries that
+    compute.
+
+    source : path of the recording or map; only its name is kept. digest : its sha256. The time of day is left
+    out, so that the same input gives the same bytes.
+
+    >>> import pc2grid, signature
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     origin = provenance(log.info.path, log.digest(), signature.Config())
+    >>> origin.source, len(origin.digest), origin.versions["pc2grid"] == pc2grid.__version__
+    ('monday.mcap', 64, True)
     """
-    own = {section: getattr(config, section) for section in ("read", "registration", "relocalize")}
-    return database.config().model_copy(update=own)
+    return Provenance(
+        source=Path(source).name,
+        digest=digest,
+        config=config,
+        start_s=span.start_s,
+        duration_s=span.duration_s,
+        versions={"pc2grid": __version__, "python": platform.python_version(), **_versions()},
+        label=label or Label(),
+    )
+
+
+def _versions() -> dict[str, str]:
+    versions = {}
+    for name in _LIBRARIES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
+    return versions
+
+
+def build_session(
+    path: str | Path,
+    name: str,
+    config: Config,
+    *,
+    span: TimeSpan = TimeSpan(),
+    recover: bool = False,
+    label: Label | None = None,
+    observer: Observer = Observer(),
+) -> tuple[SessionMap, Provenance]:
+    """Turn a recording or a map into a session map; returns it and its provenance.
+
+    path : of a recording, or of a nav2 map, point cloud or mesh of a building. span : the part of the
+    recording to use; a map is always used as a whole. recover : use the undamaged part of a recording.
+    observer : gets the progress, each scan with its tracked pose, and a note with the topic that was chosen.
+    Of a recording in several parts the one with the longest travel is returned; `build_sessions` returns all.
+
+    Raises LogError and its subclasses, NoScans, MapFileError.
+
+    >>> import signature
+    >>> session, origin = build_session("map.yaml", "plan", signature.Config())
+    >>> session.sensor, len(session.trajectory), origin.source
+    ('map', 0, 'map.yaml')
+    """
+    maps, origin = build_sessions(
+        path, name, config, span=span, recover=recover, label=label, observer=observer
+    )
+    return longest_of(maps), origin
+
+
+@one_blas_thread
+def build_sessions(
+    path: str | Path,
+    name: str,
+    config: Config,
+    *,
+    span: TimeSpan = TimeSpan(),
+    recover: bool = False,
+    label: Label | None = None,
+    observer: Observer = Observer(),
+) -> tuple[tuple[SessionMap, ...], Provenance]:
+    """Turn a recording into one session map, or into several if its parts cannot be placed to each other.
+
+    See `pc2grid.build_maps`, which names them. Parameters and errors are those of `build_session`.
+
+    >>> import signature
+    >>> sessions, origin = build_sessions("map.yaml", "plan", signature.Config())
+    >>> [session.session for session in sessions]
+    ['plan']
+    """
+    path = Path(path)
+    if is_drawn_map(path):
+        drawn = load_drawn_map(path, config)
+        origin = provenance(path, drawn.digest, config, label=label)
+        return (session_of_map(drawn, name, config),), origin
+
+    with open_log(path, config.read, recover=recover) as log:
+        choice = log.choose()
+        observer.on_note(f"{path}: {choice.topic} ({choice.sensor}): {choice.reason}")
+        length_s = span.length_ns(log.info.start_ns, log.info.end_ns) * 1e-9
+        with observer.step(f"map {path.name}", length_s):
+            maps = build_maps(
+                log,
+                config,
+                session=name,
+                span=span,
+                observer=observer,
+                recognizer=recognizer_for(config),
+            )
+        origin = provenance(path, log.digest(), config, span=span, label=label)
+    return maps, origin
+
+
+def session_of_map(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
+    """Make a session of a map, in the frame of that map and without a trajectory."""
+    no_poses = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
+    graph, submaps = divide(drawn.grid, config.partition)
+    return SessionMap(
+        session=name,
+        sensor="map",
+        grid=drawn.grid,
+        submaps=submaps,
+        trajectory=no_poses,
+        graph=graph,
+        points=_points(drawn, config),
+        report=ReadReport(warnings=drawn.warnings),
+    )
+
+
+def _points(drawn: DrawnMap, config: Config) -> PointMap | None:
+    """Return the points of a cloud or mesh in space, if they are to be kept; never finer than the map."""
+    voxel_m = config.projection.points_voxel_m
+    if voxel_m is None or not len(drawn.level_points_m):
+        return None
+    cloud = VoxelCloud(max(voxel_m, config.projection.resolution_m))
+    cloud.add(drawn.level_points_m)
+    return PointMap.of(cloud.points_m(), cloud.edge_m, cloud.corner_m)
+
+
+def digest_of(path: Path, config: Config) -> str:
+    """Return the sha256 in the provenance of a session that is made from this recording or map."""
+    if is_drawn_map(path):
+        return digest_of_map(path)
+
+    with open_log(path, config.read) as log:
+        return log.digest()
+
+
+@one_blas_thread
+def describe_all(session_map: SessionMap, config: Config, observer: Observer = Observer()) -> list[Signature]:
+    """Return the signatures of all submaps of a session, in the order of the submaps."""
+    signatures = []
+    for done, submap in enumerate(session_map.submaps, start=1):
+        signatures.append(describe(submap, config.signature))
+        observer.on_progress(done / len(session_map.submaps))
+    return signatures
+
+
+def add_session(
+    database: str | Path,
+    session_map: SessionMap,
+    config: Config,
+    provenance: Provenance,
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Describe a session and add it to a database file, which is created if it does not exist.
+
+    overwrite : replace a session of the same name.
+
+    Raises the errors of `SubmapDatabase.add`.
+
+    >>> import pc2grid, signature
+    >>> config = signature.Config()
+    >>> with pc2grid.open_log("monday.mcap") as log:
+    ...     monday = pc2grid.build_map(log, config, session="monday", span=pc2grid.TimeSpan(0.0, 2.0))
+    ...     add_session("new.submaps", monday, config, provenance(log.info.path, log.digest(), config))
+    >>> with signature.open_database("new.submaps") as database:
+    ...     [session.name for session in database.sessions()]
+    ['monday']
+    """
+    add_sessions(database, [(session_map, provenance)], config, keep=True, overwrite=overwrite)
+
+
+def add_sessions(
+    database: str | Path,
+    sessions: Sequence[tuple[SessionMap, Provenance]],
+    config: Config,
+    *,
+    keep: bool = True,
+    overwrite: bool = False,
+    observer: Observer = Observer(),
+) -> None:
+    """Describe several sessions and store them in one transaction.
+
+    keep : add them to the sessions of the file; otherwise they replace them.
+    """
+    entries = [(m, describe_all(m, config, observer), origin) for m, origin in sessions]
+    store(database, entries, keep=keep, overwrite=overwrite)

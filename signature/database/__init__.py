@@ -61,5 +61,5 @@ def refuse_existing(place: Place, overwrite: bool) -> None:
 
 
 def engine_of(place: Place) -> type[Rows]:
-    """The engine of a path or URL."""
+    """Return the engine of a path or URL."""
     return PostgresRows if is_url(place) else SqliteRows

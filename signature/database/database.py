@@ -15,7 +15,6 @@ from pc2grid.model import Loop, OccupancyGrid, PointMap, SessionMap, Submap, Tra
 from pc2grid.submaps.submaps import view_at
 from signature.config import Config
 from signature.database import document
-from signature.database import document as validation
 from signature.database.document import (
     PARTS,
     DatabaseDamage,
@@ -40,14 +39,14 @@ if TYPE_CHECKING:
 class SubmapDatabase:
     """Sessions and their submaps. Reading never changes it; `add` changes all or nothing.
 
-    A handle sees the database as it was when it was opened; `add` lets its own handle see the new state. (A
-    server keeps deleted rows for it, so services should open a new handle now and then.)
+    A handle shows the database as it was when it was opened; after `add` its own handle shows the new state.
+    (A server keeps deleted rows for it, so services should open a new handle now and then.)
 
-    Every read raises DatabaseCorrupt where a row does not match its checksum, or says what cannot be.
+    Every read raises DatabaseCorrupt if a row does not match its checksum, or has impossible content.
     """
 
     def __init__(self, rows: Rows, *, writable: bool = False, damaged: bool = False) -> None:
-        """damaged : know only the sessions whose own row can be read."""
+        """Wrap the rows of an engine. damaged : know only the sessions whose own row can be read."""
         self._rows, self._writable, self._damaged = rows, writable, damaged
         self._left_out: set[int] = set()
         self._labelled: dict[str, str] = {}
@@ -85,30 +84,32 @@ class SubmapDatabase:
 
     @property
     def location(self) -> str:
-        """Path or URL, for messages; never with a password."""
+        """Return the path or URL, for messages; never with a password."""
         return self._rows.location
 
     def sessions(self, names: Collection[str] | None = None) -> tuple[SessionInfo, ...]:
-        """All sessions, or those of `names`, in the order they were added."""
+        """Return all sessions, or those of `names`, in the order they were added."""
         if names is None:
             return tuple(map(self._rows.info, self._known()))
         marks = ", ".join("?" * len(names)) or "NULL"
         return tuple(map(self._rows.info, self._known(f"name IN ({marks})", *names)))
 
     def session(self, name: str) -> SessionInfo:
-        """The session of a name. Raises DatabaseError if there is none."""
+        """Return the session of a name. Raises DatabaseError if there is none."""
         return self._rows.info(self._row(name))
 
     def config(self) -> Config:
-        """The configuration of the first session, whose signature and partition settings all sessions share.
+        """Return the configuration of the first session; all sessions share its signature and partition
+        settings.
 
-        The default configuration if there is no session.
+        It is the default configuration if there is no session.
         """
         first = next(self._known(), None)
         return Config() if first is None else self._rows.info(first).provenance.config
 
     def signatures(self, session: str | None = None) -> SignatureTable:
-        """All signatures, or those of one session; `session_index` counts in the order of `sessions()`."""
+        """Return all signatures, or those of one session; `session_index` counts in the order of
+        `sessions()`."""
         config, tables = self.config(), list[SignatureTable]()
         for index, row in enumerate(self._known()):
             if session not in (None, row.name):
@@ -117,7 +118,7 @@ class SubmapDatabase:
             if not len(part):
                 continue
             with explained(self.location, f"submaps of session {row.name!r}"):
-                validation.check_bins(part, config)
+                document.check_bins(part, config)
             columns = {field.name: getattr(part, field.name) for field in fields(SubmapArrays)}
             tables.append(SignatureTable(session_index=np.full(len(part), index, np.int32), **columns))
         if session is not None and not tables:
@@ -125,55 +126,55 @@ class SubmapDatabase:
         return SignatureTable.concatenated(tables or [SignatureTable.of((), np.empty((0, 2)))])
 
     def grid(self, session: str) -> OccupancyGrid:
-        """Whole occupancy grid of a session."""
+        """Return the whole occupancy grid of a session."""
         return cast("OccupancyGrid", self._parts(session, "grid")["grid"])
 
     def trajectory(self, session: str) -> Trajectory:
-        """Poses of the base in the session's map frame; empty for an imported map."""
+        """Return the poses of the base in the session's map frame; empty for an imported map."""
         return cast("Trajectory", self._parts(session, "trajectory")["trajectory"])
 
     def loops(self, session: str) -> tuple[Loop, ...]:
-        """The loops of a session; their `older` and `newer` are indices of poses of its trajectory."""
+        """Return the loops of a session; their `older` and `newer` are indices of poses of its trajectory."""
         return cast("tuple[Loop, ...]", self._parts(session, "loops")["loops"])
 
     def graph(self, session: str) -> nx.Graph:
-        """The junction graph of a session's free space (`pc2grid.submaps.junction_graph`)."""
+        """Return the junction graph of a session's free space (`pc2grid.submaps.junction_graph`)."""
         return graph_from_arrays(self._parts(session, "grid", "graph")["graph"])
 
     def points(self, session: str) -> PointMap | None:
-        """The points of a session in space; None if none were stored."""
+        """Return the points of a session in space; None if none were stored."""
         return cast("PointMap | None", self._parts(session, "points")["points"])
 
     def seen_places(self, session: str) -> SeenPlaces:
-        """What is seen from the centre of each submap of a session, by id."""
+        """Return the visible surroundings of the centre of each submap of a session, by id."""
         return cast("SeenPlaces", self._parts(session, "seen")["seen"])
 
     def frame(self, session: str) -> BuildingFrame | None:
-        """Where a session lies in the frame of its building; None if it was not joined with another one."""
+        """Return the place of a session in its building; None if it was not joined with another one."""
         return cast("BuildingFrame | None", self._parts(session, "frame")["frame"])
 
     def frames(self) -> dict[str, BuildingFrame]:
-        """The same of all sessions that were joined, by name."""
+        """Return the places of all sessions that were joined, by name."""
         found = (
             (row.name, self._rows.part(row, "frame", {"info": self._rows.info(row)})) for row in self._known()
         )
         return {name: frame for name, frame in found if frame is not None}
 
     def submap(self, session: str, submap_id: int) -> Submap:
-        """One submap. Raises DatabaseError if the session has none of that number."""
+        """Return one submap. Raises DatabaseError if the session has none of that number."""
         found = next(self._cut(session, submap_id), None)
         if found is None:
             raise DatabaseError(f"{self.location}: session {session!r} has no submap {submap_id}")
         return found
 
     def submaps(self, session: str) -> Iterable[Submap]:
-        """All submaps of a session, by id."""
+        """Yield all submaps of a session, by id."""
         return self._cut(session)
 
     def stored(self, session: str, *, recover: bool = False) -> StoredSession:
-        """Everything that is stored of a session.
+        """Return everything that is stored of a session.
 
-        recover : without what is damaged and can be lost (`signature.database.document.completed`).
+        recover : without damaged parts that can be lost (`signature.database.document.completed`).
         """
         row = self._row(session)
         parts: dict[str, Any] = {"info": self._rows.info(row)}
@@ -190,8 +191,10 @@ class SubmapDatabase:
         *,
         overwrite: bool = False,
     ) -> None:
-        """Store a session in one transaction. The same session again changes nothing; another one of the
-        same name is refused with DatabaseError, or replaced with `overwrite`.
+        """Store a session in one transaction.
+
+        The same session again changes nothing; another one of the same name is refused with DatabaseError, or
+        replaced with `overwrite`.
 
         Of the submaps their centres are stored: they are cut from the map again, with the settings of
         `provenance`. Raises ValueError for submaps and signatures of other sizes than these settings make.
@@ -205,12 +208,12 @@ class SubmapDatabase:
             self._rows.renew()
 
     def check(self) -> tuple[Problem, ...]:
-        """All damage of what is there now; empty if there is none."""
+        """Return all damage of the present content; empty if there is none."""
         with contextlib.closing(self._rows.open(self._rows.source, damaged=True)) as rows:
             return rows.all_problems()
 
     def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
-        """From now on, know only the sessions of this building and floor; None: any, "": not labelled.
+        """Restrict this handle to the sessions of a building and floor; None: any, "": not labelled.
 
         Raises DatabaseError if there are none.
         """
@@ -226,9 +229,9 @@ class SubmapDatabase:
             )
 
     def leave_out_damaged(self) -> tuple[Problem, ...]:
-        """From now on, leave out the sessions that cannot be searched because they are damaged.
+        """Leave out, from now on, the sessions that cannot be searched because they are damaged.
 
-        Returns what is wrong with each of them; damage to what a search can do without is not looked for.
+        Returns the problem of each of them; damage to parts that a search does not need is not searched for.
         Raises DatabaseCorrupt if none is left, or if the database itself cannot be read.
         """
         damaged = {
@@ -246,7 +249,8 @@ class SubmapDatabase:
     # --- rows and parts -------------------------------------------------------------------------------
 
     def _known(self, condition: str = "true", *values: Any) -> Iterator[SessionRow]:
-        """The rows of the sessions that are known. A fleet has too many to look at those of all buildings."""
+        """Yield the rows of the known sessions, in SQL restricted to their building: a fleet has too many of
+        all."""
         for column, word in self._labelled.items():
             condition, values = f"{condition} AND {column} = ?", (*values, word)
         with contextlib.suppress(*[DatabaseCorrupt] if self._damaged else []):
@@ -262,7 +266,7 @@ class SubmapDatabase:
         return row
 
     def _parts(self, session: str, *parts: str) -> dict[str, Any]:
-        """The info and these parts of a session, each compared with those before it."""
+        """Return the info and these parts of a session, each compared with those before it."""
         row = self._row(session)
         found: dict[str, Any] = {"info": self._rows.info(row)}
         for part in parts:
@@ -270,7 +274,7 @@ class SubmapDatabase:
         return found
 
     def _cut(self, session: str, submap_id: int | None = None) -> Iterator[Submap]:
-        """The submaps of a session, or that of a number, cut from its grid."""
+        """Yield the submaps of a session, or that of a number, cut from its grid."""
         parts = self._parts(session, "grid", "submaps")
         submaps, config = parts["submaps"], parts["info"].provenance.config
         for number, (x, y) in zip(submaps.submap_id.tolist(), submaps.center_m.tolist(), strict=True):

@@ -1,17 +1,15 @@
-"""What a database stores of a session, as one frozen type: the session map, its submaps and signatures.
+"""The content of a database for a session, as one frozen type: the session map, its submaps and signatures.
 
-`StoredSession` is all there is to say about the content of a database: pydantic turns its parts into plain
-values and back, by the types of their fields. A field of one of its types is stored without another line.
-
-Arrays as bytes, a checksum for every row, and damage that is said by name.
+pydantic turns the parts of `StoredSession` into plain values and back, by the types of their fields. A field
+of one of its types is stored without another line.
 
 A part of a session is one `.npz`: its arrays in numpy's own format (`numpy.lib.format`), and its document as
-the bytes of its JSON. Whatever it claims, no more than `MOST_BYTES` are unpacked.
+the bytes of its JSON. Whatever it claims, no more than `MOST_BYTES` are unpacked. Every row has a checksum,
+and damage is reported by name.
 
-Plausibility of stored content, which a checksum does not show: it shows only that nothing changed.
-
-Each check raises ValueError that says what is wrong; the caller adds where. Arrays are checked as a whole: a
-million signatures take a fraction of a second.
+A checksum shows only that nothing changed. So `check` tests whether the content is plausible: each test
+raises ValueError with the fault; the caller adds the place. Arrays are tested as a whole: a million
+signatures take a fraction of a second.
 """
 
 from __future__ import annotations
@@ -54,96 +52,15 @@ if TYPE_CHECKING:
     from signature.paper import Signature
 
 
-KINDS = ("junction", "end")
-"""What a node may be; `GraphArrays.kind` counts from 0 in this order."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GraphArrays:
-    """A junction graph as plain arrays, to be stored.
-
-    center_m : (N, 2) float64. kind : (N,) uint8, index into `KINDS`. pixels : (N,) int32.
-    edges : (E, 2) int32, numbers of nodes, the lower one first. length_m : (E,) float64.
-    path_start : (E + 1,) int64; `path_m[path_start[e]:path_start[e + 1]]` is the way of edge e.
-    path_m : (K, 2) float32.
-    """
-
-    center_m: F64
-    kind: NDArray[np.uint8]
-    pixels: NDArray[np.int32]
-    edges: NDArray[np.int32]
-    length_m: F64
-    path_start: I64
-    path_m: F32
-
-    def __post_init__(self) -> None:
-        nodes, edges = len(self.kind), len(self.length_m)
-        freeze(self, "center_m", np.float64, (nodes, 2))
-        freeze(self, "kind", np.uint8, (nodes,))
-        freeze(self, "pixels", np.int32, (nodes,))
-        freeze(self, "edges", np.int32, (edges, 2))
-        freeze(self, "length_m", np.float64, (edges,))
-        freeze(self, "path_start", np.int64, (edges + 1,))
-        freeze(self, "path_m", np.float32, (None, 2))
-
-
-def graph_to_arrays(graph: nx.Graph) -> GraphArrays:
-    """A junction graph as arrays; `graph_from_arrays` gives the same graph back."""
-    nodes = [graph.nodes[node] for node in range(len(graph))]
-    edges = [(min(a, b), max(a, b), way) for a, b, way in graph.edges(data=True)]
-    paths = [np.asarray(way["path_m"], np.float32).reshape(-1, 2) for _, _, way in edges]
-    return GraphArrays(
-        center_m=np.array([node["center_m"] for node in nodes], np.float64).reshape(-1, 2),
-        kind=np.array([KINDS.index(node["kind"]) for node in nodes], np.uint8),
-        pixels=np.array([node["pixels"] for node in nodes], np.int32),
-        edges=np.array([(a, b) for a, b, _ in edges], np.int32).reshape(-1, 2),
-        length_m=np.array([way["length_m"] for _, _, way in edges], np.float64),
-        path_start=np.cumsum([0, *map(len, paths)], dtype=np.int64),
-        path_m=np.concatenate((np.empty((0, 2), np.float32), *paths)),
-    )
-
-
-def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
-    """The junction graph that `graph_to_arrays` was given.
-
-    Raises ValueError if the arrays are no junction graph: a kind that does not exist, an edge to a node that
-    does not exist, from a node to itself or given twice, a length that is not positive, numbers that are not
-    finite, paths that do not follow each other.
-    """
-    import networkx as nx
-
-    nodes, starts = len(arrays.kind), arrays.path_start
-    edges = arrays.edges.tolist()
-    positive = np.isfinite(arrays.length_m) & (arrays.length_m > 0)
-    valid = {
-        "kind": (arrays.kind < len(KINDS)).all(),
-        "edges": all(0 <= a < b < nodes for a, b in edges) and len(set(map(tuple, edges))) == len(edges),
-        "center_m": np.isfinite(arrays.center_m).all(),
-        "length_m": positive.all(),
-        "path_start": starts[0] == 0 and starts[-1] == len(arrays.path_m) and (np.diff(starts) >= 0).all(),
-        "path_m": np.isfinite(arrays.path_m).all(),
-    }
-    for name, good in valid.items():
-        if not good:
-            raise ValueError(f"GraphArrays.{name}: not that of a junction graph")
-    graph = nx.Graph()
-    about = zip(arrays.kind.tolist(), arrays.center_m.tolist(), arrays.pixels.tolist(), strict=True)
-    for node, (kind, (x, y), pixels) in enumerate(about):
-        graph.add_node(node, kind=KINDS[kind], center_m=(x, y), pixels=pixels)
-    for k, ((a, b), length_m) in enumerate(zip(edges, arrays.length_m.tolist(), strict=True)):
-        graph.add_edge(a, b, length_m=length_m, path_m=arrays.path_m[starts[k] : starts[k + 1]])
-    return graph
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubmapArrays:
-    """The N submaps of a session: where they are, and their signatures.
+    """The N submaps of a session: their centres and their signatures.
 
     A submap is the part of the map around its centre that the settings of the session define
     (`pc2grid.submaps.submaps.view_at`), so its cells are not stored twice.
 
-    submap_id (N,) : int32, increasing. center_m (N, 2) : float64, in the map frame.
-    boundary (N, Nb), freespace (N, Nf), symmetry (N, 2) : float32, as in `Signature`.
+    submap_id (N,) : int32, increasing. center_m (N, 2) : float64, in the map frame. boundary (N, Nb),
+    freespace (N, Nf), symmetry (N, 2) : float32, as in `Signature`.
     """
 
     submap_id: I32
@@ -164,8 +81,11 @@ class SubmapArrays:
 
     @staticmethod
     def of(submaps: Sequence[Submap], signatures: Sequence[Signature], config: Config) -> SubmapArrays:
-        """Raises ValueError for a number of signatures other than that of the submaps, and for submaps or
-        signatures that the configuration does not make."""
+        """Make the arrays of submaps and their signatures.
+
+        Raises ValueError for a number of signatures other than that of the submaps, and for submaps or
+        signatures that the configuration does not make.
+        """
         if len(signatures) != len(submaps):
             raise ValueError(f"{len(submaps)} submaps but {len(signatures)} signatures")
         for submap in submaps:
@@ -186,8 +106,8 @@ class SubmapArrays:
 class StoredSession:
     """Everything that is stored of a session.
 
-    graph : its junction graph. submaps : where they are, and their signatures. seen : what is seen from their
-    centres. frame : where it lies in its building; None if it was not joined with another session.
+    graph : its junction graph. submaps : their centres and signatures. seen : visible surroundings of their
+    centres. frame : its place in its building; None if it was not joined with another session.
     """
 
     info: SessionInfo
@@ -213,7 +133,10 @@ _CONFIG = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan
 
 
 def _adapter(kind: Any) -> TypeAdapter[Any]:
-    """pydantic takes a configuration for a type that may be None, and none for a dataclass alone."""
+    """Return the pydantic adapter of a type.
+
+    pydantic takes a configuration for a type that may be None, and none for a dataclass alone.
+    """
     optional: Any = Optional[kind]  # noqa: UP045 - a type that is made here
     return TypeAdapter(optional, config=_CONFIG)
 
@@ -225,7 +148,7 @@ _ADAPTERS = {
 
 
 def stored_session(entry: Entry) -> StoredSession:
-    """A session as it is stored. Raises ValueError for what its settings do not make."""
+    """Return a session as it is stored. Raises ValueError for content that its settings do not make."""
     session_map, signatures, provenance = entry
     grid, config, graph = session_map.grid, provenance.config, session_map.graph
     submaps = SubmapArrays.of(session_map.submaps, signatures, config)
@@ -257,10 +180,10 @@ def stored_session(entry: Entry) -> StoredSession:
 
 
 def completed(parts: Mapping[str, Any]) -> StoredSession:
-    """A session of which parts were lost: those that follow from its grid are computed again, and its points
-    and its place in the building are left out.
+    """Complete a session of which parts were lost.
 
-    parts : the others, at least info, grid, trajectory and loops.
+    The parts that follow from its grid are computed again; its points and its place in the building are left
+    out. parts : the others, at least info, grid, trajectory and loops.
     """
     found, grid, config = (
         {"points": None, "frame": None, **parts},
@@ -282,25 +205,25 @@ def completed(parts: Mapping[str, Any]) -> StoredSession:
 
 
 def seen_from(submaps: SubmapArrays, grid: OccupancyGrid, config: Config) -> SeenPlaces:
-    """What is seen from the centres of submaps."""
+    """Return the visible surroundings of the centres of submaps."""
     return SeenPlaces.of(grid, submaps.center_m, config.partition.radius_m)
 
 
 def stored_name(name: str) -> str:
-    """The name of a session as it is stored. Raises DatabaseError if it is empty."""
+    """Return the name of a session as it is stored. Raises DatabaseError if it is empty."""
     if not name.strip():
         raise DatabaseError("the name of a session is empty", hint="give it a name")
     return clean(name)
 
 
 def encode_info(info: SessionInfo) -> str:
-    """The document of a session."""
+    """Return the document of a session."""
     return to_json(_ADAPTERS["info"].dump_python(info, round_trip=True))
 
 
 @functools.lru_cache(maxsize=256)
 def decode_info(document: str) -> SessionInfo:
-    """The inverse of `encode_info`. Raises ValidationError. Cached: each part is compared with it."""
+    """Return the inverse of `encode_info`. Raises ValidationError. Cached: each part is compared with it."""
     info: SessionInfo | None = _ADAPTERS["info"].validate_json(document)
     if info is None:
         raise ValueError("a document without content")
@@ -308,7 +231,7 @@ def decode_info(document: str) -> SessionInfo:
 
 
 def encode(part: str, value: Any) -> bytes:
-    """A part of a session as it is stored."""
+    """Return a part of a session as it is stored."""
     content, arrays = _ADAPTERS[part].dump_python(value), {}
     if isinstance(content, dict):
         arrays = {name: field for name, field in content.items() if isinstance(field, np.ndarray)}
@@ -317,7 +240,7 @@ def encode(part: str, value: Any) -> bytes:
 
 
 def decode(part: str, data: bytes) -> Any:
-    """The inverse of `encode`. Raises ValueError and others for damaged content."""
+    """Return the inverse of `encode`. Raises ValueError and others for damaged content."""
     content, arrays = unpack(data)
     value = _ADAPTERS[part].validate_python({**content, **arrays} if isinstance(content, dict) else content)
     if value is None and part not in ("points", "frame"):
@@ -325,8 +248,91 @@ def decode(part: str, data: bytes) -> Any:
     return value
 
 
-Array = NDArray[Any]
+# The junction graph.
 
+KINDS = ("junction", "end")
+"""What a node may be; `GraphArrays.kind` counts from 0 in this order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GraphArrays:
+    """A junction graph as plain arrays, to be stored.
+
+    center_m : (N, 2) float64. kind : (N,) uint8, index into `KINDS`. pixels : (N,) int32. edges : (E, 2)
+    int32, numbers of nodes, the lower one first. length_m : (E,) float64. path_start : (E + 1,) int64;
+    `path_m[path_start[e]:path_start[e + 1]]` is the way of edge e. path_m : (K, 2) float32.
+    """
+
+    center_m: F64
+    kind: NDArray[np.uint8]
+    pixels: NDArray[np.int32]
+    edges: NDArray[np.int32]
+    length_m: F64
+    path_start: I64
+    path_m: F32
+
+    def __post_init__(self) -> None:
+        nodes, edges = len(self.kind), len(self.length_m)
+        freeze(self, "center_m", np.float64, (nodes, 2))
+        freeze(self, "kind", np.uint8, (nodes,))
+        freeze(self, "pixels", np.int32, (nodes,))
+        freeze(self, "edges", np.int32, (edges, 2))
+        freeze(self, "length_m", np.float64, (edges,))
+        freeze(self, "path_start", np.int64, (edges + 1,))
+        freeze(self, "path_m", np.float32, (None, 2))
+
+
+def graph_to_arrays(graph: nx.Graph) -> GraphArrays:
+    """Return a junction graph as arrays; `graph_from_arrays` is the inverse."""
+    nodes = [graph.nodes[node] for node in range(len(graph))]
+    edges = [(min(a, b), max(a, b), way) for a, b, way in graph.edges(data=True)]
+    paths = [np.asarray(way["path_m"], np.float32).reshape(-1, 2) for _, _, way in edges]
+    return GraphArrays(
+        center_m=np.array([node["center_m"] for node in nodes], np.float64).reshape(-1, 2),
+        kind=np.array([KINDS.index(node["kind"]) for node in nodes], np.uint8),
+        pixels=np.array([node["pixels"] for node in nodes], np.int32),
+        edges=np.array([(a, b) for a, b, _ in edges], np.int32).reshape(-1, 2),
+        length_m=np.array([way["length_m"] for _, _, way in edges], np.float64),
+        path_start=np.cumsum([0, *map(len, paths)], dtype=np.int64),
+        path_m=np.concatenate((np.empty((0, 2), np.float32), *paths)),
+    )
+
+
+def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
+    """Return the junction graph of arrays from `graph_to_arrays`.
+
+    Raises ValueError if the arrays are no junction graph: a kind that does not exist, an edge to a node that
+    does not exist, from a node to itself or given twice, a length that is not positive, numbers that are not
+    finite, paths that do not follow each other.
+    """
+    import networkx as nx
+
+    nodes, starts = len(arrays.kind), arrays.path_start
+    edges = arrays.edges.tolist()
+    positive = np.isfinite(arrays.length_m) & (arrays.length_m > 0)
+    valid = {
+        "kind": (arrays.kind < len(KINDS)).all(),
+        "edges": all(0 <= a < b < nodes for a, b in edges) and len(set(map(tuple, edges))) == len(edges),
+        "center_m": np.isfinite(arrays.center_m).all(),
+        "length_m": positive.all(),
+        "path_start": starts[0] == 0 and starts[-1] == len(arrays.path_m) and (np.diff(starts) >= 0).all(),
+        "path_m": np.isfinite(arrays.path_m).all(),
+    }
+    for name, good in valid.items():
+        if not good:
+            raise ValueError(f"GraphArrays.{name}: not that of a junction graph")
+    graph = nx.Graph()
+    about = zip(arrays.kind.tolist(), arrays.center_m.tolist(), arrays.pixels.tolist(), strict=True)
+    for node, (kind, (x, y), pixels) in enumerate(about):
+        graph.add_node(node, kind=KINDS[kind], center_m=(x, y), pixels=pixels)
+    for k, ((a, b), length_m) in enumerate(zip(edges, arrays.length_m.tolist(), strict=True)):
+        graph.add_edge(a, b, length_m=length_m, path_m=arrays.path_m[starts[k] : starts[k + 1]])
+    return graph
+
+
+# Bytes and checksums.
+
+Array = NDArray[Any]
 SALVAGE = "`pc2grid db check` lists all damage, `pc2grid db copy --recover` keeps what is whole"
 MOST_BYTES = 1_200_000_000
 """Largest part that is read: the steps of 100 million points in space, 50,000 m2 at 5 cm."""
@@ -339,12 +345,14 @@ _NO_UTF8 = re.compile("[\udc80-\udcff]")
 
 
 def clean(word: str) -> str:
-    r"""Text as it can be stored: bytes of a name that are not valid UTF-8 become escapes such as `\xff`."""
+    r"""Return text as it can be stored: bytes of a name that are not valid UTF-8 become escapes such as
+    `\xff`."""
     return _NO_UTF8.sub(lambda found: rf"\x{ord(found[0]) - 0xDC00:02x}", word)
 
 
 def to_json(document: Any) -> str:
-    """Canonical JSON: equal content, equal bytes. Raises ValueError for a number that is not finite."""
+    """Return canonical JSON: equal content, equal bytes. Raises ValueError for a number that is not
+    finite."""
 
     def plain(value: Any) -> Any:
         return value.value if isinstance(value, enum.Enum) else value.tolist()
@@ -356,7 +364,7 @@ def to_json(document: Any) -> str:
 
 
 def pack(document: Any, arrays: Mapping[str, Array], *, compress: bool = True) -> bytes:
-    """A document and its arrays as the bytes of an `.npz`. Equal content, equal bytes."""
+    """Pack a document and its arrays into the bytes of an `.npz`. Equal content, equal bytes."""
     stream, text = io.BytesIO(), np.frombuffer(to_json(document).encode(), np.uint8)
     save: Any = np.savez_compressed if compress else np.savez
     save(stream, **{_DOCUMENT: text, **arrays})
@@ -364,7 +372,7 @@ def pack(document: Any, arrays: Mapping[str, Array], *, compress: bool = True) -
 
 
 def unpack(data: bytes) -> tuple[Any, dict[str, Array]]:
-    """What was packed. Raises ValueError, BadZipFile and others for other bytes."""
+    """Return the document and arrays of `pack`. Raises ValueError, BadZipFile and others for other bytes."""
     with zipfile.ZipFile(io.BytesIO(data)) as file:
         size = sum(member.file_size for member in file.infolist())
     if size > MOST_BYTES:
@@ -380,7 +388,8 @@ def unpack(data: bytes) -> tuple[Any, dict[str, Array]]:
 
 
 def row_crc(values: Iterable[Any]) -> int:
-    """crc32 of a row's values, with their types and lengths, so that no two rows look alike by shifting."""
+    """Return the crc32 of a row's values, with their types and lengths, so that no shifted row has the
+    same."""
     crc = 0
     for value in values:
         body = value if isinstance(value, bytes) else str(value).encode("utf-8", "surrogatepass")
@@ -389,7 +398,7 @@ def row_crc(values: Iterable[Any]) -> int:
 
 
 class DatabaseDamage(DatabaseCorrupt):
-    """Damage at a known place: in which database, where in it, and what."""
+    """Damage at a known place: the database, the place in it, and the fault."""
 
     def __init__(self, location: Path | str, where: str, what: str) -> None:
         super().__init__(f"{location}: damaged: {where}: {what}", hint=SALVAGE)
@@ -412,6 +421,8 @@ def explained(location: Path | str, where: str) -> Iterator[None]:
         raise DatabaseDamage(location, where, what) from error
 
 
+# Plausible content.
+
 # All chosen by hand: wide enough for every real session.
 MOST_VOXELS = 1 << 21
 """Voxels along an axis; 104 km of 5 cm."""
@@ -422,7 +433,7 @@ _ROUNDING = 1e-4
 
 
 def check(part: str, value: Any, others: Mapping[str, Any]) -> None:
-    """What must be true of a part of a session, beside the types of its fields.
+    """Check a part of a session for plausible content, beyond the types of its fields.
 
     others : the parts that it is compared with: always the info, and the grid if that is known.
     """
@@ -431,7 +442,7 @@ def check(part: str, value: Any, others: Mapping[str, Any]) -> None:
 
 
 def check_grid(grid: OccupancyGrid, info: SessionInfo, _: object = None) -> None:
-    """The cells of a grid are unknown, or percents, and it lies at plausible coordinates."""
+    """Check that the cells of a grid are unknown, or percents, and that it lies at plausible coordinates."""
     _edge(grid.resolution_m)
     _near(np.array([grid.origin_m]), "corner")
     if grid.cells.size and (grid.cells.min() < -1 or grid.cells.max() > 100):
@@ -441,8 +452,11 @@ def check_grid(grid: OccupancyGrid, info: SessionInfo, _: object = None) -> None
 
 
 def check_trajectory(trajectory: Trajectory, info: SessionInfo, _: object = None) -> None:
-    """Stamps do not decrease, and poses are rigid: an orthonormal rotation with determinant > 0, the last row
-    of a pose, and a translation that is not too far."""
+    """Check that stamps do not decrease and that poses are rigid.
+
+    That is an orthonormal rotation with determinant > 0, the last row of a pose, and a translation that is
+    not too far.
+    """
     stamps_ns, poses = trajectory.stamps_ns, trajectory.T_session_base
     _each(stamps_ns[1:] >= stamps_ns[:-1], "the stamp after {} is earlier")
     turns = poses[:, :3, :3]
@@ -455,19 +469,20 @@ def check_trajectory(trajectory: Trajectory, info: SessionInfo, _: object = None
 
 
 def check_loops(loops: tuple[Loop, ...], info: SessionInfo, _: object = None) -> None:
-    """Loops are between two of the poses."""
+    """Check that loops are between two of the poses."""
     between = [0 <= loop.older < loop.newer < info.scans for loop in loops]
     _each(np.array(between, bool), f"loop {{}} is not between two of {info.scans} poses")
 
 
 def check_graph(graph: GraphArrays, _: SessionInfo, grid: OccupancyGrid | None) -> None:
-    """A junction graph lies on its map."""
+    """Check that a junction graph lies on its map."""
     graph_from_arrays(graph)
     _on_map(graph.center_m, grid, "node")
 
 
 def check_points(points: PointMap | None, info: SessionInfo, _: object = None) -> None:
-    """The voxels of points in space increase by x, then y, then z, none twice. None: there are no points."""
+    """Check that the voxels of points increase by x, then y, then z, none twice. None: there are no
+    points."""
     _as_many(0 if points is None else len(points), info.points, "points")
     if points is None:
         return
@@ -481,7 +496,7 @@ def check_points(points: PointMap | None, info: SessionInfo, _: object = None) -
 
 
 def check_submaps(submaps: SubmapArrays, info: SessionInfo, grid: OccupancyGrid | None) -> None:
-    """Submap ids increase, the submaps lie on their map, and their histograms have the sum 1, or 0."""
+    """Check that submap ids increase, submaps lie on their map, and histograms have the sum 1, or 0."""
     _as_many(len(submaps), info.submaps, "submaps")
     _each(np.diff(submaps.submap_id, prepend=-1) > 0, "the number of submap {} does not increase")
     _on_map(submaps.center_m, grid, "submap")
@@ -491,14 +506,15 @@ def check_submaps(submaps: SubmapArrays, info: SessionInfo, grid: OccupancyGrid 
 
 
 def check_histograms(histograms: F32, what: str) -> None:
-    """Histograms (N, K): no negative share, each row of sum 1, or all 0."""
+    """Check histograms (N, K): no negative share, each row of sum 1, or all 0."""
     sums = histograms @ np.ones(histograms.shape[1], np.float32)
     _each((np.abs(sums - 1.0) <= _ROUNDING) | (sums == 0.0), f"{what} histogram {{}} does not have the sum 1")
     _each((histograms >= 0).all(axis=1), f"{what} histogram {{}} has a negative share")
 
 
 def check_bins(submaps: SubmapArrays, config: Config) -> None:
-    """Histograms have as many bins as the configuration makes; others cannot be compared with a query's."""
+    """Check the number of bins against the configuration; other histograms cannot be compared with a
+    query's."""
     radius_m, bins = config.partition.radius_m, (submaps.boundary.shape[1], submaps.freespace.shape[1])
     wanted = boundary_bins(radius_m, config.signature), freespace_bins(radius_m, config.signature)
     if len(submaps) and bins != wanted:
@@ -508,8 +524,7 @@ def check_bins(submaps: SubmapArrays, config: Config) -> None:
 
 
 def check_seen(seen: SeenPlaces, info: SessionInfo, _: object = None) -> None:
-    """What is seen from places has the columns that queries are compared by; each of the places has a
-    viewpoint, and they are in order."""
+    """Check that visible surroundings have the columns of queries, and each place a viewpoint, in order."""
     columns = seen.signatures.shape[1]
     if columns != SIGNATURE_COLUMNS:
         raise ValueError(f"signatures of {columns} columns; this version compares {SIGNATURE_COLUMNS}")
@@ -530,7 +545,7 @@ _CHECKS: dict[str, Callable[[Any, SessionInfo, OccupancyGrid | None], None]] = {
 
 
 def _each(right: Any, what: str) -> None:
-    """Raises ValueError with the number of the first of `right` (N,) that is false, in place of `{}`."""
+    """Raise ValueError with the number of the first of `right` (N,) that is false, in place of `{}`."""
     if not right.all():
         raise ValueError(what.format(int(right.argmin())))
 
@@ -542,12 +557,12 @@ def _edge(edge_m: float) -> None:
 
 
 def _near(points_m: F64 | F32, what: str) -> None:
-    """Points (N, 2 or 3) are at plausible coordinates."""
+    """Check that points (N, 2 or 3) are at plausible coordinates."""
     _each((np.abs(points_m) <= FARTHEST_M).all(axis=1), f"{what} {{}} is more than {FARTHEST_M:g} m away")
 
 
 def _on_map(points_m: F64, grid: OccupancyGrid | None, what: str) -> None:
-    """Points (N, 2) lie on a map, or within a cell of it."""
+    """Check that points (N, 2) lie on a map, or within a cell of it."""
     if grid is None:
         return
     cell_m = grid.resolution_m

@@ -1,4 +1,4 @@
-"""Changing a database of any engine, checking it, and copying, merging and splitting databases."""
+"""Changes of a database of any engine, checks of it, and copying, merging and splitting databases."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def rename(target: Place, old: str, new: str) -> None:
 
 
 def place(target: Place, frames: Mapping[str, BuildingFrame | None]) -> None:
-    """Store where sessions lie in their building, by name, all or none; None: nowhere.
+    """Store the places of sessions in their building, by name, all or none; None: nowhere.
 
     All else stays as it is. Raises DatabaseError for a name that no session has, OutputError, DatabaseBusy,
     and as `open_database`.
@@ -61,22 +61,22 @@ def place(target: Place, frames: Mapping[str, BuildingFrame | None]) -> None:
 
 
 def exists(target: Place) -> bool:
-    """Whether there is anything that storing without `keep` would replace."""
+    """Return True if there is anything that storing without `keep` would replace."""
     return engine_of(target).exists(target)
 
 
 def is_database(name: str) -> bool:
-    """Whether this is the URL or the file of a submap database."""
+    """Return True if this is the URL or the file of a submap database."""
     return is_url(name) or is_submap_file(Path(name))
 
 
 def shown(place: Place) -> str:
-    """A path or URL for messages: never with a password."""
+    """Return a path or URL for messages: never with a password."""
     return location(str(place)) if is_url(place) else str(place)
 
 
 def check(source: Place) -> tuple[Problem, ...]:
-    """Read everything and list what is wrong; empty if it is sound.
+    """Read everything and return all problems; empty if it is sound.
 
     Raises NotADatabase or DatabaseVersion if `source` is no database of the format that this version reads.
     """
@@ -89,10 +89,10 @@ def copy(
 ) -> tuple[Problem, ...]:
     """Write a compact copy, on the same or another engine.
 
-    With `recover`, what follows from the map of a session (junction graph, submaps and their signatures, what
-    is seen) is computed again where it is damaged; damaged points, and sessions of which another part is
-    damaged, are left out. Returns all damage. Raises DatabaseCorrupt for damage without `recover`,
-    OutputError if `target` exists without `overwrite`.
+    With `recover`, parts that follow from the map of a session (junction graph, submaps and their signatures,
+    visible surroundings) are computed again where they are damaged; damaged points, and sessions of which
+    another part is damaged, are left out. Returns all damage. Raises DatabaseCorrupt for damage without
+    `recover`, OutputError if `target` exists without `overwrite`.
     """
     refuse_existing(target, overwrite)
     problems = check(source)
@@ -104,9 +104,9 @@ def copy(
 
 
 def merge(sources: Sequence[Place], target: Place, *, overwrite: bool = False) -> int:
-    """Put the sessions of several databases into a new one; returns how many.
+    """Put the sessions of several databases into a new one; returns their number.
 
-    A session that several of them hold is taken once. Raises DatabaseError if a database is named twice, if
+    A session that is in several of them is taken once. Raises DatabaseError if a database is named twice, if
     two different sessions share a name, or were made with settings whose submaps cannot be compared.
     """
     refuse_existing(target, overwrite)
@@ -129,7 +129,7 @@ def merge(sources: Sequence[Place], target: Place, *, overwrite: bool = False) -
 
 
 def split(source: Place, names: Sequence[str], target: Place, *, overwrite: bool = False) -> int:
-    """Copy sessions of a database into a new one; returns how many. `source` stays as it is.
+    """Copy sessions of a database into a new one; returns their number. `source` stays as it is.
 
     Raises DatabaseError for a name that no session has, or for a `target` that is `source`; OutputError if
     `target` exists without `overwrite`.

@@ -1,8 +1,6 @@
-"""The rows of a database in PostgreSQL: one for a whole fleet, with many writers at once.
+"""The rows of a database on a PostgreSQL server: one for a whole fleet, with many writers at once.
 
-The database on a PostgreSQL server: its tables, the connection to it, and the meaning of its errors.
-
-Everything is in a schema of its own, `pc2grid`, so the database may hold other things too.
+Everything is in a schema of its own, `pc2grid`, so the database may hold other tables, too.
 """
 
 from __future__ import annotations
@@ -13,7 +11,6 @@ from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from pc2grid import libraries as extras
 from pc2grid.errors import (
     DatabaseBusy,
     DatabaseCorrupt,
@@ -23,6 +20,7 @@ from pc2grid.errors import (
     OutputError,
     Pc2GridError,
 )
+from pc2grid.libraries import require
 from signature.database.protocol import (
     APPLICATION_ID,
     BUSY_TIMEOUT_S,
@@ -51,7 +49,7 @@ class PostgresRows(Rows):
 
     @classmethod
     def open(cls, place: Place, *, damaged: bool = False) -> Self:
-        """See `Rows.open`."""
+        """Open the rows, see `Rows.open`."""
         with contextlib.ExitStack() as undo:
             rows = cls._connected(place)
             undo.callback(rows.close)
@@ -67,8 +65,11 @@ class PostgresRows(Rows):
     def change(
         cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
     ) -> None:
-        """See `Rows.change`. Any number of processes may write at once; they wait for each other only if they
-        store sessions of one name, or while the database is empty."""
+        """Change the rows, see `Rows.change`.
+
+        Any number of processes may write at once; they wait for each other only if they store sessions of one
+        name, or while the database is empty.
+        """
         errors = driver().errors
         with contextlib.closing(cls._connected(place)) as rows:
             if create:
@@ -91,7 +92,8 @@ class PostgresRows(Rows):
 
     @classmethod
     def exists(cls, place: Place) -> bool:
-        """Whether the database holds sessions. Raises DatabaseUnreachable if the server does not answer."""
+        """Return True if the database holds sessions. Raises DatabaseUnreachable if the server does not
+        answer."""
         with contextlib.closing(cls._connected(place)) as rows:
             try:
                 inspect(rows.connection, rows.location)
@@ -110,7 +112,7 @@ class PostgresRows(Rows):
             self.connection.execute("SELECT 1 FROM about")
 
     def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
-        """The rows of a query. Raises the errors of `served`."""
+        """Yield the rows of a query. Raises the errors of `served`."""
         with served(self.location), self.connection.cursor(binary=True) as cursor:
             found = cursor.execute(statement.replace("?", "%s"), values).fetchall()
         yield from found
@@ -121,12 +123,12 @@ class PostgresRows(Rows):
             self.connection.execute(statement.replace("?", "%s"), values)
 
     def new_id(self) -> int:
-        """A number for a further session."""
+        """Return a number for a further session."""
         ((number,),) = self.select("SELECT nextval('session_id')")
         return int(number)
 
     def other(self, info: SessionInfo) -> SessionInfo | None:
-        """Any session of another name, locked against removal until this transaction ends.
+        """Return any session of another name, locked against removal until this transaction ends.
 
         None: there is no other, and no writer can add one until then.
         """
@@ -141,7 +143,7 @@ class PostgresRows(Rows):
         return super().other(info)
 
     def orphans(self) -> Iterator[Problem]:
-        """None: the server keeps no part without its session."""
+        """Yield nothing: a foreign key excludes orphaned parts."""
         return iter(())
 
 
@@ -160,12 +162,12 @@ _CONNECT_TIMEOUT_S = 10
 
 
 def is_url(path_or_url: object) -> bool:
-    """Whether this names a PostgreSQL database and not a file."""
+    """Return True if this names a PostgreSQL database and not a file."""
     return isinstance(path_or_url, str) and path_or_url.startswith(("postgresql://", "postgres://"))
 
 
 def location(url: str) -> str:
-    """The URL without password and options, which may be shown and logged.
+    """Return the URL without password and options, which may be shown and logged.
 
     Raises DatabaseError for a URL that PostgreSQL does not accept, without quoting it.
     """
@@ -204,7 +206,7 @@ def served(where: str) -> Iterator[None]:
 
 
 def connect(url: str) -> Connection[Any]:
-    """A connection in autocommit mode. Raises DatabaseUnreachable or NotADatabase."""
+    """Open a connection in autocommit mode. Raises DatabaseUnreachable or NotADatabase."""
     psycopg, where = driver(), location(url)
     parts = psycopg.conninfo.conninfo_to_dict(url)
     defaults = {"connect_timeout": _CONNECT_TIMEOUT_S, "application_name": "pc2grid"}
@@ -256,8 +258,8 @@ def _exists(connection: Connection[Any]) -> bool:
 
 
 def driver() -> Any:
-    """The module psycopg. Raises DatabaseError with what to install if it is missing."""
-    extras.require({"postgres": "postgresql://"})
+    """Import the module psycopg. Raises DatabaseError with the package to install if it is missing."""
+    require({"postgres": "postgresql://"})
     import psycopg
     import psycopg.conninfo
 
@@ -265,7 +267,7 @@ def driver() -> Any:
 
 
 def _refused(error: Error, where: str, parts: dict[str, Any]) -> Pc2GridError:
-    """Why the connection failed. libpq gives no error codes for this, only text."""
+    """Return the error for a connection that failed. libpq gives no error codes for this, only text."""
     text = str(error)
     said = text.rpartition("FATAL:")[2].strip().splitlines()[0] if "FATAL:" in text else ""
     if "password" in text:

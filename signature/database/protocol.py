@@ -1,11 +1,11 @@
-"""The description of the sessions of a submap database, and its format.
+"""The description of the sessions of a submap database: labels, provenance, place in a building, and the
+format.
 
-How a map is bent: a small rigid motion that varies over the map.
-
-A session drifts where it closes no loop, and what another session knows straightens it
-(`signature.localization.joining.building`). Its map stays as it was drawn. A bend has a row for each of
-some places of the map: x and y of the place, and how the map moves about it, x, y and yaw, all in the axes of
-the map. In between, the motions are blended by a Gaussian of the distance. A map without rows is straight.
+A session drifts where it closes no loop, and joining corrects it by other sessions
+(`signature.localization.joining.building`). Its map stays as it was drawn; the correction is a `Deformation`,
+a small rigid motion that varies over the map. It has a row for each of some places of the map: x and y of the
+place, and the motion of the map about it, x, y and yaw, all in the axes of the map. In between, the motions
+are blended by a Gaussian of the distance. A map without rows is rigid.
 """
 
 from __future__ import annotations
@@ -28,68 +28,19 @@ if TYPE_CHECKING:
     from signature.paper import Signature
 
 
-Bend = tuple[tuple[float, float, float, float, float], ...]
-"""Rows (x, y, motion in x, in y, in yaw); metres and radians."""
-
-_BLENDED_M = 3.0
-"""Standard deviation of the weights. From 2 to 4 m, sessions of csail and aces came to lie equally well."""
-_NEAREST = 8
-"""Places that are blended; those further away have no weight."""
-_ROUNDS = 3
-"""In which a motion is inverted: each leaves a few percent of the error, as steep as real bends are."""
-
-
-def motions(bend: Bend, points_m: F64) -> F64:
-    """How a map moves at points (M, 2): (M, 3) x, y, yaw."""
-    points_m = np.asarray(points_m, np.float64)
-    if not bend or not len(points_m):
-        return np.zeros((len(points_m), 3))
-    from scipy.spatial import cKDTree
-
-    rows = np.array(bend)
-    distance_m, near = cKDTree(rows[:, :2]).query(points_m, k=range(1, min(_NEAREST, len(rows)) + 1))
-    weight = np.exp((distance_m[:, :1] ** 2 - distance_m**2) / (2.0 * _BLENDED_M**2))
-    weight /= weight.sum(axis=1, keepdims=True)
-    moved = rows[near, 2:]
-    away = points_m[:, None] - rows[near, :2]
-    moved[..., 0] -= moved[..., 2] * away[..., 1]
-    moved[..., 1] += moved[..., 2] * away[..., 0]
-    return np.asarray((weight[..., None] * moved).sum(axis=1))
-
-
-def straightened(bend: Bend, points_m: F64) -> F64:
-    """Where points (M, 2) of a map lie when it is straight."""
-    return np.asarray(points_m + motions(bend, points_m)[:, :2])
-
-
-def drawn_at(bend: Bend, points_m: F64) -> F64:
-    """The points (M, 2) of a map that lie at `points_m` (M, 2) when it is straight."""
-    drawn_m = points_m
-    for _ in range(_ROUNDS if bend else 0):
-        drawn_m = points_m - motions(bend, drawn_m)[:, :2]
-    return drawn_m
-
-
-def rigid_motions(bend: Bend, points_m: F64) -> list[SE2]:
-    """The rigid motions of a map about points (M, 2) of it: T_straight_drawn, each good near its point."""
-    found = []
-    for (x, y), (dx, dy, yaw) in zip(points_m.tolist(), motions(bend, points_m).tolist(), strict=True):
-        found.append(SE2(x + dx, y + dy, yaw) @ SE2(-x, -y, 0.0))
-    return found
-
-
-def largest_m(bend: Bend) -> float:
-    """How far a bend moves any of its places."""
-    return max((float(np.hypot(dx, dy)) for _, _, dx, dy, _ in bend), default=0.0)
-
-
+FORMAT = 1
+"""The format that is written and read."""
+APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
+"""Marks a file, and the lock of a server, as pc2grid's."""
+BUSY_TIMEOUT_S = 30.0
+"""How long a writer waits for another one; chosen by hand."""
 Place = str | Path
 """Path of a `*.submaps` file, or URL of a PostgreSQL database."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Label:
-    """Where a session was recorded; None: not known.
+    """The place where a session was recorded; None: not known.
 
     building, floor : in the user's words.
     """
@@ -101,25 +52,24 @@ class Label:
         return ", ".join(word for word in (self.building, self.floor) if word) or "no label"
 
     def contradicts(self, other: Label) -> bool:
-        """Whether the two name different buildings, or different floors; None differs from nothing."""
+        """Return True if the two name different buildings, or different floors; None contradicts nothing."""
         pairs = ((self.building, other.building), (self.floor, other.floor))
         return any(a is not None and b is not None and a != b for a, b in pairs)
 
     def agrees(self, other: Label) -> bool:
-        """Whether the two name the same building, and the same floor or none."""
+        """Return True if the two name the same building, and the same floor or none."""
         return self.building is not None and self == other
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:
-    """What made a session: enough to make it again. It has no time of day, so equal inputs give equal bytes.
+    """The origin of a session: enough to make it again. It has no time of day, so equal inputs give equal
+    bytes.
 
-    source : file name of the recording or map, without its folder, which differs between machines.
-    digest : sha256 of the recording, hex.
-    config : the whole effective configuration.
-    start_s, duration_s : which part of the recording, seconds from its start; duration None: to the end.
-    versions : program and library -> version.
-    label : building and floor.
+    source : file name of the recording or map, without its folder, which differs between machines. digest :
+    sha256 of the recording, hex. config : the whole effective configuration. start_s, duration_s : part of
+    the recording, seconds from its start; duration None: to the end. versions : program and library ->
+    version. label : building and floor.
     """
 
     source: str
@@ -134,64 +84,16 @@ class Provenance:
         return f"Provenance({short(self.source)}, sha256 {self.digest[:12]}, {short(self.label)})"
 
 
-Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
-"""Of x, y and yaw, row by row; metres and radians."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BuildingFrame:
-    """Where a session lies in the frame of its building, in which joined sessions have their answers.
-
-    name : of the frame: that of the session whose map frame it was when the first sessions were joined. It
-        stays when that session is renamed or removed.
-    T_building_session : the map frame of the session in that of the building. covariance : of it, in the axes
-        of the building.
-    bend : how the map is bent before it is placed by T_building_session; empty: it is rigid.
-    """
-
-    name: str
-    T_building_session: SE2
-    covariance: Covariance
-    bend: Bend = ()
-
-    def at(self, x_m: float, y_m: float) -> SE2:
-        """T_building_session around a place of the session's map."""
-        return self.around(np.array([(x_m, y_m)]))[0]
-
-    def around(self, points_m: F64) -> list[SE2]:
-        """T_building_session around points (N, 2) of the session's map."""
-        return [self.T_building_session @ T for T in rigid_motions(self.bend, points_m)]
-
-    def placed(self, T_session_base: SE2) -> SE2:
-        """A pose in the session's map, in the building."""
-        return self.at(T_session_base.x, T_session_base.y) @ T_session_base
-
-    def apply(self, points_m: F64) -> F64:
-        """Points (N, 2) or (N, 3) of the session's map, in the building."""
-        plane_m = self.T_building_session.apply(straightened(self.bend, points_m[:, :2]))
-        return np.column_stack((plane_m, points_m[:, 2:]))
-
-    def as_drawn(self, points_m: F64) -> F64:
-        """The points (N, 2) of the session's map that lie at points (N, 2) of the building."""
-        return drawn_at(self.bend, self.T_building_session.inverse().apply(points_m))
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionInfo:
     """A session as `db info` shows it.
 
-    name : unique within the database.
-    sensor : kind that made it, or "map".
-    submaps : how many.
-    area_m2 : free space in its grid.
-    path_m : distance driven, metres; 0 for an imported map.
-    duration_s : time between first and last pose.
-    scans : poses in its trajectory.
-    points : how many points in space are stored.
-    report : what was read, and what was lost while reading.
-    consistency : how well its map agrees with its own scans; None for an imported map.
-    odometry : how well odometry agrees with its scans; None likewise.
-    precision : how exactly its places lie to each other; None likewise.
+    name : unique within the database. sensor : kind that made it, or "map". submaps : how many. area_m2 :
+    free space in its grid. path_m : distance driven, metres; 0 for an imported map. duration_s : time between
+    first and last pose. scans : poses in its trajectory. points : how many points in space are stored. report
+    : counts of what was read, and of what was lost while reading. consistency : agreement of its map with its
+    own scans; None for an imported map. odometry : agreement of odometry with its scans; None likewise.
+    precision : standard deviations of its places relative to each other; None likewise.
     """
 
     name: str
@@ -218,34 +120,22 @@ class SessionInfo:
 
     @property
     def digest(self) -> str:
-        """sha256 of the recording, hex."""
+        """Return the sha256 of the recording, hex."""
         return self.provenance.digest
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """The warnings of reading and mapping."""
+        """Return the warnings of reading and mapping."""
         return self.report.warnings
 
     @property
     def lossy(self) -> bool:
-        """Whether data was lost while reading."""
+        """Return True if data was lost while reading."""
         return self.report.lossy
 
 
-def refuse_other_format(location: object, version: int) -> None:
-    """Raises DatabaseVersion for a database of another format."""
-    if version != FORMAT:
-        raise DatabaseVersion(
-            f"{location}: database format {version}; this pc2grid reads format {FORMAT}",
-            hint="use a newer pc2grid" if version > FORMAT else "convert the recordings again",
-        )
-
-
-def no_utf8(location: str) -> DatabaseError:
-    """The error for a name that is asked for and that no database can hold."""
-    return DatabaseError(
-        f"{location}: holds UTF-8 only, and a name is none", hint="rename the recording, or use --name"
-    )
+Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
+"""Everything that is stored of one session: the map, the signature of each submap, the provenance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,11 +146,119 @@ class Problem:
     what: str
 
 
-FORMAT = 1
-"""The format that is written and read."""
-APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
-"""Marks a file, and the lock of a server, as pc2grid's."""
-BUSY_TIMEOUT_S = 30.0
-"""How long a writer waits for another one; chosen by hand."""
-Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
-"""Everything that is stored of one session: the map, the signature of each submap, the provenance."""
+# The place in a building.
+
+Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+"""Of x, y and yaw, row by row; metres and radians."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BuildingFrame:
+    """The place of a session in the frame of its building, in which joined sessions have their answers.
+
+    name : of the frame: that of the session whose map frame it was when the first sessions were joined. It
+        stays when that session is renamed or removed.
+    T_building_session : the map frame of the session in that of the building. covariance : of it, in the axes
+        of the building.
+    bend : deformation of the map before T_building_session is applied; empty: it is rigid.
+    """
+
+    name: str
+    T_building_session: SE2
+    covariance: Covariance
+    bend: Deformation = ()
+
+    def at(self, x_m: float, y_m: float) -> SE2:
+        """Return T_building_session around a place of the session's map."""
+        return self.around(np.array([(x_m, y_m)]))[0]
+
+    def around(self, points_m: F64) -> list[SE2]:
+        """Return T_building_session around points (N, 2) of the session's map."""
+        return [self.T_building_session @ T for T in rigid_motions(self.bend, points_m)]
+
+    def placed(self, T_session_base: SE2) -> SE2:
+        """Transform a pose in the session's map into the building."""
+        return self.at(T_session_base.x, T_session_base.y) @ T_session_base
+
+    def apply(self, points_m: F64) -> F64:
+        """Transform points (N, 2) or (N, 3) of the session's map into the building."""
+        plane_m = self.T_building_session.apply(deformed(self.bend, points_m[:, :2]))
+        return np.column_stack((plane_m, points_m[:, 2:]))
+
+    def to_session(self, points_m: F64) -> F64:
+        """Transform points (N, 2) of the building into the session's map."""
+        return undeformed(self.bend, self.T_building_session.inverse().apply(points_m))
+
+
+Deformation = tuple[tuple[float, float, float, float, float], ...]
+"""Rows (x, y, motion in x, in y, in yaw); metres and radians."""
+_BLENDED_M = 3.0
+"""Standard deviation of the weights. From 2 to 4 m, sessions of csail and aces came to lie equally well."""
+_NEAREST = 8
+"""Places that are blended; those further away have no weight."""
+_ROUNDS = 3
+"""In which a motion is inverted: each leaves a few percent of the error, as steep as real bends are."""
+
+
+def motions(deformation: Deformation, points_m: F64) -> F64:
+    """Return the motion (M, 3) x, y, yaw of a map at points (M, 2)."""
+    points_m = np.asarray(points_m, np.float64)
+    if not deformation or not len(points_m):
+        return np.zeros((len(points_m), 3))
+    from scipy.spatial import cKDTree
+
+    rows = np.array(deformation)
+    distance_m, near = cKDTree(rows[:, :2]).query(points_m, k=range(1, min(_NEAREST, len(rows)) + 1))
+    weight = np.exp((distance_m[:, :1] ** 2 - distance_m**2) / (2.0 * _BLENDED_M**2))
+    weight /= weight.sum(axis=1, keepdims=True)
+    moved = rows[near, 2:]
+    away = points_m[:, None] - rows[near, :2]
+    moved[..., 0] -= moved[..., 2] * away[..., 1]
+    moved[..., 1] += moved[..., 2] * away[..., 0]
+    return np.asarray((weight[..., None] * moved).sum(axis=1))
+
+
+def deformed(deformation: Deformation, points_m: F64) -> F64:
+    """Return the positions (M, 2) of points (M, 2) of a map after its deformation."""
+    return np.asarray(points_m + motions(deformation, points_m)[:, :2])
+
+
+def undeformed(deformation: Deformation, points_m: F64) -> F64:
+    """Return the points (M, 2) of a map that its deformation moves to `points_m` (M, 2)."""
+    drawn_m = points_m
+    for _ in range(_ROUNDS if deformation else 0):
+        drawn_m = points_m - motions(deformation, drawn_m)[:, :2]
+    return drawn_m
+
+
+def rigid_motions(deformation: Deformation, points_m: F64) -> list[SE2]:
+    """Return the rigid motions of a map about points (M, 2) of it, T_deformed_drawn, each good near its
+    point."""
+    found = []
+    for (x, y), (dx, dy, yaw) in zip(points_m.tolist(), motions(deformation, points_m).tolist(), strict=True):
+        found.append(SE2(x + dx, y + dy, yaw) @ SE2(-x, -y, 0.0))
+    return found
+
+
+def largest_m(deformation: Deformation) -> float:
+    """Return the largest shift of a place by a deformation."""
+    return max((float(np.hypot(dx, dy)) for _, _, dx, dy, _ in deformation), default=0.0)
+
+
+# Errors.
+
+
+def refuse_other_format(location: object, version: int) -> None:
+    """Raise DatabaseVersion for a database of another format."""
+    if version != FORMAT:
+        raise DatabaseVersion(
+            f"{location}: database format {version}; this pc2grid reads format {FORMAT}",
+            hint="use a newer pc2grid" if version > FORMAT else "convert the recordings again",
+        )
+
+
+def no_utf8(location: str) -> DatabaseError:
+    """Return the error for a name that no database can hold."""
+    return DatabaseError(
+        f"{location}: holds UTF-8 only, and a name is none", hint="rename the recording, or use --name"
+    )

@@ -1,7 +1,7 @@
-"""The two tables of a database, and what SQLite and PostgreSQL share of reading and writing their rows.
+"""The two tables of a database, and the reading and writing of their rows that SQLite and PostgreSQL share.
 
 `session` has one row a session: its name, its label, its document. `part` has one row for each part of a
-session. Every row ends with the crc32 of its other columns: no engine notices a flipped bit in a blob.
+session. Every row ends with the crc32 of its other columns: no engine detects a flipped bit in a blob.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from pydantic import ValidationError
 from pc2grid.errors import DatabaseError, DatabaseVersion
 from pc2grid.model import is_part_of
 from signature.database import document
-from signature.database import document as validation
 from signature.database.document import PARTS, DatabaseDamage, StoredSession, explained, row_crc
 from signature.database.protocol import BuildingFrame, Place, Problem, SessionInfo
 
@@ -37,10 +36,10 @@ _ORPHANS = (
 
 
 def definitions(blob: str, number: str, *, session_key: str = "", part_key: str = "") -> dict[str, str]:
-    """The statement that creates each table: table -> SQL.
+    """Return the statement that creates each table: table -> SQL.
 
-    blob : the engine's type of bytes. number : its column of a session's number. session_key, part_key :
-    what it adds to the two tables.
+    blob : the engine's type of bytes. number : its column of a session's number. session_key, part_key : its
+    additions to the two tables.
     """
     return {
         "session": f"CREATE TABLE session (building text NOT NULL, {number}, floor text NOT NULL,"
@@ -78,7 +77,7 @@ class Rows(ABC):
     @classmethod
     @abstractmethod
     def open(cls, place: Place, *, damaged: bool = False) -> Self:
-        """The rows of what is there, to be read. damaged : in whatever state it is.
+        """Open the rows of a database for reading. damaged : in whatever state it is.
 
         Raises NotADatabase, DatabaseVersion, DatabaseCorrupt, DatabaseUnreachable.
         """
@@ -90,8 +89,8 @@ class Rows(ABC):
     ) -> None:
         """Change a database in one transaction, all or nothing.
 
-        action : may be called again if another writer comes in between. keep : start from what is there;
-        otherwise from nothing. create : make the database if there is none.
+        action : may be called again if another writer comes in between. keep : start from the present
+        content; otherwise from nothing. create : make the database if there is none.
 
         Raises what `action` raises, as `open`, OutputError if it cannot be written, and DatabaseBusy.
         """
@@ -99,11 +98,11 @@ class Rows(ABC):
     @classmethod
     @abstractmethod
     def exists(cls, place: Place) -> bool:
-        """Whether there is anything that a change without `keep` would replace."""
+        """Return True if there is anything that a change without `keep` would replace."""
 
     @abstractmethod
     def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
-        """The rows of a query with `?` for each value. Raises DatabaseCorrupt, DatabaseUnreachable."""
+        """Yield the rows of a query with `?` for each value. Raises DatabaseCorrupt, DatabaseUnreachable."""
 
     @abstractmethod
     def execute(self, statement: str, *values: Any) -> None:
@@ -111,24 +110,24 @@ class Rows(ABC):
 
     @abstractmethod
     def new_id(self) -> int:
-        """A number for a further session, larger than all others."""
+        """Return a number for a further session, larger than all others."""
 
     @abstractmethod
     def renew(self) -> None:
-        """See the database as it is now."""
+        """Take a new snapshot of the database."""
 
     def close(self) -> None:
         """Close the file or connection."""
         self.connection.close()
 
     def damaged_structure(self) -> Iterator[Problem]:
-        """What is wrong with the database itself."""
+        """Yield the problems of the database itself."""
         return iter(())
 
     # --- reading --------------------------------------------------------------------------------------
 
     def sessions(self, condition: str = "true", *values: Any, tail: str = "") -> Iterator[SessionRow]:
-        """Rows of sessions in the order they were added. tail : what follows that in the statement.
+        """Yield rows of sessions in the order they were added. tail : end of the statement.
 
         Raises DatabaseCorrupt where the order ends: a page of a file that refers back to earlier pages gives
         the same rows again and again, more than memory holds.
@@ -142,7 +141,7 @@ class Rows(ABC):
             yield row
 
     def info(self, row: SessionRow) -> SessionInfo:
-        """What the row of a session says.
+        """Return the description of a session from its row.
 
         Raises DatabaseCorrupt, and DatabaseVersion for settings that this version does not know.
         """
@@ -163,7 +162,8 @@ class Rows(ABC):
             return info
 
     def part(self, row: SessionRow, part: str, others: Mapping[str, Any]) -> Any:
-        """A part of a session (`signature.database.document`). others : parts that it is compared with.
+        """Return a part of a session (`signature.database.document`). others : parts that it is compared
+        with.
 
         Raises DatabaseCorrupt that names the part and the session.
         """
@@ -175,11 +175,11 @@ class Rows(ABC):
             if row_crc(values) != crc:
                 raise ValueError("wrong checksum")
             value = document.decode(part, values[-1])
-            validation.check(part, value, others)
+            document.check(part, value, others)
             return value
 
     def problems(self, row: SessionRow, parts: Sequence[str] = PARTS) -> Iterator[Problem]:
-        """What is wrong with a session and these parts of it."""
+        """Yield the problems of a session and of these parts of it."""
         known: dict[str, Any] = {}
         try:
             known["info"] = self.info(row)
@@ -194,7 +194,7 @@ class Rows(ABC):
             yield Problem(f"session {row.id}", error.message)
 
     def all_problems(self) -> tuple[Problem, ...]:
-        """What is wrong with the database, its sessions and their parts; as far as it can be read."""
+        """Return the problems of the database, its sessions and their parts; as far as it can be read."""
         problems: list[Problem] = []
         try:
             problems += self.damaged_structure()
@@ -206,7 +206,7 @@ class Rows(ABC):
         return tuple(dict.fromkeys(problems))
 
     def orphans(self) -> Iterator[Problem]:
-        """Parts without a session."""
+        """Yield parts without a session."""
         for (number,) in self.select(_ORPHANS):
             yield Problem(f"parts of session {number}", "belong to no session")
 
@@ -222,7 +222,7 @@ class Rows(ABC):
     # --- writing: within a transaction ----------------------------------------------------------------
 
     def store(self, sessions: Iterable[StoredSession], *, overwrite: bool) -> None:
-        """Add sessions. One that is stored already is passed over.
+        """Add sessions. One that is stored already is skipped.
 
         overwrite : replace a session of the same name.
 
@@ -230,7 +230,7 @@ class Rows(ABC):
         compared with those of the other sessions.
         """
         for session in sessions:
-            validation.check("submaps", session.submaps, {"info": session.info, "grid": session.grid})
+            document.check("submaps", session.submaps, {"info": session.info, "grid": session.grid})
             text = document.encode_info(session.info)
             info = document.decode_info(text)
             other = self.other(info)
@@ -254,7 +254,7 @@ class Rows(ABC):
                 self._insert("part", PART_COLUMNS, (building, number, part, data))
 
     def other_parts(self, name: str) -> list[str]:
-        """The further sessions of the recording that a session was made from, which fell into parts."""
+        """Return the other parts of the recording of a session, which are sessions of their own."""
         first = self.find(name)
         if first is None:
             return []
@@ -282,8 +282,10 @@ class Rows(ABC):
         )  # fmt: skip
 
     def place(self, frames: Mapping[str, BuildingFrame | None]) -> None:
-        """Store where sessions lie in their building, by name; None: nowhere. Raises DatabaseError for a name
-        that no session has."""
+        """Store the places of sessions in their building, by name; None: nowhere.
+
+        Raises DatabaseError for a name that no session has.
+        """
         for name, frame in frames.items():
             row = self._found(name)
             where = row.building, row.id, "frame"
@@ -291,11 +293,11 @@ class Rows(ABC):
             self._insert("part", PART_COLUMNS, (*where, document.encode("frame", frame)))
 
     def find(self, name: str) -> SessionRow | None:
-        """The session of a name."""
+        """Return the session of a name."""
         return next(self.sessions("name = ?", name, tail=self.for_update), None)
 
     def other(self, info: SessionInfo) -> SessionInfo | None:
-        """Any session of another name; None if there is none."""
+        """Return any session of another name; None if there is none."""
         row = next(self.sessions("name <> ?", info.name, tail=" LIMIT 1"), None)
         return None if row is None else self.info(row)
 
@@ -305,7 +307,7 @@ class Rows(ABC):
         self.execute("DELETE FROM session WHERE building = ? AND id = ?", row.building, row.id)
 
     def _found(self, name: str) -> SessionRow:
-        """The session of a name. Raises DatabaseError that names some of those that are there."""
+        """Return the session of a name. Raises DatabaseError that names some of the others."""
         row = self.find(name)
         if row is None:
             known = [name for (name,) in self.select("SELECT name FROM session ORDER BY id LIMIT 20")]
@@ -320,7 +322,7 @@ class Rows(ABC):
 
 
 def no_session(name: str, known: Iterable[str], location: str) -> DatabaseError:
-    """The error for a session that a database does not hold."""
+    """Return the error for a session that is not in a database."""
     there = ", ".join(map(repr, known)) or "none"
     return DatabaseError(f"{location}: no session {name!r}", hint=f"there are: {there}")
 

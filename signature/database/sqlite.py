@@ -1,13 +1,10 @@
-"""Changing a database as a whole: in a copy that replaces the file when it is complete.
+"""The rows of one SQLite file, which is changed as a whole: in a copy that replaces it when it is complete.
 
 A finished `*.submaps` file is never written to again. A reader keeps the file it opened, complete and
-unlocked, on any file system and any read-only medium; a file opened later has the new content. A writer
-that is killed at any moment leaves the old content. There is one writer at a time: it holds a lock on a file
-beside the database, which the system releases when the process ends.
-
-The rows of one SQLite file.
-
-What makes a file a `*.submaps` file: its header and tables, examined before anything else is read.
+unlocked, on any file system and any read-only medium; a file opened later has the new content. A writer that
+is killed at any moment leaves the old content. There is one writer at a time: it holds a lock on a file
+beside the database, which the system releases when the process ends. The header and the tables of a file are
+examined before anything else is read.
 """
 
 from __future__ import annotations
@@ -43,18 +40,129 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
+_MAPPED_BYTES = 1 << 30
+"""How much of a file SQLite maps into memory at most; chosen by hand."""
+
+
+class SqliteRows(Rows):
+    """The rows of a `*.submaps` file. Finished files are never written again, so readers need no locks."""
+
+    @classmethod
+    def open(cls, place: Place, *, damaged: bool = False) -> Self:
+        """Open the rows, see `Rows.open`."""
+        path = local(place)
+        with contextlib.suppress(*[DatabaseCorrupt] if damaged else []):
+            inspect_header(path)
+        rows = cls(path, str(path), _connect(path))
+        if not damaged:
+            with contextlib.ExitStack() as undo:
+                undo.callback(rows.close)
+                rows._inspect_tables()
+                undo.pop_all()
+        return rows
+
+    @classmethod
+    def change(
+        cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
+    ) -> None:
+        """Change the rows, see `Rows.change`. Deleted rows take no place in the new file."""
+        path = local(place)
+        if not create:
+            inspect_header(path)
+        with rewrite(path, keep=keep) as connection:
+            action(cls(path, str(path), connection))
+            # The copy that is worked on is nobody else's: the change may end before the file is made compact.
+            connection.execute("COMMIT")
+            if connection.execute("PRAGMA freelist_count").fetchone() != (0,):
+                connection.execute("VACUUM")
+            connection.execute("BEGIN")
+
+    @classmethod
+    def exists(cls, place: Place) -> bool:
+        """Return True if there is a file, other than an empty one."""
+        path = local(place)
+        return path.exists() and not (path.is_file() and path.stat().st_size == 0)
+
+    def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
+        """Yield the rows of a query. Raises DatabaseCorrupt if SQLite finds the file damaged."""
+        try:
+            # `yield from` would close the cursor of an unfinished generator, perhaps after the connection.
+            for row in self.connection.execute(statement, values):  # noqa: UP028
+                yield row
+        except UnicodeEncodeError:
+            raise no_utf8(self.location) from None
+        except sqlite3.ProgrammingError:
+            raise  # the use of a closed database is a mistake of the caller, not damage
+        except DAMAGE as error:
+            raise DatabaseDamage(self.location, "file", f"{type(error).__name__}: {error}") from error
+
+    def execute(self, statement: str, *values: Any) -> None:
+        """Change rows. Raises sqlite3.Error, which `rewrite` explains."""
+        self.connection.execute(statement, values)
+
+    def new_id(self) -> int:
+        """Return a number for a further session."""
+        ((largest,),) = self.select("SELECT coalesce(max(id), 0) FROM session")
+        return int(largest) + 1
+
+    def renew(self) -> None:
+        """Open the present file."""
+        self.close()
+        self.connection = self.open(self.source).connection
+
+    def damaged_structure(self) -> Iterator[Problem]:
+        """Yield a wrong header, tables that are not those of the format, and the findings of SQLite
+        itself."""
+        try:
+            inspect_header(local(self.source))
+            self._inspect_tables()
+        except DatabaseCorrupt as error:
+            yield Problem("file", error.message)
+        for (message,) in self.select("PRAGMA integrity_check"):
+            yield from (Problem("file", line) for line in str(message).splitlines() if line != "ok")
+
+    def _inspect_tables(self) -> None:
+        inspect_tables(self.connection, local(self.source))
+
+
+def local(place: Place) -> Path:
+    """Return the path of a file. Raises DatabaseError for a URL of an unknown engine."""
+    scheme, separator, _ = str(place).partition("://")
+    if isinstance(place, str) and separator:
+        raise DatabaseError(
+            f"{scheme}:// databases are not supported by this version",
+            hint="give the path of a .submaps file, or postgresql://user@host/database",
+        )
+    return Path(place)
+
+
+def _connect(path: Path) -> sqlite3.Connection:
+    """Open a connection that cannot change the file."""
+    connection = sqlite3.connect(
+        f"file:{quote(os.path.realpath(path))}?mode=ro&immutable=1",
+        uri=True,
+        isolation_level=None,
+        check_same_thread=False,
+    )
+    connection.execute("PRAGMA trusted_schema = OFF")
+    connection.execute(f"PRAGMA mmap_size = {_MAPPED_BYTES}")
+    return connection
+
+
+# Writing.
+
 _POLL_S = 0.05
 
 
 @contextlib.contextmanager
 def rewrite(path: Path, *, keep: bool) -> Iterator[sqlite3.Connection]:
-    """Give the body a connection to change; when it ends without an error, `path` holds the result.
+    """Yield a connection to change; when the body ends without an error, `path` holds the result.
 
     keep : start from the content of `path`; otherwise, or if there is none yet, from an empty database.
 
     Raises DatabaseBusy if another writer does not finish within `BUSY_TIMEOUT_S`, OutputError if the file
-    cannot be written, and NotADatabase, DatabaseVersion or DatabaseCorrupt if the content of `path` cannot
-    be kept.
+    cannot be written, and NotADatabase, DatabaseVersion or DatabaseCorrupt if the content of `path` cannot be
+    kept.
     """
     target = Path(os.path.realpath(path))
     with hold(target, BUSY_TIMEOUT_S), replace_file(target, alone=True) as copy:
@@ -91,7 +199,7 @@ def _explained(path: Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def hold(target: Path, timeout_s: float) -> Iterator[None]:
-    """Be the only writer of `target` while the body runs; wait up to `timeout_s` for another writer.
+    """Lock `target` while the body runs; wait up to `timeout_s` for another writer.
 
     Raises DatabaseBusy naming the other writer, OutputError if the folder is not writable.
     """
@@ -130,120 +238,12 @@ def hold(target: Path, timeout_s: float) -> Iterator[None]:
         os.close(descriptor)
 
 
-_MAPPED_BYTES = 1 << 30
-"""How much of a file SQLite maps into memory at most; chosen by hand."""
-
-
-class SqliteRows(Rows):
-    """The rows of a `*.submaps` file. Finished files are never written again, so readers need no locks."""
-
-    @classmethod
-    def open(cls, place: Place, *, damaged: bool = False) -> Self:
-        """See `Rows.open`."""
-        path = local(place)
-        with contextlib.suppress(*[DatabaseCorrupt] if damaged else []):
-            inspect_header(path)
-        rows = cls(path, str(path), _connect(path))
-        if not damaged:
-            with contextlib.ExitStack() as undo:
-                undo.callback(rows.close)
-                rows._inspect_tables()
-                undo.pop_all()
-        return rows
-
-    @classmethod
-    def change(
-        cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
-    ) -> None:
-        """See `Rows.change`. What was deleted takes no place in the new file."""
-        path = local(place)
-        if not create:
-            inspect_header(path)
-        with rewrite(path, keep=keep) as connection:
-            action(cls(path, str(path), connection))
-            # The copy that is worked on is nobody else's: the change may end before the file is made compact.
-            connection.execute("COMMIT")
-            if connection.execute("PRAGMA freelist_count").fetchone() != (0,):
-                connection.execute("VACUUM")
-            connection.execute("BEGIN")
-
-    @classmethod
-    def exists(cls, place: Place) -> bool:
-        """Whether there is a file, other than an empty one."""
-        path = local(place)
-        return path.exists() and not (path.is_file() and path.stat().st_size == 0)
-
-    def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
-        """The rows of a query. Raises DatabaseCorrupt where SQLite finds the file damaged."""
-        try:
-            # `yield from` would close the cursor of an unfinished generator, perhaps after the connection.
-            for row in self.connection.execute(statement, values):  # noqa: UP028
-                yield row
-        except UnicodeEncodeError:
-            raise no_utf8(self.location) from None
-        except sqlite3.ProgrammingError:
-            raise  # the use of a closed database is a mistake of the caller, not damage
-        except DAMAGE as error:
-            raise DatabaseDamage(self.location, "file", f"{type(error).__name__}: {error}") from error
-
-    def execute(self, statement: str, *values: Any) -> None:
-        """Change rows. Raises sqlite3.Error, which `rewrite` explains."""
-        self.connection.execute(statement, values)
-
-    def new_id(self) -> int:
-        """A number for a further session."""
-        ((largest,),) = self.select("SELECT coalesce(max(id), 0) FROM session")
-        return int(largest) + 1
-
-    def renew(self) -> None:
-        """Open the file that is there now."""
-        self.close()
-        self.connection = self.open(self.source).connection
-
-    def damaged_structure(self) -> Iterator[Problem]:
-        """A wrong header, tables that are not those of the format, and what SQLite itself finds wrong."""
-        try:
-            inspect_header(local(self.source))
-            self._inspect_tables()
-        except DatabaseCorrupt as error:
-            yield Problem("file", error.message)
-        for (message,) in self.select("PRAGMA integrity_check"):
-            yield from (Problem("file", line) for line in str(message).splitlines() if line != "ok")
-
-    def _inspect_tables(self) -> None:
-        inspect_tables(self.connection, local(self.source))
-
-
-def local(place: Place) -> Path:
-    """The path of a file. Raises DatabaseError for a URL of an unknown engine."""
-    scheme, separator, _ = str(place).partition("://")
-    if isinstance(place, str) and separator:
-        raise DatabaseError(
-            f"{scheme}:// databases are not supported by this version",
-            hint="give the path of a .submaps file, or postgresql://user@host/database",
-        )
-    return Path(place)
-
-
-def _connect(path: Path) -> sqlite3.Connection:
-    """A connection that cannot change the file."""
-    connection = sqlite3.connect(
-        f"file:{quote(os.path.realpath(path))}?mode=ro&immutable=1",
-        uri=True,
-        isolation_level=None,
-        check_same_thread=False,
-    )
-    connection.execute("PRAGMA trusted_schema = OFF")
-    connection.execute(f"PRAGMA mmap_size = {_MAPPED_BYTES}")
-    return connection
-
+# The file.
 
 _CONVERTED = (".mcap", ".bag", ".db3", ".yaml", ".yml", ".pcd", ".ply", ".obj", ".stl")
 CONVERT = "make one with `pc2grid convert LOG -o BUILDING.submaps`"
-
 TABLES = definitions("blob", "id integer PRIMARY KEY")
 """The statement that creates each table: table -> SQL."""
-
 DAMAGE = (sqlite3.Error, UnicodeDecodeError)
 """What SQLite raises for damaged content: the second where its message would quote bytes that are no text."""
 
@@ -261,7 +261,7 @@ def inspect_header(path: Path) -> None:
     """Examine the first 100 bytes of a file, before SQLite opens it.
 
     Raises NotADatabase (missing, empty, another kind of file, another program's SQLite file),
-    DatabaseVersion, DatabaseCorrupt (shorter than it says).
+    DatabaseVersion, DatabaseCorrupt (shorter than its header claims).
     """
     header, size = _header(path)
     if len(header) < 100:
@@ -276,7 +276,7 @@ def inspect_header(path: Path) -> None:
 
 
 def _header(path: Path) -> tuple[bytes, int]:
-    """The header of an SQLite file, and the size of the file. Raises NotADatabase."""
+    """Return the header of an SQLite file, and the size of the file. Raises NotADatabase."""
     try:
         with path.open("rb") as file:
             header = file.read(100)
@@ -302,7 +302,7 @@ def _header(path: Path) -> tuple[bytes, int]:
 
 
 def _check_format(path: Path, application_id: int, version: int) -> None:
-    """Raises NotADatabase or DatabaseVersion unless both are those of this format."""
+    """Raise NotADatabase or DatabaseVersion unless both are those of this format."""
     if application_id != APPLICATION_ID:
         raise NotADatabase(
             f"{path}: not a pc2grid database, but another program's SQLite file (application id"

@@ -44,7 +44,7 @@ from pc2grid.model import (
     Trajectory,
 )
 from pc2grid.observer import Observer
-from signature.database.protocol import Bend, BuildingFrame, Covariance, SessionInfo, largest_m
+from signature.database.protocol import BuildingFrame, Covariance, Deformation, SessionInfo, largest_m
 from signature.database.rows import no_session
 from signature.localization.joining.join import (
     Link,
@@ -427,7 +427,7 @@ def _placement(nodes: F64, solved: F64) -> SE2:
     return SE2(x, y, yaw)
 
 
-def _bend(nodes: F64, solved: F64, T: SE2) -> Bend:
+def _bend(nodes: F64, solved: F64, T: SE2) -> Deformation:
     """Return how a session is bent where it lies at T: a row for each square of its way, none if hardly.
 
     A square is as wide as a local map is long.
@@ -439,7 +439,7 @@ def _bend(nodes: F64, solved: F64, T: SE2) -> Bend:
     columns = [
         np.bincount(square.ravel(), weights=values) / count for values in (nodes[:, 0], nodes[:, 1], *moved.T)
     ]
-    bend: Bend = tuple(
+    bend: Deformation = tuple(
         (x, y, dx, dy, yaw) for x, y, dx, dy, yaw in np.column_stack(columns).round(4).tolist()
     )
     return bend if largest_m(bend) >= _LEAST_M else ()
@@ -535,7 +535,7 @@ def _as_drawn(
     middle = (n - 1) / 2
     squares = np.stack(np.meshgrid(rows[::n] + middle, columns[::n] + middle, indexing="ij"), axis=-1)
     points_m = whole.to_point(squares.reshape(-1, 2))
-    bent_m = (frame.as_drawn(points_m) - T_session_building.apply(points_m)).reshape(squares.shape)
+    bent_m = (frame.to_session(points_m) - T_session_building.apply(points_m)).reshape(squares.shape)
     height, width = squares.shape[:2]
     return straight_m + cv2.resize(bent_m, (n * width, n * height))[: len(rows), : len(columns)]
 

@@ -9,7 +9,7 @@ import pytest
 
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from signature.database.protocol import Bend, BuildingFrame
+from signature.database.protocol import BuildingFrame, Deformation
 from signature.localization.joining.building import building_map
 
 _ = UNKNOWN
@@ -20,7 +20,7 @@ def grid(rows: list[list[int]]) -> OccupancyGrid:
     return OccupancyGrid(cells=np.array(rows[::-1], np.int8), resolution_m=1.0, origin_m=(0.0, 0.0))
 
 
-def at(x: float = 0.0, y: float = 0.0, yaw: float = 0.0, bend: Bend = ()) -> BuildingFrame:
+def at(x: float = 0.0, y: float = 0.0, yaw: float = 0.0, bend: Deformation = ()) -> BuildingFrame:
     exact = ((0.0, 0.0, 0.0),) * 3
     return BuildingFrame(name="old", T_building_session=SE2(x, y, yaw), covariance=exact, bend=bend)
 

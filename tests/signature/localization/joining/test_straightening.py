@@ -9,7 +9,7 @@ import pytest
 
 from pc2grid.geometry import F64, SE2
 from pc2grid.model import Health, Precision, Trajectory
-from signature.database.protocol import Bend, BuildingFrame, largest_m
+from signature.database.protocol import BuildingFrame, Deformation, largest_m
 from signature.localization.joining.building import RIGID, body_of, straighten
 from signature.localization.joining.join import Link
 
@@ -44,7 +44,7 @@ SOFT = body_of(way(), (), exact_to(0.1))
 """About as soft as tracking is (`LoopParameters`): its drift is no surprise."""
 
 
-def frame(T: SE2, bend: Bend = ()) -> BuildingFrame:
+def frame(T: SE2, bend: Deformation = ()) -> BuildingFrame:
     exact = ((0.0, 0.0, 0.0),) * 3
     return BuildingFrame(name="plan", T_building_session=T, covariance=exact, bend=bend)
 
