@@ -1,8 +1,8 @@
 """Recordings -> registered scans -> occupancy grids -> submaps.
 
 The front of pc2grid: everything that depends on the kind of sensor. `signature`, the back, only gets grids
-and submaps; the names of it that most users need are passed on here. Importing this package loads no library:
-each name loads its module when it is first used. `help(pc2grid.convert)` and so on explain them.
+and submaps; its most used names are exported here, too. Importing this package loads no library: each name
+loads its module when it is first used. `help(pc2grid.convert)` and so on explain them.
 
 >>> import pc2grid
 >>> monday = pc2grid.convert("monday.mcap", "monday.submaps")

@@ -1,4 +1,4 @@
-"""How results show themselves in a notebook: a map as a picture, facts as a table.
+"""Displays of results in a notebook: a map as a picture, facts as a table.
 
 Jupyter calls `_repr_png_` and `_repr_html_` of the last value of a cell (https://ipython.readthedocs.io,
 "Rich display"); the types of pc2grid use these functions there.
@@ -33,7 +33,7 @@ def map_png(
     path_m: F64 | None = None,
     centers_m: F64 | None = None,
 ) -> bytes:
-    """A map as PNG, cut to what is known, north (+y) up.
+    """Draw a map as PNG, cropped to the known cells, north (+y) up.
 
     cells, resolution_m, origin_m : as in `OccupancyGrid`.
     path_m : (N, 2) path of the robot. centers_m : (M, 2) centres of submaps; both in the map frame, metres.
@@ -67,19 +67,19 @@ def map_png(
 
 
 def _shades(cells: NDArray[np.int8]) -> U8:
-    """Grey of each cell: the darker, the more probably occupied."""
+    """Return the grey of each cell: the darker, the more probably occupied."""
     shade = FREE_GREY - (FREE_GREY - WALL_GREY) / 100.0 * cells
     return np.where(cells < 0, UNKNOWN_GREY, shade).astype(np.uint8)
 
 
 def html_picture(png: bytes, description: str) -> str:
-    """An image that needs no file beside the page."""
+    """Return an image element that needs no file beside the page."""
     data = base64.b64encode(png).decode("ascii")
     return f'<img style="max-width:100%" alt="{escape(description)}" src="data:image/png;base64,{data}">'
 
 
 def html_table(title: str, rows: Iterable[Sequence[object]], head: Sequence[str] = ()) -> str:
-    """A table with a title; `head` names its columns. Everything is escaped."""
+    """Return a table with a title; `head` names its columns. Everything is escaped."""
     parts = [f"<table><caption>{escape(title)}</caption>"]
     if head:
         parts.append("<tr>" + "".join(f"<th>{escape(word)}</th>" for word in head) + "</tr>")
@@ -90,7 +90,7 @@ def html_table(title: str, rows: Iterable[Sequence[object]], head: Sequence[str]
 
 
 def short(name: object, longest: int = 60) -> str:
-    """A name in quotes for a `repr`; the middle of a long one is left out."""
+    """Return a name in quotes for a `repr`, without the middle of a long one."""
     text = repr(str(name))
     half = longest // 2 - 1
     return text if len(text) <= longest else f"{text[:half]}...{text[-half:]}"
@@ -102,7 +102,7 @@ _LEAST, _MOST = 0.01, 0.99
 
 
 def probability(value: float) -> str:
-    """A probability with two digits; never 0 or 1.
+    """Format a probability with two digits; never 0 or 1.
 
     >>> probability(0.5), probability(0.9999), probability(0.0)
     ('0.50', '> 0.99', '< 0.01')
@@ -113,7 +113,7 @@ def probability(value: float) -> str:
 
 
 def counted(number: int, noun: str) -> str:
-    """A number with its noun.
+    """Format a number with its noun.
 
     >>> counted(1, "submap"), counted(0, "submap"), counted(12, "lidar scan")
     ('1 submap', '0 submaps', '12 lidar scans')

@@ -1,7 +1,7 @@
 """Every error that pc2grid raises on purpose, as one tree.
 
-The library raises; only the command line prints and exits. A message is one line that says what is
-wrong and where; `hint` says what to type next: the command line prints it as it is, `str` in terms of Python.
+The library raises; only the command line prints and exits. A message is one line with the fault and its
+place; `hint` is what to type next: the command line prints it as it is, `str` in terms of Python.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import re
 
 
 def _setting(found: re.Match[str]) -> str:
-    """A setting of the command line as an argument in Python."""
+    """Return a setting of the command line as an argument in Python."""
     section, key, value = found.groups()
     known = {"true": "True", "false": "False"}.get(value)
     plain = value if re.fullmatch(r"-?[\d.]+|N", value) else repr(value)
@@ -34,7 +34,7 @@ _IN_PYTHON = (
 
 
 def in_python(hint: str) -> str:
-    """A hint for the command line as one for Python.
+    """Translate a hint for the command line into one for Python.
 
     >>> print(in_python("choose one, e.g. --topic /front"))
     choose one, e.g. config=Config(read={'topic': '/front'})
@@ -48,7 +48,7 @@ def in_python(hint: str) -> str:
 
 
 def one_line(text: str) -> str:
-    """The text with line breaks and control characters escaped: names in a file may contain them."""
+    """Escape line breaks and control characters: names in a file may contain them."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)
 
 
@@ -73,7 +73,7 @@ class Pc2GridError(Exception):
 
     @property
     def in_short(self) -> str:
-        """Message and hint in one line, as the command line says them."""
+        """Return message and hint in one line, as the command line prints them."""
         return self.message if self.hint is None else f"{self.message} ({self.hint})"
 
 

@@ -1,9 +1,8 @@
-"""Planar and spatial poses.
+"""Planar and spatial poses, angles and outlines, and the array types of all packages.
 
-Convention, everywhere: `T_target_source` maps coordinates of `source` into `target`,
-`p_target = T_target_source @ p_source`. Axes as in REP-103 (x forward, y left, z up), angles in radians.
-
-Names of array types, and the check that every array field of a frozen type passes.
+Convention, everywhere: `T_target_source` maps coordinates of `source` into `target`, `p_target =
+T_target_source @ p_source`. Axes as in REP-103 (x forward, y left, z up), angles in radians. `freeze` checks
+the array fields of frozen types.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ def wrap_angle(angle_rad: F64) -> F64: ...
 
 
 def wrap_angle(angle_rad: float | F64) -> float | F64:
-    """The same angle, or each of an array of angles, in (-pi, pi]."""
+    """Return the same angle, or each of an array of angles, in (-pi, pi]."""
     if isinstance(angle_rad, np.ndarray):
         turns = np.round(angle_rad / (2.0 * math.pi))
         wrapped = angle_rad - 2.0 * math.pi * turns
@@ -60,7 +59,7 @@ class SE2:
         )
 
     def inverse(self) -> SE2:
-        """`T_b_a` of `T_a_b`."""
+        """Return `T_b_a` of `T_a_b`."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return SE2(-c * self.x - s * self.y, s * self.x - c * self.y, wrap_angle(-self.yaw))
 
@@ -72,12 +71,12 @@ class SE2:
         return moved
 
     def matrix(self) -> F64:
-        """Homogeneous (3, 3)."""
+        """Return the homogeneous matrix (3, 3)."""
         c, s = math.cos(self.yaw), math.sin(self.yaw)
         return np.array([[c, -s, self.x], [s, c, self.y], [0.0, 0.0, 1.0]])
 
     def lift(self) -> F64:
-        """The same motion in space, (4, 4), at z = 0 and level."""
+        """Return the same motion in space, (4, 4), at z = 0 and level."""
         matrix = np.eye(4)
         matrix[:2, :2] = self.matrix()[:2, :2]
         matrix[:2, 3] = self.x, self.y
@@ -85,9 +84,9 @@ class SE2:
 
     @staticmethod
     def fit(source_m: ArrayLike, target_m: ArrayLike) -> SE2:
-        """T_target_source that brings points (N, 2) nearest to their partners (N, 2), least squares.
+        """Fit T_target_source that brings points (N, 2) nearest to their partners (N, 2), least squares.
 
-        Without scale (Umeyama 1991): what remains is the absolute trajectory error.
+        It has no scale (Umeyama 1991): the residual is the absolute trajectory error.
         """
         source, target = np.asarray(source_m, np.float64), np.asarray(target_m, np.float64)
         a, b = source - source.mean(axis=0), target - target.mean(axis=0)
@@ -97,7 +96,7 @@ class SE2:
 
     @staticmethod
     def from_matrix(T_target_source: F64) -> SE2:
-        """The planar part of a spatial pose (4, 4): x, y and the heading of its x axis."""
+        """Return the planar part of a spatial pose (4, 4): x, y and the heading of its x axis."""
         return SE2(
             float(T_target_source[0, 3]),
             float(T_target_source[1, 3]),
@@ -111,7 +110,7 @@ def transform_points(T_target_source: F64, points_m: NDArray[np.floating]) -> F6
 
 
 def invert_pose(T_target_source: F64) -> F64:
-    """Inverse of a rigid pose (4, 4)."""
+    """Return the inverse of a rigid pose (4, 4)."""
     inverse = np.eye(4)
     inverse[:3, :3] = T_target_source[:3, :3].T
     inverse[:3, 3] = -T_target_source[:3, :3].T @ T_target_source[:3, 3]
@@ -119,7 +118,8 @@ def invert_pose(T_target_source: F64) -> F64:
 
 
 def pose_from_xyz_quat(xyz_m: ArrayLike, quat_xyzw: ArrayLike) -> F64:
-    """Pose (4, 4) from a translation (3,) and a quaternion (4,) in x, y, z, w order (any length but 0).
+    """Return the pose (4, 4) of a translation (3,) and a quaternion (4,) in x, y, z, w order (any length but
+    0).
 
     Raises ValueError for a quaternion of length zero or not finite.
     """
@@ -140,7 +140,7 @@ def pose_from_xyz_quat(xyz_m: ArrayLike, quat_xyzw: ArrayLike) -> F64:
 
 
 def quat_xyzw_from_pose(T_target_source: F64) -> F64:
-    """Unit quaternion (4,) in x, y, z, w order, w >= 0, of a pose's rotation (4, 4) or (3, 3)."""
+    """Return the unit quaternion (4,) in x, y, z, w order, w >= 0, of a pose's rotation (4, 4) or (3, 3)."""
     m = T_target_source
     trace = m[0, 0] + m[1, 1] + m[2, 2]
     # Shepperd's method: divide by the largest component, so that no half turn loses digits.
@@ -159,7 +159,7 @@ def quat_xyzw_from_pose(T_target_source: F64) -> F64:
 
 
 def rotation_vector(T_target_source: F64) -> F64:
-    """Axis times angle (3,) of a pose's rotation, radians."""
+    """Return axis times angle (3,) of a pose's rotation, radians."""
     quat = quat_xyzw_from_pose(T_target_source)
     sin_half = float(np.linalg.norm(quat[:3]))
     if sin_half < 1e-12:
@@ -168,7 +168,7 @@ def rotation_vector(T_target_source: F64) -> F64:
 
 
 def pose_from_rotation_vector(rotation_rad: ArrayLike, xyz_m: ArrayLike = (0.0, 0.0, 0.0)) -> F64:
-    """Pose (4, 4) from axis times angle (3,) and a translation (3,)."""
+    """Return the pose (4, 4) of axis times angle (3,) and a translation (3,)."""
     vector = np.asarray(rotation_rad, dtype=np.float64)
     angle = float(np.linalg.norm(vector))
     axis = vector / angle if angle > 1e-12 else np.zeros(3)
@@ -176,7 +176,7 @@ def pose_from_rotation_vector(rotation_rad: ArrayLike, xyz_m: ArrayLike = (0.0, 
 
 
 def leveling(up: F64) -> F64:
-    """Pose (4, 4): the smallest rotation that turns a unit vector (3,) upright."""
+    """Return the pose (4, 4) of the smallest rotation that turns a unit vector (3,) upright."""
     axis = np.cross(up, (0.0, 0.0, 1.0))
     sine = float(np.linalg.norm(axis))
     if sine < 1e-9:
@@ -185,7 +185,8 @@ def leveling(up: F64) -> F64:
 
 
 def interpolate_pose(T_a: F64, T_b: F64, fraction: float) -> F64:
-    """Pose between two poses (4, 4): straight in translation, constant rate in rotation; 0 -> a, 1 -> b."""
+    """Interpolate between two poses (4, 4): straight in translation, constant rate in rotation; 0 -> a, 1 ->
+    b."""
     relative = invert_pose(T_a) @ T_b
     step = pose_from_rotation_vector(fraction * rotation_vector(relative), fraction * relative[:3, 3])
     return T_a @ step
@@ -199,7 +200,7 @@ def skew(vectors: F64) -> F64:
 
 
 def motion_size(motion: F64) -> tuple[float, float]:
-    """The distance (m) and the angle (rad) of a motion (4, 4)."""
+    """Return the distance (m) and the angle (rad) of a motion (4, 4)."""
     (xx, xy, xz, x), (yx, yy, yz, y), (zx, zy, zz, z), _ = motion.tolist()
     twice_sine = math.hypot(zy - yz, xz - zx, yx - xy)
     return math.hypot(x, y, z), math.atan2(twice_sine, xx + yy + zz - 1.0)
@@ -245,7 +246,8 @@ def hand_over(array: A) -> A:
 
 
 def _is_read_only(array: NDArray[np.generic]) -> bool:
-    """Whether nobody can write to an array, neither through it nor through what it is a view of."""
+    """Return True if nobody can write to an array, neither through it nor through the array that it is a view
+    of."""
     base: object = array
     while isinstance(base, np.ndarray):
         if base.flags.writeable:
@@ -259,7 +261,7 @@ SUBPIXEL_BITS = 4
 
 
 def polygon_corners(outline_cells: F64) -> NDArray[np.int32]:
-    """The corners (B, 2) of an outline, as OpenCV draws it with `shift=SUBPIXEL_BITS`.
+    """Return the corners (B, 2) of an outline, as OpenCV draws it with `shift=SUBPIXEL_BITS`.
 
     outline_cells : (B, 2) column and row, in cells; a whole number is the edge of a cell.
     """
@@ -267,5 +269,6 @@ def polygon_corners(outline_cells: F64) -> NDArray[np.int32]:
 
 
 def cells_of(mask: BoolGrid) -> I64:
-    """Set cells (N, 2) of a mask as (row, column), row by row: `np.argwhere`, ten times as fast."""
+    """Return the set cells (N, 2) of a mask as (row, column), row by row: `np.argwhere`, ten times as
+    fast."""
     return np.column_stack(np.divmod(np.flatnonzero(mask), max(mask.shape[1], 1)))

@@ -55,7 +55,7 @@ _OF_ADDRESSES = {
 
 
 def of_addresses(*addresses: object) -> dict[str, str]:
-    """The extras that addresses such as `ws://robot` need, with the scheme that needs each; of others none.
+    """Return the extras that addresses such as `ws://robot` need, with the scheme that needs each.
 
     >>> of_addresses("ws://robot:8765", "postgresql://host/db", "monday.mcap", None)
     {'live': 'ws://', 'postgres': 'postgresql://'}
@@ -67,7 +67,7 @@ def of_addresses(*addresses: object) -> dict[str, str]:
 def require(needs: Mapping[str, str]) -> None:
     """Refuse work for which packages are missing; all of them are named.
 
-    needs : by extra, what needs it, as the user called it. The packages are imported, because one that is
+    needs : by extra, the word of the user that needs it. The packages are imported, because one that is
     installed in part fails only then.
 
     Raises the `Extra.error` of the first extra that cannot be imported.
@@ -157,7 +157,8 @@ class _Compiled:
 
     @functools.cached_property
     def dispatcher(self) -> Any:
-        """Numba's function. In its module it stands in the place of this one, for others that call it."""
+        """Compile the function; in its module numba's function takes the place of this one, for others that
+        call it."""
         from numba import njit
 
         names = self._function.__globals__

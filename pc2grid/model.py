@@ -1,9 +1,8 @@
-"""The types that the stages hand on: frozen, with units in their names.
+"""The types that the stages exchange: frozen, with units in their names; and the properties of the sensors.
 
-Metres, radians, int64 nanoseconds. The arrays inside are read-only, and no other code can write to them, so
-a stage cannot change what another one holds.
-
-What sets the kinds of sensors apart, in one place: `SENSOR_MODELS[scan.sensor]`.
+Metres, radians, int64 nanoseconds. The arrays inside are read-only, and no other code can write to them, so a
+stage cannot change the data of another one. The kinds of sensors differ in one place:
+`SENSOR_MODELS[scan.sensor]`.
 """
 
 from __future__ import annotations
@@ -62,16 +61,16 @@ class Scan:
     stamp_ns : when the scan was taken (`header.stamp`).
     points_m : (N, 3) float32, returns in the base frame (x forward, y left, z up); finite.
     offsets_s : (N,) float32, when each point was taken relative to `stamp_ns`; None if not recorded.
-    T_base_sensor : (4, 4) where the sensor sits on the base; its translation is the origin of the rays.
+    T_base_sensor : (4, 4) mounting of the sensor on the base; its translation is the origin of the rays.
     T_odom_base : (4, 4) odometry at `stamp_ns`, or None if the log has none there.
     odometry_gap_s : longest time without a reading of odometry since the last scan that has `T_odom_base`;
         infinite if that is not known.
-    T_first_last : (4, 4) how the base moved from the first to the last of the points' times, by odometry;
-        without odometry how it turned, by an IMU; None where that or the times are not recorded.
+    T_first_last : (4, 4) motion of the base from the first to the last of the points' times, by odometry;
+    without odometry its rotation, by an IMU; None where that or the times are not recorded.
     T_level_base : (4, 4) attitude at `stamp_ns` by an IMU: z is up, the heading drifts, no translation; None
         if there is no IMU.
-    sensor : which of the three kinds made it.
-    dropped : how many returns were left out while decoding (NaN, inf, no return, out of range).
+    sensor : kind of the sensor.
+    dropped : number of returns that were left out while decoding (NaN, inf, no return, out of range).
 
     >>> import numpy as np
     >>> scan = Scan(stamp_ns=0, points_m=np.ones((5, 3)), T_base_sensor=np.eye(4), sensor="lidar")
@@ -108,7 +107,7 @@ class Health(enum.Enum):
 
     FINE : in every direction, and odometry, if there is any, agrees. DEGENERATE : some direction rests on
     odometry or the motion before. LOST : not at all; the scan is not mapped. OVERRULED : as FINE, but
-    odometry says something else (`pc2grid.estimation.tracker`).
+    odometry is an outlier (`pc2grid.estimation.tracker`).
     """
 
     FINE = "fine"
@@ -180,27 +179,27 @@ class Trajectory:
         return f"Trajectory({len(self)} poses, {self.length_m:.1f} m in {self.duration_s:.1f} s)"
 
     def planar(self) -> F64:
-        """(N, 3): x, y, yaw of the base in the session frame; metres and radians."""
+        """Return (N, 3): x, y, yaw of the base in the session frame; metres and radians."""
         T = self.T_session_base
         return np.column_stack((T[:, 0, 3], T[:, 1, 3], np.arctan2(T[:, 1, 0], T[:, 0, 0])))
 
     def path_m(self) -> F64:
-        """(N,): planar distance driven up to each pose, metres."""
+        """Return (N,): planar distance driven up to each pose, metres."""
         steps = np.linalg.norm(np.diff(self.T_session_base[:, :2, 3], axis=0), axis=1)
         return np.concatenate(([0.0], np.cumsum(steps)))[: len(self)]
 
     @property
     def length_m(self) -> float:
-        """Planar distance driven, metres; 0 without poses."""
+        """Return the planar distance driven, metres; 0 without poses."""
         return float(self.path_m()[-1]) if len(self) else 0.0
 
     @property
     def duration_s(self) -> float:
-        """Time between the first and the last pose, seconds; 0 without poses."""
+        """Return the time between the first and the last pose, seconds; 0 without poses."""
         return float(self.stamps_ns[-1] - self.stamps_ns[0]) * 1e-9 if len(self) else 0.0
 
     def poses(self) -> Iterator[SE2]:
-        """Planar pose of each entry."""
+        """Yield the planar pose of each entry."""
         for x, y, yaw in self.planar():
             yield SE2(float(x), float(y), float(yaw))
 
@@ -209,13 +208,13 @@ class Trajectory:
 class OccupancyGrid:
     """A 2D occupancy grid with cells as in nav_msgs/OccupancyGrid.
 
-    cells : (H, W) int8; -1 unknown, 0 free .. 100 occupied, `THING` what stands on the floor and is no wall.
+    cells : (H, W) int8; -1 unknown, 0 free .. 100 occupied, `THING` a low obstacle.
         Row 0 holds the smallest y, column 0 the smallest x.
     resolution_m : edge of a cell.
     origin_m : (x, y) in the map frame of the lower-left corner of cell (0, 0).
     height_m : of the one plane that was observed, above the base; None: of all heights, or not known.
-    heights : (H, W) uint8, in which slices an occupied cell or a thing was observed to be occupied and to be
-        free (`SLICES`); 0 where that is not known. None if it is known of no cell.
+    heights : (H, W) uint8, the slices in which an occupied cell or a low obstacle was observed to be occupied
+    and to be free (`SLICES`); 0 where that is not known. None if it is known of no cell.
 
     >>> import numpy as np
     >>> grid = OccupancyGrid(cells=np.array([[0, 100], [-1, 0]]), resolution_m=0.5, origin_m=(-1.0, 2.0))
@@ -251,27 +250,28 @@ class OccupancyGrid:
 
     @property
     def occupied(self) -> BoolGrid:
-        """(H, W) cells that are occupied: `OCCUPIED_FROM` percent or more."""
+        """Return a mask (H, W) of the occupied cells: `OCCUPIED_FROM` percent or more."""
         return self.cells >= OCCUPIED_FROM
 
     @property
     def free(self) -> BoolGrid:
-        """(H, W) cells that are known and free: below `FREE_BELOW` percent."""
+        """Return a mask (H, W) of the known free cells: below `FREE_BELOW` percent."""
         return (self.cells >= 0) & (self.cells < FREE_BELOW)
 
     @property
     def things(self) -> BoolGrid:
-        """(H, W) cells of things on the floor that are no walls; none where heights are not known."""
+        """Return a mask (H, W) of the cells of low obstacles; empty where heights are not known."""
         things: BoolGrid = self.cells == THING
         return things
 
     @property
     def ground(self) -> BoolGrid:
-        """(H, W) cells where a sensor may be: the free ones, and the things, over which a hand reaches."""
+        """Return a mask (H, W) of the cells where a sensor may be: free ones, and low obstacles, over which a
+        hand reaches."""
         return self.free | self.things
 
     def told(self, of: MapOf = "everything") -> NDArray[np.int8]:
-        """(H, W) the cells as others are told them: 100 where something stands, 0 where it is free, else -1.
+        """Return the cells (H, W) for other programs: 100 for an obstacle, 0 for a free cell, else -1.
 
         >>> import numpy as np
         >>> cells = np.array([[1, 50, THING, 82, -1]])
@@ -286,28 +286,32 @@ class OccupancyGrid:
 
     @property
     def free_m2(self) -> float:
-        """Area of the free cells, square metres."""
+        """Return the area of the free cells, square metres."""
         return float(np.count_nonzero(self.free)) * self.resolution_m**2
 
     def is_free(self, x_m: float, y_m: float) -> bool:
-        """Whether a point of the map frame lies in a free cell of the grid."""
+        """Return True if a point of the map frame lies in a free cell of the grid."""
         row, column = (int(v) for v in self.to_cell(np.array([(x_m, y_m)]))[0])
         height, width = self.cells.shape
         inside = 0 <= row < height and 0 <= column < width
         return inside and 0 <= int(self.cells[row, column]) < FREE_BELOW
 
     def to_cell(self, points_m: NDArray[np.floating]) -> I64:
-        """Map points (N, 2) in the map frame to (N, 2) cells as (row, column); may lie outside."""
+        """Return the cells (N, 2), as (row, column), of points (N, 2) in the map frame; they may lie
+        outside."""
         xy = np.floor((np.asarray(points_m, dtype=np.float64) - self.origin_m) / self.resolution_m)
         return xy[:, ::-1].astype(np.int64)
 
     def to_point(self, cells: NDArray[np.integer]) -> F64:
-        """Cells (N, 2) as (row, column) to their centres (N, 2) in the map frame, metres."""
+        """Return the centres (N, 2) of cells (N, 2), given as (row, column), in the map frame, metres."""
         return (np.asarray(cells)[:, ::-1] + 0.5) * self.resolution_m + self.origin_m
 
     def crop(self, center_m: tuple[float, float], half_width_m: float) -> OccupancyGrid:
-        """The square of (2 n + 1)^2 cells around the cell that holds `center_m`; unknown past the edge.
-        Heights are left out."""
+        """Return the square of (2 n + 1)^2 cells around the cell that holds `center_m`; unknown past the
+        edge.
+
+        Heights are left out.
+        """
         n = round(half_width_m / self.resolution_m)
         row, column = (int(v) for v in self.to_cell(np.array([center_m]))[0])
         cells = np.full((2 * n + 1, 2 * n + 1), UNKNOWN, dtype=np.int8)
@@ -327,10 +331,9 @@ class OccupancyGrid:
 class Submap:
     """A part of a map around a centre (paper III-A).
 
-    submap_id : number within its session, in the order of the partition.
-    center_m : (x, y) in the map frame.
-    radius_m : what lies farther from the centre is unknown in `grid`.
-    grid : square crop around the centre, cells outside the radius unknown.
+    submap_id : number within its session, in the order of the partition. center_m : (x, y) in the map frame.
+    radius_m : cells farther from the centre are unknown in `grid`. grid : square crop around the centre,
+    cells outside the radius unknown.
 
     >>> import pc2grid
     >>> submap = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))[0]
@@ -359,7 +362,7 @@ SEVERE_SHARE = 0.01
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadReport:
-    """What was read from a log, and what was lost; if much was lost, the program exits with 3.
+    """Counts of what was read from a log, and of what was lost; if much was lost, the program exits with 3.
 
     scans_skipped counts by reason; warnings are whole sentences for the user.
 
@@ -377,12 +380,12 @@ class ReadReport:
     @computed_field  # type: ignore[prop-decorator]  # mypy has no decorated properties
     @property
     def lossy(self) -> bool:
-        """Whether data was lost."""
+        """Return whether data was lost."""
         return bool(self.scans_skipped) or self.bytes_lost > 0
 
     @property
     def severe(self) -> bool:
-        """Whether so much was lost that the result may be incomplete.
+        """Return whether so much was lost that the result may be incomplete.
 
         That is: a part of a file was damaged or a file was missing, or for each hundred scans that were read
         (`SEVERE_SHARE`) at least one was lost.
@@ -400,7 +403,7 @@ class Loop:
     T_older_newer : the newer base in the frame of the older one, in the plane, by matching the two views.
         The trajectory agrees with it as far as the other loops and the odometry between allow.
     information : (3, 3) inverse covariance of its x, y, yaw in the older base's axes.
-    accepted : whether it agrees with the other measurements; otherwise its weight in the pose graph is low.
+    accepted : True if it agrees with the other measurements; otherwise its weight in the pose graph is low.
 
     >>> import numpy as np
     >>> from pc2grid import SE2
@@ -425,12 +428,11 @@ class Loop:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Contradiction:
-    """A stretch of a trajectory where the scans do not agree with the map that was drawn from them.
+    """A part of a trajectory along which the scans do not agree with the map that was drawn from them.
 
-    from_ns, to_ns : stamps of its first and last scan.
-    x_m, y_m : position of the base, in the session frame, where the scans agree least.
-    length_m : planar distance driven.
-    share : of the wall hits there that lie on ground which the map calls free, 0..1.
+    from_ns, to_ns : stamps of its first and last scan. x_m, y_m : position of the base, in the session frame,
+    where the scans agree least. length_m : planar distance driven. share : of the wall hits there that lie on
+    free ground of the map, 0..1.
     """
 
     from_ns: int
@@ -443,13 +445,12 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consistency:
-    """How well a map agrees with its own scans (`pc2grid.mapping.quality`).
+    """The agreement of a map with its own scans (`pc2grid.mapping.quality`).
 
-    hits_on_free : share of all wall hits that lie on ground which the map calls free, 0..1. Hits on what
-        moves are not counted.
-    contradicted : share of the travel along which many do, 0..1.
-    bent : whether this is so much that parts of the map are probably drawn in the wrong place.
-    stretches : where this is so, the longest first; of very many the longest only.
+    hits_on_free : share of all wall hits that lie on free ground of the map, 0..1. Hits on moving objects are
+    not counted. contradicted : share of the travel along which many do, 0..1. bent : True if the share is so
+    high that parts of the map are probably drawn in the wrong place. stretches : where this is so, the
+    longest first; of very many the longest only.
 
     >>> Consistency().bent
     False
@@ -463,11 +464,11 @@ class Consistency:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UncertainSegment:
-    """A stretch of a trajectory whose place relative to the rest of the map is known only roughly.
+    """A part of a trajectory whose place relative to the rest of the map is known only roughly.
 
-    from_ns, to_ns : stamps of its ends. length_m : planar distance driven.
-    sigma_m : largest standard deviation of a position along it, in the least certain direction.
-    x_m, y_m : position of the base, in the session frame, where that is so.
+    from_ns, to_ns : stamps of its ends. length_m : planar distance driven. sigma_m : largest standard
+    deviation of a position along it, in the least certain direction. x_m, y_m : position of the base, in the
+    session frame, where that is so.
     """
 
     from_ns: int
@@ -480,12 +481,12 @@ class UncertainSegment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precision:
-    """How exactly the places of a map lie to each other (`pc2grid.mapping.quality`).
+    """The precision of the places of a map relative to each other (`pc2grid.mapping.quality`).
 
     stamps_ns : (N,) increasing, of scans along the travel, a few metres apart.
     sigma_m : (N,) standard deviation of the position there, in the least certain direction, relative to the
-        part of the map that is well tied together.
-    loose : stretches where it is too large to rely on, the least certain first.
+        well-constrained part of the map.
+    loose : unconstrained segments, where it is too large to rely on, the least certain first.
 
     >>> round(Precision(stamps_ns=(0, 10), sigma_m=(0.1, 0.3)).at(5), 3)
     0.2
@@ -504,11 +505,11 @@ class Precision:
 
     @property
     def worst_m(self) -> float:
-        """The largest standard deviation, 0 without any."""
+        """Return the largest standard deviation, 0 without any."""
         return max(self.sigma_m, default=0.0)
 
     def at(self, stamp_ns: int) -> float:
-        """The standard deviation at a time, interpolated; 0 if nothing is known."""
+        """Return the standard deviation at a time, interpolated; 0 if nothing is known."""
         if not self.stamps_ns:
             return 0.0
         since_s = np.array([stamp - self.stamps_ns[0] for stamp in self.stamps_ns]) * 1e-9
@@ -517,7 +518,7 @@ class Precision:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryOutlier:
-    """A stretch of time in which the scans showed another motion than odometry.
+    """A time in which the scans showed another motion than odometry.
 
     from_ns, to_ns : stamps of its first and last scan. distance_m, turn_rad : the largest difference between
         the two motions from one scan to the next.
@@ -531,11 +532,11 @@ class OdometryOutlier:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OdometryCheck:
-    """What the scans of a session say of its odometry (`pc2grid.estimation.tracker`).
+    """The comparison of a session's odometry with its scans (`pc2grid.estimation.tracker`).
 
-    compared : scans that were tracked and have odometry. overruled : of these, scans that fit the map where
-        odometry does not lead.
-    stretches : where that was so, the largest difference first; of very many the largest only.
+    compared : number of scans that were tracked and have odometry. overruled : of these, number of scans at
+    which odometry is an outlier. stretches : where that was so, the largest difference first; of very many
+    the largest only.
 
     >>> OdometryCheck().compared
     0
@@ -578,7 +579,7 @@ class PointMap:
 
     @staticmethod
     def of(points_m: NDArray[np.floating], voxel_m: float, corner_m: F64 | None = None) -> PointMap:
-        """Of points (N, 3) in the map frame; of several in a voxel the first is kept.
+        """Make the map of points (N, 3) in the map frame; of several in a voxel the first is kept.
 
         corner_m : (3,) a corner of any voxel; by default the lowest coordinates.
         """
@@ -595,7 +596,7 @@ class PointMap:
         return len(self.steps)
 
     def points_m(self) -> F64:
-        """The points (V, 3) in the map frame."""
+        """Return the points (V, 3) in the map frame."""
         return (self.steps + 0.5) * (self.voxel_m / POINT_STEPS) + self.origin_m
 
 
@@ -603,18 +604,14 @@ class PointMap:
 class SessionMap:
     """The map made of one recording: the result of the point-cloud half of pc2grid.
 
-    session : name, unique within a database.
-    sensor : the kind that made the map, or "map" for an imported map.yaml.
-    grid : the whole occupancy grid, in the session frame.
-    submaps : its partition.
-    trajectory : poses of the base; empty for an imported map.
-    loops : where the recording came back to a place it had seen.
-    graph : the junction graph of the free space (`pc2grid.submaps.junction_graph`), which the submaps were
-        made from; empty if none was made.
-    consistency : how well the map agrees with its own scans; None if that is not known.
-    odometry : how well odometry agrees with the scans; None if that is not known.
-    precision : how exactly its places lie to each other; None if that is not known.
-    points : the points of the recording in space; None if they were not asked for, or there are none.
+    session : name, unique within a database. sensor : the kind that made the map, or "map" for an imported
+    map.yaml. grid : the whole occupancy grid, in the session frame. submaps : its partition. trajectory :
+    poses of the base; empty for an imported map. loops : between visits of the same place. graph : the
+    junction graph of the free space (`pc2grid.submaps.junction_graph`) from which the submaps were made;
+    empty if none was made. consistency : agreement of the map with its own scans; None if that is not known.
+    odometry : agreement of odometry with the scans; None if that is not known. precision : of its places
+    relative to each other; None if that is not known. points : the points of the recording in space; None if
+    they were not asked for, or there are none.
 
     >>> import numpy as np
     >>> import pc2grid
@@ -679,7 +676,7 @@ class SessionMap:
 
 
 def part_name(session: str, number: int) -> str:
-    """The name of part `number`, from 0, of a recording that does not hang together.
+    """Return the name of part `number`, from 0, of a recording in several parts.
 
     >>> part_name("monday", 0), part_name("monday", 1)
     ('monday', 'monday#2')
@@ -688,7 +685,7 @@ def part_name(session: str, number: int) -> str:
 
 
 def is_part_of(name: str, session: str) -> bool:
-    """Whether `name` is that of another part of the recording whose first part is `session`.
+    """Return True if `name` is that of another part of the recording whose first part is `session`.
 
     >>> is_part_of("monday#2", "monday"), is_part_of("monday", "monday"), is_part_of("monday#b", "monday")
     (True, False, False)
@@ -701,11 +698,11 @@ def is_part_of(name: str, session: str) -> bool:
 class SensorModel:
     """A kind of sensor.
 
-    planar : it measures in one plane, so it shows no floor, no slope, and no points in space.
-    image : its scans are images in optical axes (REP-103), with a CameraInfo, of one moment; others sweep.
-    narrow : it looks ahead only, and there densely: the floor ahead is seen, and its walls hold a pose in
-    fewer directions than those all around.
-    noise_per_m2 : standard deviation of a range over its square; 0: the noise does not grow with the range.
+    planar : it measures in one plane, so it shows no floor, no slope, and no points in space. image : its
+    scans are images in optical axes (REP-103), with a CameraInfo, of one moment; others sweep. narrow : it
+    looks ahead only, and there densely: it shows the floor ahead, and its walls constrain a pose in fewer
+    directions than those all around. noise_per_m2 : standard deviation of a range over its square; 0: the
+    noise does not grow with the range.
     """
 
     planar: bool = False
@@ -714,7 +711,7 @@ class SensorModel:
     noise_per_m2: float = 0.0
 
     def range_of_noise_m(self, sigma_m: float) -> float:
-        """The range at which the noise has this standard deviation; infinite if it does not grow."""
+        """Return the range at which the noise has this standard deviation; infinite if it does not grow."""
         return math.sqrt(sigma_m / self.noise_per_m2) if self.noise_per_m2 else math.inf
 
 

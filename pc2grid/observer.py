@@ -1,9 +1,7 @@
-"""What the stages report while they work: one object in place of a callback for each kind of news.
+"""Progress and news of a piece of work, and the part of a recording that it works on.
 
-`Observer` is also the null object: all its methods do nothing, so a stage calls them without asking whether
-anybody is interested. A subclass overrides the methods that it needs.
-
-A part of a recording, by time.
+`Observer` is one object in place of a callback for each kind of news. It is also the null object: all its
+methods do nothing, so a stage calls them without a test. A subclass overrides the methods that it needs.
 """
 
 from __future__ import annotations
@@ -19,10 +17,6 @@ if TYPE_CHECKING:
     from rich.progress import Progress, ProgressColumn
 
     from pc2grid.model import RegisteredScan
-
-
-_UPDATE_EVERY_S = 0.1
-"""How often at most what shows progress is told of it, as often as rich draws; stages report each scan."""
 
 
 class Observer:
@@ -43,7 +37,7 @@ class Observer:
     """
 
     def step(self, what: str, recorded_s: float | None = None) -> AbstractContextManager[None]:
-        """Surrounds a step of the work.
+        """Surround a step of the work.
 
         what : name of the step, for the user. recorded_s : length of the recording that the step works
         through; None if there is none.
@@ -51,16 +45,20 @@ class Observer:
         return nullcontext()
 
     def on_progress(self, share: float) -> None:
-        """The share of the present step that is done: 0..1, never decreasing."""
+        """Take the finished share of the present step: 0..1, never decreasing."""
 
     def on_scan(self, registered: RegisteredScan) -> None:
-        """The next scan with its tracked pose, before loops are closed."""
+        """Take the next scan with its tracked pose, before loops are closed."""
 
     def on_note(self, text: str) -> None:
-        """A sentence about a choice that the program made, for a user who wants details."""
+        """Take a sentence about a choice of the program, for a user who wants details."""
 
     def on_warning(self, text: str) -> None:
-        """A sentence about something that went wrong and was dealt with."""
+        """Take a sentence about a problem that the program has dealt with."""
+
+
+_UPDATE_EVERY_S = 0.1
+"""How often at most what shows progress is told of it, as often as rich draws; stages report each scan."""
 
 
 class ProgressBars(Observer):
@@ -81,11 +79,11 @@ class ProgressBars(Observer):
         self._update = None
 
     def step(self, what: str, recorded_s: float | None = None) -> AbstractContextManager[None]:
-        """Surrounds a step of the work with its bar."""
+        """Surround a step of the work with its bar."""
         return self._bar(what)
 
     def on_progress(self, share: float) -> None:
-        """Moves the bar."""
+        """Move the bar."""
         if self._update is not None:
             self._update(share)
 
@@ -140,12 +138,12 @@ class TimeSpan:
     duration_s: float | None = None
 
     def length_ns(self, start_ns: int, end_ns: int) -> int:
-        """Length of this part of a recording from `start_ns` to `end_ns`; at least 1."""
+        """Return the length of this part of a recording from `start_ns` to `end_ns`; at least 1."""
         if self.duration_s is not None:
             return max(int(self.duration_s * 1e9), 1)
         return max(end_ns - start_ns - int(self.start_s * 1e9), 1)
 
     def share_done(self, stamp_ns: int, start_ns: int, end_ns: int) -> float:
-        """How much of this part, 0..1, lies before `stamp_ns`."""
+        """Return the share of this part, 0..1, before `stamp_ns`."""
         elapsed_ns = stamp_ns - start_ns - int(self.start_s * 1e9)
         return min(max(elapsed_ns / self.length_ns(start_ns, end_ns), 0.0), 1.0)

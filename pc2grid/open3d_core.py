@@ -1,4 +1,4 @@
-"""Open3D, which is loaded here without its plots for web pages: `from pc2grid.open3d_core import o3d`.
+"""Open3D, loaded without its plots for web pages: `from pc2grid.open3d_core import o3d`.
 
 With them (`open3d.visualization.draw_plotly`, on Dash and Plotly) the import takes 0.96 s of processor time,
 without them 0.39 s. A stand-in takes the place of that one module; it loads the module itself when one of its
@@ -17,7 +17,7 @@ _PLOTS = "open3d.visualization.draw_plotly"
 
 
 class _LaterLoaded(ModuleType):
-    """A module of which every public name is a function that loads the module itself when it is called."""
+    """A module whose public names are functions that load the module itself when they are called."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name)

@@ -1,14 +1,13 @@
-"""The settings of the point-cloud half: a name, unit, default and meaning for each number a user may change.
+"""The settings of the point-cloud half, read from a TOML file and from `section.key=value`, and written as
+TOML.
 
-There is one section for each stage, and a stage takes only its own section. Sections are frozen. An
-unknown key or a value out of range is an error. `Config` holds the sections of this package;
-`signature.config.Config` adds those of the package above.
+Each number that a user may change has a name, unit, default and meaning. There is one section for each stage,
+and a stage takes only its own section. Sections are frozen. An unknown key or a value out of range is an
+error. `Config` holds the sections of this package; `signature.config.Config` adds those of the package above,
+so the functions take any tree of `Section`s.
 
-Reads settings from a TOML file and from `section.key=value`, and writes them as TOML.
-
-The functions take any tree of `Section`s, so that the package above can add its own sections. TOML has no
-null. In a dump, a setting that is null is a commented line if null is its default, else the text "null".
-On the command line it is `section.key=null`.
+TOML has no null. In a dump, a setting that is null is a commented line if null is its default, else the text
+"null". On the command line it is `section.key=null`.
 """
 
 from __future__ import annotations
@@ -33,7 +32,8 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True)
 
     def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
-        """What differs from the defaults, so that a notebook shows one line and not a hundred settings."""
+        """Yield what differs from the defaults, so that a notebook shows one line and not a hundred
+        settings."""
         for name, field in type(self).model_fields.items():
             value = getattr(self, name)
             if value != field.default:
@@ -154,7 +154,7 @@ class PartitionConfig(Section):
 
     @classmethod
     def paper(cls, radius_m: float = 8.0) -> Self:
-        """Discs around junctions, as in the paper (III-A; 8 m is r of Table II)."""
+        """Return discs around junctions, as in the paper (III-A; 8 m is r of Table II)."""
         return cls(view="disc", radius_m=radius_m, spacing_m=None)
 
 
@@ -175,7 +175,7 @@ class Config(Section):
 
     @classmethod
     def paper(cls) -> Self:
-        """The defaults, but with the submaps of the paper."""
+        """Return the defaults, but with the submaps of the paper."""
         return cls(partition=PartitionConfig.paper())
 
 
@@ -197,11 +197,11 @@ def load_settings(
     *,
     preset: T | None = None,
 ) -> T:
-    """Settings of a tree: `assignments` override `file`, which overrides `preset`.
+    """Load the settings of a tree: `assignments` override `file`, which overrides `preset`.
 
-    file : a TOML file; None: the one that the environment variable PC2GRID_CONFIG names, if any.
-    assignments : "section.key=value" each, the value as in TOML; text needs no quotes.
-    preset : the settings that nothing else sets; None: the defaults of `model`.
+    file : a TOML file; None: the one that the environment variable PC2GRID_CONFIG names, if any. assignments
+    : "section.key=value" each, the value as in TOML; text needs no quotes. preset : the settings that nothing
+    else sets; None: the defaults of `model`.
 
     Raises ConfigError naming the key and the closest known one.
     """
@@ -217,7 +217,7 @@ def load_settings(
 
 
 def dump_settings(settings: Section) -> str:
-    """The whole tree as TOML with a comment for every key; reading it back gives the same settings."""
+    """Return the whole tree as TOML with a comment for every key; reading it back gives the same settings."""
     lines = ["# Settings of pc2grid. Lines that start with '# key =' are at null: chosen by the program."]
     for name, field in type(settings).model_fields.items():
         section, usual = getattr(settings, name), field.default
@@ -286,7 +286,7 @@ def _validated(model: type[T], tree: dict[str, Any], preset: T | None, origin: s
 
 
 def _over(preset: Section, tree: dict[str, Any]) -> dict[str, Any]:
-    """The tree with the values of `preset` where it has none."""
+    """Return the tree with the values of `preset` where it has none."""
     full = preset.model_dump()
     for name, section in tree.items():
         both = isinstance(section, dict) and isinstance(full.get(name), dict)
@@ -295,8 +295,10 @@ def _over(preset: Section, tree: dict[str, Any]) -> dict[str, Any]:
 
 
 def _closest(model: type[Section], key: str) -> str | None:
-    """The known setting whose name is nearest, or whose last part is the same in another section; of a
-    section, the section."""
+    """Return the known setting whose name is nearest, or whose last part is the same in another section.
+
+    For a section it is a section.
+    """
     known = [] if "." in key else list(model.model_fields)
     for section, field in model.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, Section):
@@ -308,6 +310,6 @@ def _closest(model: type[Section], key: str) -> str | None:
 
 
 def _toml(value: Any) -> str:
-    """A value as TOML, which writes numbers, booleans, texts and lists of them as JSON does."""
+    """Return a value as TOML, which writes numbers, booleans, texts and lists of them as JSON does."""
     text = "null" if value is None else value
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from signature.localization.posterior import Prior
 
 
-# From file to file.
+# --- from file to file --------------------------------------------------------------------------------
 
 
 def convert(
@@ -285,7 +285,7 @@ def about_map(path: Path, drawn: DrawnMap, answer: Answer) -> QueryRecording:
     }
 
 
-# From a recording or a map to a session.
+# --- from a recording or a map to a session -----------------------------------------------------------
 
 _LIBRARIES = (
     "kiss-icp",

@@ -1,1 +1,1 @@
-"""Operations on one cloud: deskewing, ground plane, normals, and reduction to a planar scan."""
+"""Operations on clouds: deskewing, downsampling, ground plane, planar scan, and columns of fused clouds."""

@@ -203,7 +203,7 @@ class ColumnMap:
             self._floor_m = math.nan  # states are made again
 
 
-# Compiled functions.
+# --- compiled functions -------------------------------------------------------------------------------
 
 
 @njit(cache=True)

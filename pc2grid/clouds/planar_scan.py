@@ -253,7 +253,7 @@ class DepthLimit:
         return planar_scan.only(depth_m <= self.unbiased_m)
 
 
-# Compiled functions.
+# --- compiled functions -------------------------------------------------------------------------------
 
 
 @njit(cache=True)

@@ -386,7 +386,7 @@ def evenly(length: int, count: int) -> NDArray[np.intp]:
     return np.arange(length) if length <= count else np.linspace(0, length - 1, count).astype(np.intp)
 
 
-# Poses as unknowns.
+# --- poses as unknowns --------------------------------------------------------------------------------
 
 
 class Steps(NamedTuple):
@@ -430,7 +430,7 @@ def _for_compiled(*arrays: F64) -> Iterator[F64]:
     return (np.require(array, requirements=("C", "W")) for array in arrays)
 
 
-# Compiled functions.
+# --- compiled functions -------------------------------------------------------------------------------
 
 _DAMPING = 1e-6  # so that directions that no point measures can be solved for
 

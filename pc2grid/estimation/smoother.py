@@ -401,7 +401,7 @@ def _without(H: F64, g: F64, first: int) -> tuple[F64, F64]:
     return 0.5 * (reduced + reduced.T), g[rest] - B @ solved[:, -1]
 
 
-# Compiled functions: the factors and their normal equations.
+# --- compiled functions: the factors and their normal equations ---------------------------------------
 
 
 @njit(cache=True)

@@ -189,7 +189,7 @@ def _alone(found: SurfaceMatch, held: PoseWithCovariance) -> Measurement:
     return moved(found.pose[None], change[None])[0], information
 
 
-# The beginning of a session.
+# --- the beginning of a session -----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -281,7 +281,7 @@ def first_pose(scan: Scan, points_m: F32) -> F64:
     return np.eye(4) if ground is None else ground.leveling()
 
 
-# The local map.
+# --- the local map ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

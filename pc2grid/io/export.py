@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
 
-# Clouds.
+# --- clouds -------------------------------------------------------------------------------------------
 
 _PLY = """ply
 format binary_little_endian 1.0
@@ -82,7 +82,7 @@ def write_cloud(path: str | Path, points_m: ArrayLike) -> None:
         temporary.write_bytes(header.format(n=len(points)).encode("ascii") + points.tobytes())
 
 
-# Graphs.
+# --- graphs -------------------------------------------------------------------------------------------
 
 # Standard deviation of tracking as a random walk, of the order that loop closure assumes; chosen by hand.
 _WALK_M, _WALK_RAD = 0.03, math.radians(0.5)  # after one metre
@@ -146,7 +146,7 @@ def write_graph(path: str | Path, graph: nx.Graph) -> None:
         nx.write_graphml_xml(flat, temporary)
 
 
-# Recordings.
+# --- recordings ---------------------------------------------------------------------------------------
 
 _FLOAT32 = 7  # sensor_msgs/PointField
 _FARTHEST_DEPTH_M = 65.0  # an image of 16UC1 ends at 65.535 m
@@ -406,7 +406,7 @@ def _marker(number: int, marker: Marker, head: Any) -> Any:
     )
 
 
-# Messages of ROS 2.
+# --- messages of ROS 2 --------------------------------------------------------------------------------
 
 _UNOBSERVED = 1e6
 """Variance of z, roll and pitch of a planar pose, as drivers of robots on wheels write it. nav2 takes 1e9 at

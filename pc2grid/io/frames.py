@@ -362,7 +362,7 @@ class Transforms:
                 yield [First(at_ns, edge) for edge in edges or ()]
 
 
-# The attitude of an IMU.
+# --- the attitude of an IMU ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

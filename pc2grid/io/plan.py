@@ -130,7 +130,7 @@ def published_once(topic: TopicInfo) -> bool:
     return topic.type in topics.CAMERA_INFOS or (topic.type in topics.TF and topics.is_static(topic))
 
 
-# The sensors.
+# --- the sensors --------------------------------------------------------------------------------------
 
 _FIRST_SCANS = 20
 """So many scans of a topic are looked at, so that each of several sensors on it is among them. By hand."""
@@ -350,7 +350,7 @@ def _calibration(sensor: Sensor, frame: str, first: FirstMessages) -> CameraInfo
     return next((info.content for info in infos if info.frame == frame), sensor.calibration)
 
 
-# The base of the robot.
+# --- the base of the robot ----------------------------------------------------------------------------
 
 _LIDARS = ("lidar", "laser", "velodyne", "livox", "ouster", "os_sensor", "hesai", "pandar", "rslidar")
 """Parts of the names of frames of lidars."""
@@ -588,7 +588,7 @@ class BaseSearch:
         return ", ".join(t.topic for t in others if frame in self._first.frames_of(t))
 
 
-# Odometry and IMU.
+# --- odometry and IMU ---------------------------------------------------------------------------------
 
 
 class Motion(NamedTuple):

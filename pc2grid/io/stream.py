@@ -608,7 +608,7 @@ class _Poses:
         return found
 
 
-# Scans of further sensors.
+# --- scans of further sensors -------------------------------------------------------------------------
 
 _MOST_APART_NS = 100_000_000
 """Stamps of scans that are put together differ by no more: a period of a usual lidar."""

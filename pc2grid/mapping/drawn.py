@@ -187,7 +187,7 @@ def _doubts(level: F64, T_map_file: F64, read: ReadConfig, *, dense: bool) -> It
         yield f"the lowest floor is mapped; {floors}: --set read.floor_z={z_m[0]:.1f} maps that one"
 
 
-# From a cloud to a grid.
+# --- from a cloud to a grid ---------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -513,7 +513,7 @@ def check_plausible(points_m: NDArray[np.floating], parameters: CloudMapParamete
         )
 
 
-# The floor of a cloud.
+# --- the floor of a cloud -----------------------------------------------------------------------------
 
 _LEAST_UP = 0.99 / math.sqrt(3.0)
 """Of a floor's normal along the axis that points up. The farthest direction from all axes has 1 / sqrt(3)."""
@@ -643,7 +643,7 @@ def _refined(points: F64, ground: Ground, p: CloudMapParameters) -> Ground:
     return Ground(plane[:3], float(plane[3]), ground.ceiling_m)
 
 
-# Is the right side up, and the right floor mapped?
+# --- is the right side up, and the right floor mapped? ------------------------------------------------
 
 _CELL_M = 0.2
 """Edge of the cells and voxels in which a building is judged: a door is four of them wide."""

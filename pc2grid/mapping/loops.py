@@ -476,7 +476,7 @@ class SessionGraph:
         return sigma_m
 
 
-# Place recognition.
+# --- place recognition --------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -92,7 +92,7 @@ def _moved(tracked: F64, index: NDArray[np.integer], corrected: F64, which: NDAr
     return moved
 
 
-# The map of each part.
+# --- the map of each part -----------------------------------------------------------------------------
 
 
 def draw_parts(
@@ -259,7 +259,7 @@ def _of_scans(trajectory: Trajectory, scans: I64) -> Trajectory:
     )
 
 
-# Reports and warnings.
+# --- reports and warnings -----------------------------------------------------------------------------
 
 _WARN_DEGENERATE = 0.1
 """Share of degenerate scans above which the report says so; chosen by hand."""

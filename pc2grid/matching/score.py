@@ -347,7 +347,7 @@ def _drawn(walls: Walls, n: int) -> tuple[F64, F64, F64]:
     return weights, likelihood, known.astype(np.float64)
 
 
-# Compiled functions.
+# --- compiled functions -------------------------------------------------------------------------------
 
 
 @numba.njit(cache=True, nogil=True)

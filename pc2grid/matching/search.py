@@ -275,7 +275,7 @@ def _distinct(found: F64, parameters: SearchParameters) -> F64:
     return np.array(kept).reshape(-1, 4)
 
 
-# Compiled functions.
+# --- compiled functions -------------------------------------------------------------------------------
 
 _ROWS, _COLUMNS = TILE
 _NEUTRAL = LIKELIHOOD.neutral_value

@@ -26,7 +26,7 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.simulate.config import DriveConfig, OdometryConfig
 from pc2grid.simulate.plan import clearance_m
 
-# The motion along a route.
+# --- the motion along a route -------------------------------------------------------------------------
 
 RATE_HZ = 100.0
 """Samples of a drive in a second."""
@@ -150,7 +150,7 @@ def _turn(angle_rad: float, config: DriveConfig) -> tuple[F64, F64]:
     return times, np.sign(angle_rad) * angles
 
 
-# The route.
+# --- the route ----------------------------------------------------------------------------------------
 
 STEP_M = 0.05
 """Distance between two points of a route."""
@@ -395,7 +395,7 @@ def _smooth(points_m: F64, grid: OccupancyGrid, clearance: F32, least_m: float) 
     return band
 
 
-# Wheel odometry.
+# --- wheel odometry -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)

@@ -141,7 +141,7 @@ def _shelves(passages: Passages, layout: Layout, wall: int, margin: int, rng: np
             passages.put(_corners(Box(x, y, x + width, y + height)) + margin)
 
 
-# The division of a floor.
+# --- the division of a floor --------------------------------------------------------------------------
 
 
 class Box(NamedTuple):
@@ -435,7 +435,7 @@ def _shared_wall(a: Box, b: Box) -> tuple[int, int, int] | None:
     return None
 
 
-# Placing objects.
+# --- placing objects ----------------------------------------------------------------------------------
 
 _WINDOW_M = 1.2  # around an object, beyond the radius of the robot
 

@@ -36,7 +36,7 @@ from pc2grid.settings import ReadConfig
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
 from pc2grid.simulate.plan import Passages, outline_mask
 
-# Meshes and rays.
+# --- meshes and rays ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +146,7 @@ class Scene:
         return hits
 
 
-# Buildings.
+# --- buildings ----------------------------------------------------------------------------------------
 
 _VOXEL_M = 0.05  # smallest voxel of a cloud that rays hit
 
@@ -241,7 +241,7 @@ def _moved(mesh: Mesh, T: F64) -> Mesh:
     return Mesh(transform_points(T, mesh.vertices_m).astype(np.float32), mesh.triangles)
 
 
-# Sensors.
+# --- sensors ------------------------------------------------------------------------------------------
 
 OPTICAL = np.array([(0.0, 0.0, 1.0), (-1.0, 0.0, 0.0), (0.0, -1.0, 0.0)])
 """R_body_optical (REP-103): z forward, x right, y down, in body axes."""
@@ -368,7 +368,7 @@ def _measure_depth(true_m: F32, config: DepthConfig, rng: np.random.Generator) -
     return np.where(kept, reading, np.float32(np.nan)).astype(np.float32)
 
 
-# Clutter.
+# --- clutter ------------------------------------------------------------------------------------------
 
 _TRIES_PER_OBJECT = 40
 _SQUARE_SHARE = 0.5  # of the objects are aligned with the axes of the map

@@ -209,7 +209,7 @@ def iter_session(
     yield from prepare_session(sensor=sensor, grid=grid, config=config).scans()
 
 
-# Recordings.
+# --- recordings ---------------------------------------------------------------------------------------
 
 BASE_FRAME, ODOM_FRAME = "base_link", "odom"
 TOPICS: dict[SensorKind, str] = {

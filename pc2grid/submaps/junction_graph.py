@@ -174,7 +174,7 @@ def _join(a: list[int], b: list[int]) -> list[int]:
     return a + b[-2::-1]
 
 
-# Skeletons.
+# --- skeletons ----------------------------------------------------------------------------------------
 
 Thinning = Literal["guo_hall", "zhang_suen"]
 
@@ -362,7 +362,7 @@ def thin_in_place(flat: NDArray[np.uint8], width: int, border: I64, deletable: N
         half = 1 - half
 
 
-# Even sampling of points (III-B 3, III-C 1).
+# --- even sampling of points (III-B 3, III-C 1) -------------------------------------------------------
 
 Number = TypeVar("Number", np.int64, np.float64)
 _TOLERANCE = 1e-9

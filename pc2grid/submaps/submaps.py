@@ -103,7 +103,7 @@ def _centers(graph: nx.Graph, skeleton: BoolGrid, grid: OccupancyGrid, config: P
     return grid.to_point(centers[np.lexsort(centers.T[::-1])])
 
 
-# Isovists.
+# --- isovists -----------------------------------------------------------------------------------------
 
 BEARINGS = 360
 """Rays of an isovist, by default."""

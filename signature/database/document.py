@@ -248,7 +248,7 @@ def decode(part: str, data: bytes) -> Any:
     return value
 
 
-# The junction graph.
+# --- the junction graph -------------------------------------------------------------------------------
 
 KINDS = ("junction", "end")
 """What a node may be; `GraphArrays.kind` counts from 0 in this order."""
@@ -330,7 +330,7 @@ def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
     return graph
 
 
-# Bytes and checksums.
+# --- bytes and checksums ------------------------------------------------------------------------------
 
 Array = NDArray[Any]
 SALVAGE = "`pc2grid db check` lists all damage, `pc2grid db copy --recover` keeps what is whole"
@@ -421,7 +421,7 @@ def explained(location: Path | str, where: str) -> Iterator[None]:
         raise DatabaseDamage(location, where, what) from error
 
 
-# Plausible content.
+# --- plausible content --------------------------------------------------------------------------------
 
 # All chosen by hand: wide enough for every real session.
 MOST_VOXELS = 1 << 21

@@ -146,7 +146,7 @@ class Problem:
     what: str
 
 
-# The place in a building.
+# --- the place in a building --------------------------------------------------------------------------
 
 Covariance = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
 """Of x, y and yaw, row by row; metres and radians."""
@@ -245,7 +245,7 @@ def largest_m(deformation: Deformation) -> float:
     return max((float(np.hypot(dx, dy)) for _, _, dx, dy, _ in deformation), default=0.0)
 
 
-# Errors.
+# --- errors -------------------------------------------------------------------------------------------
 
 
 def refuse_other_format(location: object, version: int) -> None:

@@ -149,7 +149,7 @@ def _connect(path: Path) -> sqlite3.Connection:
     return connection
 
 
-# Writing.
+# --- writing ------------------------------------------------------------------------------------------
 
 _POLL_S = 0.05
 
@@ -238,7 +238,7 @@ def hold(target: Path, timeout_s: float) -> Iterator[None]:
         os.close(descriptor)
 
 
-# The file.
+# --- the file -----------------------------------------------------------------------------------------
 
 _CONVERTED = (".mcap", ".bag", ".db3", ".yaml", ".yml", ".pcd", ".ply", ".obj", ".stl")
 CONVERT = "make one with `pc2grid convert LOG -o BUILDING.submaps`"

@@ -24,7 +24,7 @@ from pc2grid.model import (
     ReadReport,
     SessionMap,
     ThreeDigits,
-    UncertainStretch,
+    UncertainSegment,
 )
 from signature.config import Config
 from signature.database import Provenance, SessionInfo
@@ -83,7 +83,7 @@ class PrecisionSummary(TypedDict):
 
     median_m: ThreeDigits
     worst_m: ThreeDigits
-    loose: list[UncertainStretch]
+    loose: list[UncertainSegment]
 
 
 class Mapped(Labelled):

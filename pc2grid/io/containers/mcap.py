@@ -209,7 +209,7 @@ def _wanted(chunks: list[ChunkIndex], channels: set[int], low_ns: int, high_ns: 
     return sorted(found, key=lambda chunk: (chunk.message_start_time, chunk.chunk_start_offset))
 
 
-# The index of a file.
+# --- the index of a file ------------------------------------------------------------------------------
 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER = struct.Struct("<9xQQI8s")  # offsets of the summary and of its parts, checksum, magic
@@ -420,7 +420,7 @@ def _as_run(message: Message, end: int) -> Run:
     )
 
 
-# Records and chunks.
+# --- records and chunks -------------------------------------------------------------------------------
 
 
 def records_of(stream: BoundedFile, *, whole_file: bool = False) -> Iterator[McapRecord]:
@@ -474,7 +474,7 @@ def named(error: Exception, where: str, behind: str = "") -> LogError:
     return kind(f"{where}: {what}{behind}", hint=getattr(error, "hint", None) or RECOVER_HINT)
 
 
-# Bounded reading and decompression.
+# --- bounded reading and decompression ----------------------------------------------------------------
 
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 

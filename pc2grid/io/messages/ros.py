@@ -107,7 +107,7 @@ def _store_of(channel: TopicInfo, ros1: bool, needed: str) -> tuple[str, Any]:
     return name, store
 
 
-# Converters of messages with the names of their fields in small letters.
+# --- converters of messages with the names of their fields in small letters ---------------------------
 
 # --- messages with the names of their fields in small letters -----------------------------------------
 
@@ -220,7 +220,7 @@ _CONVERTERS: dict[str, tuple[Callable[[Any], Any], str]] = {
 """Of each type what makes one of the classes of `types` of it, and the fields that this needs."""
 
 
-# Definitions of types.
+# --- definitions of types -----------------------------------------------------------------------------
 
 _TIME = "builtin_interfaces/msg/Time"
 _TF = (

@@ -156,7 +156,7 @@ def _to_base(xyz: F32 | F64, T_base_sensor: F64) -> F32:
     return points
 
 
-# LaserScan.
+# --- LaserScan ----------------------------------------------------------------------------------------
 
 # Drivers round the angles: so many ranges more or less than the angles make are accepted. Chosen by hand.
 _EXTRA_BEAMS, _EXTRA_SHARE = 2.0, 0.02

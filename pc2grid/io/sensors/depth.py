@@ -190,7 +190,7 @@ def _check_size(height: int, width: int, max_points: int) -> None:
         )
 
 
-# The rays of the pixels.
+# --- the rays of the pixels ---------------------------------------------------------------------------
 
 _STEEPEST = 1e3  # largest x / z and y / z of a ray: 0.06 degrees from the image plane
 
@@ -296,7 +296,7 @@ def _undistorted(u: F64, v: F64, k: F64, d: F64, model: str) -> tuple[F64, F64]:
     return x, y
 
 
-# The unit of the depths.
+# --- the unit of the depths ---------------------------------------------------------------------------
 
 # In most scans of a camera on a robot that sees the floor, a tenth of the returns are on it. Chosen by hand;
 # cameras whose unit is not the millimetre have one of 0.25, 0.2 or 0.1 mm.
@@ -335,7 +335,7 @@ class FloorDepth:
         )
 
 
-# The header of a PNG.
+# --- the header of a PNG ------------------------------------------------------------------------------
 
 MAGIC = b"\x89PNG\r\n\x1a\n"
 _HEADER = struct.Struct(">8s4x4sIIBB")  # the first chunk of every PNG
