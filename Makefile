@@ -8,7 +8,7 @@ READY = .venv/.ready
 BYTE_CODE = PYTHONDONTWRITEBYTECODE=
 PYTEST_ARGS ?=
 
-.PHONY: help browser demo test nightly check real fuzz pictures modules docs clean
+.PHONY: help browser demo test nightly check real fuzz pictures docs clean
 .DEFAULT_GOAL = help
 
 help:
@@ -19,7 +19,6 @@ help:
 	@echo 'make real    every real recording, against examples/real.md (QUICK=1: some of them); data: PC2GRID_DATA'
 	@echo 'make fuzz    20,000 mutations of every kind of input; then kill -9 and crowds, 200 times and a minute'
 	@echo 'make pictures draw all pictures of README and the pages again (2 hours, of it 2 minutes without the paper)'
-	@echo 'make modules list the modules by what they import, in CONTRIBUTING.md'
 	@echo 'make docs    the documentation site: site/index.html'
 	@echo 'make clean   remove .venv and everything that was made'
 	@echo 'All of them work from a fresh clone. PYTHON=/path/to/python3 chooses the interpreter for .venv.'
@@ -78,11 +77,8 @@ pictures: demo
 	$(BIN)/pc2grid compare scale --maps $(REAL_DATA)/maps --out results/scale
 	cp results/scale/scale.png examples/scale.png
 
-modules: $(READY)
-	PYTHONPATH=tools $(BIN)/python tools/architecture.py CONTRIBUTING.md
-
 docs: $(READY)
-	@$(BIN)/python -c "from pc2grid.extras import require; require({'docs': 'make docs'})"
+	@$(BIN)/python -c "from pc2grid.libraries import require; require({'docs': 'make docs'})"
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build
 
 clean:

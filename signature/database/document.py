@@ -52,6 +52,86 @@ if TYPE_CHECKING:
     from signature.paper import Signature
 
 
+KINDS = ("junction", "end")
+"""What a node may be; `GraphArrays.kind` counts from 0 in this order."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GraphArrays:
+    """A junction graph as plain arrays, to be stored.
+
+    center_m : (N, 2) float64. kind : (N,) uint8, index into `KINDS`. pixels : (N,) int32. edges : (E, 2)
+    int32, numbers of nodes, the lower one first. length_m : (E,) float64. path_start : (E + 1,) int64;
+    `path_m[path_start[e]:path_start[e + 1]]` is the way of edge e. path_m : (K, 2) float32.
+    """
+
+    center_m: F64
+    kind: NDArray[np.uint8]
+    pixels: NDArray[np.int32]
+    edges: NDArray[np.int32]
+    length_m: F64
+    path_start: I64
+    path_m: F32
+
+    def __post_init__(self) -> None:
+        nodes, edges = len(self.kind), len(self.length_m)
+        freeze(self, "center_m", np.float64, (nodes, 2))
+        freeze(self, "kind", np.uint8, (nodes,))
+        freeze(self, "pixels", np.int32, (nodes,))
+        freeze(self, "edges", np.int32, (edges, 2))
+        freeze(self, "length_m", np.float64, (edges,))
+        freeze(self, "path_start", np.int64, (edges + 1,))
+        freeze(self, "path_m", np.float32, (None, 2))
+
+
+def graph_to_arrays(graph: nx.Graph) -> GraphArrays:
+    """Return a junction graph as arrays; `graph_from_arrays` is the inverse."""
+    nodes = [graph.nodes[node] for node in range(len(graph))]
+    edges = [(min(a, b), max(a, b), way) for a, b, way in graph.edges(data=True)]
+    paths = [np.asarray(way["path_m"], np.float32).reshape(-1, 2) for _, _, way in edges]
+    return GraphArrays(
+        center_m=np.array([node["center_m"] for node in nodes], np.float64).reshape(-1, 2),
+        kind=np.array([KINDS.index(node["kind"]) for node in nodes], np.uint8),
+        pixels=np.array([node["pixels"] for node in nodes], np.int32),
+        edges=np.array([(a, b) for a, b, _ in edges], np.int32).reshape(-1, 2),
+        length_m=np.array([way["length_m"] for _, _, way in edges], np.float64),
+        path_start=np.cumsum([0, *map(len, paths)], dtype=np.int64),
+        path_m=np.concatenate((np.empty((0, 2), np.float32), *paths)),
+    )
+
+
+def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
+    """Return the junction graph of arrays from `graph_to_arrays`.
+
+    Raises ValueError if the arrays are no junction graph: a kind that does not exist, an edge to a node that
+    does not exist, from a node to itself or given twice, a length that is not positive, numbers that are not
+    finite, paths that do not follow each other.
+    """
+    import networkx as nx
+
+    nodes, starts = len(arrays.kind), arrays.path_start
+    edges = arrays.edges.tolist()
+    positive = np.isfinite(arrays.length_m) & (arrays.length_m > 0)
+    valid = {
+        "kind": (arrays.kind < len(KINDS)).all(),
+        "edges": all(0 <= a < b < nodes for a, b in edges) and len(set(map(tuple, edges))) == len(edges),
+        "center_m": np.isfinite(arrays.center_m).all(),
+        "length_m": positive.all(),
+        "path_start": starts[0] == 0 and starts[-1] == len(arrays.path_m) and (np.diff(starts) >= 0).all(),
+        "path_m": np.isfinite(arrays.path_m).all(),
+    }
+    for name, good in valid.items():
+        if not good:
+            raise ValueError(f"GraphArrays.{name}: not that of a junction graph")
+    graph = nx.Graph()
+    about = zip(arrays.kind.tolist(), arrays.center_m.tolist(), arrays.pixels.tolist(), strict=True)
+    for node, (kind, (x, y), pixels) in enumerate(about):
+        graph.add_node(node, kind=KINDS[kind], center_m=(x, y), pixels=pixels)
+    for k, ((a, b), length_m) in enumerate(zip(edges, arrays.length_m.tolist(), strict=True)):
+        graph.add_edge(a, b, length_m=length_m, path_m=arrays.path_m[starts[k] : starts[k + 1]])
+    return graph
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SubmapArrays:
     """The N submaps of a session: their centres and their signatures.
@@ -246,88 +326,6 @@ def decode(part: str, data: bytes) -> Any:
     if value is None and part not in ("points", "frame"):
         raise ValueError("is not there")
     return value
-
-
-# --- the junction graph -------------------------------------------------------------------------------
-
-KINDS = ("junction", "end")
-"""What a node may be; `GraphArrays.kind` counts from 0 in this order."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GraphArrays:
-    """A junction graph as plain arrays, to be stored.
-
-    center_m : (N, 2) float64. kind : (N,) uint8, index into `KINDS`. pixels : (N,) int32. edges : (E, 2)
-    int32, numbers of nodes, the lower one first. length_m : (E,) float64. path_start : (E + 1,) int64;
-    `path_m[path_start[e]:path_start[e + 1]]` is the way of edge e. path_m : (K, 2) float32.
-    """
-
-    center_m: F64
-    kind: NDArray[np.uint8]
-    pixels: NDArray[np.int32]
-    edges: NDArray[np.int32]
-    length_m: F64
-    path_start: I64
-    path_m: F32
-
-    def __post_init__(self) -> None:
-        nodes, edges = len(self.kind), len(self.length_m)
-        freeze(self, "center_m", np.float64, (nodes, 2))
-        freeze(self, "kind", np.uint8, (nodes,))
-        freeze(self, "pixels", np.int32, (nodes,))
-        freeze(self, "edges", np.int32, (edges, 2))
-        freeze(self, "length_m", np.float64, (edges,))
-        freeze(self, "path_start", np.int64, (edges + 1,))
-        freeze(self, "path_m", np.float32, (None, 2))
-
-
-def graph_to_arrays(graph: nx.Graph) -> GraphArrays:
-    """Return a junction graph as arrays; `graph_from_arrays` is the inverse."""
-    nodes = [graph.nodes[node] for node in range(len(graph))]
-    edges = [(min(a, b), max(a, b), way) for a, b, way in graph.edges(data=True)]
-    paths = [np.asarray(way["path_m"], np.float32).reshape(-1, 2) for _, _, way in edges]
-    return GraphArrays(
-        center_m=np.array([node["center_m"] for node in nodes], np.float64).reshape(-1, 2),
-        kind=np.array([KINDS.index(node["kind"]) for node in nodes], np.uint8),
-        pixels=np.array([node["pixels"] for node in nodes], np.int32),
-        edges=np.array([(a, b) for a, b, _ in edges], np.int32).reshape(-1, 2),
-        length_m=np.array([way["length_m"] for _, _, way in edges], np.float64),
-        path_start=np.cumsum([0, *map(len, paths)], dtype=np.int64),
-        path_m=np.concatenate((np.empty((0, 2), np.float32), *paths)),
-    )
-
-
-def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
-    """Return the junction graph of arrays from `graph_to_arrays`.
-
-    Raises ValueError if the arrays are no junction graph: a kind that does not exist, an edge to a node that
-    does not exist, from a node to itself or given twice, a length that is not positive, numbers that are not
-    finite, paths that do not follow each other.
-    """
-    import networkx as nx
-
-    nodes, starts = len(arrays.kind), arrays.path_start
-    edges = arrays.edges.tolist()
-    positive = np.isfinite(arrays.length_m) & (arrays.length_m > 0)
-    valid = {
-        "kind": (arrays.kind < len(KINDS)).all(),
-        "edges": all(0 <= a < b < nodes for a, b in edges) and len(set(map(tuple, edges))) == len(edges),
-        "center_m": np.isfinite(arrays.center_m).all(),
-        "length_m": positive.all(),
-        "path_start": starts[0] == 0 and starts[-1] == len(arrays.path_m) and (np.diff(starts) >= 0).all(),
-        "path_m": np.isfinite(arrays.path_m).all(),
-    }
-    for name, good in valid.items():
-        if not good:
-            raise ValueError(f"GraphArrays.{name}: not that of a junction graph")
-    graph = nx.Graph()
-    about = zip(arrays.kind.tolist(), arrays.center_m.tolist(), arrays.pixels.tolist(), strict=True)
-    for node, (kind, (x, y), pixels) in enumerate(about):
-        graph.add_node(node, kind=KINDS[kind], center_m=(x, y), pixels=pixels)
-    for k, ((a, b), length_m) in enumerate(zip(edges, arrays.length_m.tolist(), strict=True)):
-        graph.add_edge(a, b, length_m=length_m, path_m=arrays.path_m[starts[k] : starts[k + 1]])
-    return graph
 
 
 # --- bytes and checksums ------------------------------------------------------------------------------
