@@ -331,9 +331,10 @@ class OccupancyGrid:
 class Submap:
     """A part of a map around a centre (paper III-A).
 
-    submap_id : number within its session, in the order of the partition. center_m : (x, y) in the map frame.
-    radius_m : cells farther from the centre are unknown in `grid`. grid : square crop around the centre,
-    cells outside the radius unknown.
+    submap_id : number within its session, in the order of the partition.
+    center_m : (x, y) in the map frame.
+    radius_m : cells farther from the centre are unknown in `grid`.
+    grid : square crop around the centre, cells outside the radius unknown.
 
     >>> import pc2grid
     >>> submap = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))[0]
@@ -430,9 +431,10 @@ class Loop:
 class Contradiction:
     """A part of a trajectory along which the scans do not agree with the map that was drawn from them.
 
-    from_ns, to_ns : stamps of its first and last scan. x_m, y_m : position of the base, in the session frame,
-    where the scans agree least. length_m : planar distance driven. share : of the wall hits there that lie on
-    free ground of the map, 0..1.
+    from_ns, to_ns : stamps of its first and last scan.
+    x_m, y_m : position of the base, in the session frame, where the scans agree least.
+    length_m : planar distance driven.
+    share : of the wall hits there that lie on free ground of the map, 0..1.
     """
 
     from_ns: int
@@ -448,9 +450,10 @@ class Consistency:
     """The agreement of a map with its own scans (`pc2grid.mapping.quality`).
 
     hits_on_free : share of all wall hits that lie on free ground of the map, 0..1. Hits on moving objects are
-    not counted. contradicted : share of the travel along which many do, 0..1. bent : True if the share is so
-    high that parts of the map are probably drawn in the wrong place. stretches : where this is so, the
-    longest first; of very many the longest only.
+        not counted.
+    contradicted : share of the travel along which many do, 0..1.
+    bent : True if the share is so high that parts of the map are probably drawn in the wrong place.
+    stretches : where this is so, the longest first; of very many the longest only.
 
     >>> Consistency().bent
     False
@@ -466,9 +469,9 @@ class Consistency:
 class UncertainSegment:
     """A part of a trajectory whose place relative to the rest of the map is known only roughly.
 
-    from_ns, to_ns : stamps of its ends. length_m : planar distance driven. sigma_m : largest standard
-    deviation of a position along it, in the least certain direction. x_m, y_m : position of the base, in the
-    session frame, where that is so.
+    from_ns, to_ns : stamps of its ends. length_m : planar distance driven.
+    sigma_m : largest standard deviation of a position along it, in the least certain direction.
+    x_m, y_m : position of the base, in the session frame, where that is so.
     """
 
     from_ns: int
@@ -535,8 +538,8 @@ class OdometryCheck:
     """The comparison of a session's odometry with its scans (`pc2grid.estimation.tracker`).
 
     compared : number of scans that were tracked and have odometry. overruled : of these, number of scans at
-    which odometry is an outlier. stretches : where that was so, the largest difference first; of very many
-    the largest only.
+        which odometry is an outlier.
+    stretches : where that was so, the largest difference first; of very many the largest only.
 
     >>> OdometryCheck().compared
     0
@@ -604,14 +607,18 @@ class PointMap:
 class SessionMap:
     """The map made of one recording: the result of the point-cloud half of pc2grid.
 
-    session : name, unique within a database. sensor : the kind that made the map, or "map" for an imported
-    map.yaml. grid : the whole occupancy grid, in the session frame. submaps : its partition. trajectory :
-    poses of the base; empty for an imported map. loops : between visits of the same place. graph : the
-    junction graph of the free space (`pc2grid.submaps.junction_graph`) from which the submaps were made;
-    empty if none was made. consistency : agreement of the map with its own scans; None if that is not known.
-    odometry : agreement of odometry with the scans; None if that is not known. precision : of its places
-    relative to each other; None if that is not known. points : the points of the recording in space; None if
-    they were not asked for, or there are none.
+    session : name, unique within a database.
+    sensor : the kind that made the map, or "map" for an imported map.yaml.
+    grid : the whole occupancy grid, in the session frame.
+    submaps : its partition.
+    trajectory : poses of the base; empty for an imported map.
+    loops : between visits of the same place.
+    graph : the junction graph of the free space (`pc2grid.submaps.junction_graph`) from which the submaps
+        were made; empty if none was made.
+    consistency : agreement of the map with its own scans; None if that is not known.
+    odometry : agreement of odometry with the scans; None if that is not known.
+    precision : of its places relative to each other; None if that is not known.
+    points : the points of the recording in space; None if they were not asked for, or there are none.
 
     >>> import numpy as np
     >>> import pc2grid

@@ -193,8 +193,8 @@ def map_scans(
 ) -> tuple[OccupancyGrid, Trajectory, tuple[Loop, ...]]:
     """Return the grid and trajectory of scans, and their loops; never divided as by `build_maps`.
 
-    observer : gets each scan with its tracked pose, before loops are closed. recognizer : finds loops beyond
-    the reach of the search near the tracked pose.
+    observer : gets each scan with its tracked pose, before loops are closed.
+    recognizer : finds loops beyond the reach of the search near the tracked pose.
 
     Only the pose of a scan stays in memory. The planar scan of a keyframe waits in a temporary file. So
     memory grows with the mapped area, not with the length of the recording. A robot that stands still adds

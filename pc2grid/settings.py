@@ -199,9 +199,9 @@ def load_settings(
 ) -> T:
     """Load the settings of a tree: `assignments` override `file`, which overrides `preset`.
 
-    file : a TOML file; None: the one that the environment variable PC2GRID_CONFIG names, if any. assignments
-    : "section.key=value" each, the value as in TOML; text needs no quotes. preset : the settings that nothing
-    else sets; None: the defaults of `model`.
+    file : a TOML file; None: the one that the environment variable PC2GRID_CONFIG names, if any.
+    assignments : "section.key=value" each, the value as in TOML; text needs no quotes.
+    preset : the settings that nothing else sets; None: the defaults of `model`.
 
     Raises ConfigError naming the key and the closest known one.
     """

@@ -39,7 +39,8 @@ class Job:
     """One recording or map to convert: the arguments of `signature.sessions.build_sessions`.
 
     stored : provenance of the session of this name that is in the database already and shall stay; None if
-    there is no such session. version : of the pc2grid that made the job; a worker must have the same.
+        there is no such session.
+    version : of the pc2grid that made the job; a worker must have the same.
     """
 
     path: Path
@@ -62,7 +63,8 @@ class Outcome:
     """The result of a job.
 
     entries : the sessions to be stored, one for each part of the recording; empty if it is stored already, or
-    if the job failed. error : why the job failed; None if it did not.
+        if the job failed.
+    error : why the job failed; None if it did not.
     """
 
     job: Job

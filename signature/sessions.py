@@ -199,9 +199,10 @@ def find(
 ) -> Found:
     """Locate a map, or a recording, or the part of it that `span` names, in an open database.
 
-    config, span, recover, until_located, observer : as in `relocalize`. prior : returns prior knowledge of
-    the pose, perhaps from the recording. see : called with each scan, and with the result of `Localizer.add`
-    for it. index : of the database, if it is prepared.
+    config, span, recover, until_located, observer : as in `relocalize`.
+    prior : returns prior knowledge of the pose, perhaps from the recording.
+    see : called with each scan, and with the result of `Localizer.add` for it.
+    index : of the database, if it is prepared.
 
     Raises the errors of `pc2grid.open_log`, MapFileError, NoScans, and what `prior` raises.
     """

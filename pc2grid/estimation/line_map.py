@@ -63,8 +63,8 @@ class TrackingParameters:
 
     Points:
 
-    max_points : of a scan, chosen at random; a depth image has 300 000. floor_slack_m : height up to which
-    points count as floor.
+    max_points : of a scan, chosen at random; a depth image has 300 000.
+    floor_slack_m : height up to which points count as floor.
 
     Ground:
 
@@ -72,24 +72,26 @@ class TrackingParameters:
 
     Odometry:
 
-    gap : odometry does not continue over more than so many usual intervals between scans. fastest : in m/s
-    and in rad/s; a faster motion reported by odometry is rejected, with an allowance of `jump`, m and rad,
-    for noise.
+    gap : odometry does not continue over more than so many usual intervals between scans.
+    fastest : in m/s and in rad/s; a faster motion reported by odometry is rejected, with an allowance of
+        `jump`, m and rad, for noise.
 
     Refinement in the plane:
 
-    matched_hits : hits of a scan that are matched, at most, evenly chosen. followed : number of last scans
-    with which a scan is matched that does not fit the local map. hit_weight : information of a hit, as a
-    share of one that is independent of its neighbours. sure_overlap : least overlap of a match that alone
-    decides between odometry and constant velocity; with less, a search follows if the prediction is vague
-    enough. search_above_m, search_above_rad : the search is made only if its half width, `KERNEL` standard
-    deviations, exceeds one of these; a refinement alone converges over less. search_most_m : largest half
-    width. search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
+    matched_hits : hits of a scan that are matched, at most, evenly chosen.
+    followed : number of last scans with which a scan is matched that does not fit the local map.
+    hit_weight : information of a hit, as a share of one that is independent of its neighbours.
+    sure_overlap : least overlap of a match that alone decides between odometry and constant velocity; with
+        less, a search follows if the prediction is vague enough.
+    search_above_m, search_above_rad : the search is made only if its half width, `KERNEL` standard
+        deviations, exceeds one of these; a refinement alone converges over less.
+    search_most_m : largest half width.
+    search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
 
     Local maps and keyframes:
 
-    keyframe_travel_m, keyframe_turn_rad : a scan joins the local maps after this motion. map_travel_m :
-    travel after which a new local map is begun.
+    keyframe_travel_m, keyframe_turn_rad : a scan joins the local maps after this motion.
+    map_travel_m : travel after which a new local map is begun.
 
     Health:
 

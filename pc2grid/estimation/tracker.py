@@ -36,11 +36,12 @@ from pc2grid.settings import ProjectionConfig, RegistrationConfig
 class Tracked:
     """The result of tracking one scan.
 
-    registered : the scan, deskewed, with its pose and health. planar_scan : the scan reduced to the plane.
-    keyframe : True if the robot had moved enough for the scan to become part of the local map. restart : the
-    first keyframe after tracking was lost: its pose relative to those before is unknown. walls_changed : it
-    was lost because the walls had changed while odometry stood still. disagreement : of odometry with the
-    pose; None for a lost scan, and where there is nothing to compare.
+    registered : the scan, deskewed, with its pose and health.
+    planar_scan : the scan reduced to the plane.
+    keyframe : True if the robot had moved enough for the scan to become part of the local map.
+    restart : the first keyframe after tracking was lost: its pose relative to those before is unknown.
+    walls_changed : it was lost because the walls had changed while odometry stood still.
+    disagreement : of odometry with the pose; None for a lost scan, and where there is nothing to compare.
     """
 
     registered: RegisteredScan

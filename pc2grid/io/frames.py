@@ -369,8 +369,9 @@ class Transforms:
 class AttitudeParameters:
     """Numbers of the filter. Chosen by hand.
 
-    memory_s : time over which accelerations are averaged: two steps of somebody who walks. gravity_mps2 :
-    standard gravity. slack : an acceleration that differs from it by more than this share is left out.
+    memory_s : time over which accelerations are averaged: two steps of somebody who walks.
+    gravity_mps2 : standard gravity. slack : an acceleration that differs from it by more than this share is
+        left out.
     """
 
     memory_s: float = 1.0

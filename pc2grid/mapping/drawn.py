@@ -208,13 +208,16 @@ class CloudMapParameters:
 
     Viewpoints:
 
-    tile_m : edge of the tiles in which the cloud is drawn. spacing_m : at most one viewpoint in a square of
-    this edge. clearance_m : least distance of a viewpoint to what is not seen floor. height_m : of the
-    viewpoints above the floor. sight_m : range of the view from a viewpoint. Up to 11 m a voxel of 5 cm is
-    wider than a bearing of a planar scan (0.25 degrees), so that no bearing passes through a wall. hidden_m :
-    ground farther than this from visible floor is not free, even if it lies before a wall. ceiling_m : points
-    higher above the floor are not used: they belong to the storey above. tall_m : the largest height of a
-    building. A higher cloud is not in metres. small_m : the least width and depth of a building.
+    tile_m : edge of the tiles in which the cloud is drawn.
+    spacing_m : at most one viewpoint in a square of this edge.
+    clearance_m : least distance of a viewpoint to what is not seen floor.
+    height_m : of the viewpoints above the floor.
+    sight_m : range of the view from a viewpoint. Up to 11 m a voxel of 5 cm is wider than a bearing of a
+        planar scan (0.25 degrees), so that no bearing passes through a wall.
+    hidden_m : ground farther than this from visible floor is not free, even if it lies before a wall.
+    ceiling_m : points higher above the floor are not used: they belong to the storey above.
+    tall_m : the largest height of a building. A higher cloud is not in metres.
+    small_m : the least width and depth of a building.
     """
 
     resolution_m: float = 0.05
@@ -535,7 +538,8 @@ def level_cloud(
     several storeys the lowest is taken.
 
     floor_z : height of the floor in the cloud, metres, if it is known: nothing is searched for, and the cloud
-    is not rotated. up : axis of the file that became z, for the words of an error.
+        is not rotated.
+    up : axis of the file that became z, for the words of an error.
 
     Raises MapFileError if the cloud shows no floor, or one that is tilted by more.
     """

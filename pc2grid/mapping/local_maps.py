@@ -21,11 +21,13 @@ from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField
 class LocalMapParameters:
     """How a local map is drawn and matched. Chosen by hand; checked on the relations of fr079 and intel.
 
-    range_m : hits farther from the sensor are left out: they are too sparse to match. cell_m : edge of a
-    cell. margin_m : free border around the points, at least the widest neighbourhood of `radii_cells`. wall_m
-    : largest distance of a point that meets an obstacle. radii_cells : neighbourhoods of the refinement, see
-    `PointGrid.match`. every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them
-    add no new walls. cached : local maps that stay in memory.
+    range_m : hits farther from the sensor are left out: they are too sparse to match.
+    cell_m : edge of a cell.
+    margin_m : free border around the points, at least the widest neighbourhood of `radii_cells`.
+    wall_m : largest distance of a point that meets an obstacle.
+    radii_cells : neighbourhoods of the refinement, see `PointGrid.match`.
+    every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them add no new walls.
+    cached : local maps that stay in memory.
 
     Of two local maps that are compared with each other:
 

@@ -49,19 +49,20 @@ class LoopParameters:
 
     Cutting into local maps:
 
-    travel_m : travel after which a local map is complete. turn_m_per_rad : travel that a turn on the spot
-    counts as.
+    travel_m : travel after which a local map is complete.
+    turn_m_per_rad : travel that a turn on the spot counts as.
 
     Which pairs are compared:
 
-    near_m : older local maps within this distance may overlap the newest one. compared : older local maps
-    that the newest is compared with.
+    near_m : older local maps within this distance may overlap the newest one.
+    compared : older local maps that the newest is compared with.
 
     How far is searched: as far as tracking may have drifted since the pose was last certain.
 
-    certain_m, certain_rad : the window directly after a loop. drift_per_m, drift_rad_per_m : growth of the
-    window per metre of travel. max_window_m, max_window_rad : its largest size. lost_m : travel that a lost
-    part of the session counts as; enough for the largest window.
+    certain_m, certain_rad : the window directly after a loop.
+    drift_per_m, drift_rad_per_m : growth of the window per metre of travel.
+    max_window_m, max_window_rad : its largest size.
+    lost_m : travel that a lost part of the session counts as; enough for the largest window.
 
     Their information in the pose graph:
 
@@ -75,8 +76,9 @@ class LoopParameters:
     Place recognition:
 
     maps_per_place : consecutive local maps that make a place map: 12 m of travel, chosen on aces, csail and
-    killian. recognized_m : window of the comparison that confirms a recognition; its yaw is within
-    `certain_rad`. compared_pairs : pairs of local maps of the two place maps that are compared at most.
+        killian.
+    recognized_m : window of the comparison that confirms a recognition; its yaw is within `certain_rad`.
+    compared_pairs : pairs of local maps of the two place maps that are compared at most.
     """
 
     travel_m: float = 4.0
@@ -140,7 +142,8 @@ class CandidateParameters:
     Standard deviation of the drift of tracking over a travel, large enough for a slip of the wheels
     (`docs/method.md`):
 
-    drift_m, drift_per_m : of position, constant and per metre of travel. drift_rad, drift_rad_per_m : of yaw.
+    drift_m, drift_per_m : of position, constant and per metre of travel.
+    drift_rad, drift_rad_per_m : of yaw.
 
     The drift over the short travel between two recognitions that support each other:
 
@@ -181,9 +184,9 @@ CANDIDATES = CandidateParameters()
 class LoopCloser:
     """Closes loops while a session is recorded.
 
-    keyframes : gets those of the session; local maps are drawn from them when needed. recognizer : gets every
-    place map; None: loops are searched near the tracked pose only. projection : how the grids for the
-    recognizer are drawn.
+    keyframes : gets those of the session; local maps are drawn from them when needed.
+    recognizer : gets every place map; None: loops are searched near the tracked pose only.
+    projection : how the grids for the recognizer are drawn.
     """
 
     def __init__(

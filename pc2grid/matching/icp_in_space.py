@@ -77,13 +77,15 @@ class RegistrationParameters:
 class RayParameters:
     """How rays are compared with a map. All chosen by hand, tried in simulation.
 
-    views, rays : at most so many scans are compared, evenly spread, and of each so many rays. bin_rad : size
-    of the bins of directions in which surfaces hide each other. near_m : a point so near to the map lies on
-    it. gap_m : a surface is passed, or not reached, if it is at least so far off along the ray. floor_m :
-    points this near to the floor are no evidence: it is the same everywhere. patch_m : rays that end within a
-    cell of this size hit one object. patch_rays : a patch counts for a place if so many more of its rays end
-    on surfaces of this place than of the other. above_m : surfaces higher above the floor belong to the
-    building: they are seldom moved.
+    views, rays : at most so many scans are compared, evenly spread, and of each so many rays.
+    bin_rad : size of the bins of directions in which surfaces hide each other.
+    near_m : a point so near to the map lies on it.
+    gap_m : a surface is passed, or not reached, if it is at least so far off along the ray.
+    floor_m : points this near to the floor are no evidence: it is the same everywhere.
+    patch_m : rays that end within a cell of this size hit one object.
+    patch_rays : a patch counts for a place if so many more of its rays end on surfaces of this place than of
+        the other.
+    above_m : surfaces higher above the floor belong to the building: they are seldom moved.
     """
 
     views: int = 5

@@ -41,13 +41,15 @@ from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField, Walls
 class Fit:
     """The agreement of a query with a map at one pose. Means and shares are weighted by `walls.permanence`.
 
-    T_map_query : pose of the query's frame in the map. forward : 0..1, mean likelihood of the query's walls;
-    neutral where the map is unknown. backward : 0..1, mean likelihood of the map's walls on ground known to
-    the query. overlap : 0..1, share of the query's walls on ground known to the map. compared : number of the
-    query's wall points that, with the ground in front of them, are known to the map, by weight. looked_at :
-    number of the map's wall points on ground known to the query, by weight. score : 0..1, geometric mean of
-    forward and backward; hypotheses are ranked by it. covariance : (3, 3) of x, y, yaw from the refinement:
-    wide along a corridor, narrow across it.
+    T_map_query : pose of the query's frame in the map.
+    forward : 0..1, mean likelihood of the query's walls; neutral where the map is unknown.
+    backward : 0..1, mean likelihood of the map's walls on ground known to the query.
+    overlap : 0..1, share of the query's walls on ground known to the map.
+    compared : number of the query's wall points that, with the ground in front of them, are known to the map,
+        by weight.
+    looked_at : number of the map's wall points on ground known to the query, by weight.
+    score : 0..1, geometric mean of forward and backward; hypotheses are ranked by it.
+    covariance : (3, 3) of x, y, yaw from the refinement: wide along a corridor, narrow across it.
     """
 
     T_map_query: SE2
@@ -225,9 +227,10 @@ class Support(enum.IntEnum):
 class Agreement:
     """The wall points behind a `Fit`.
 
-    points_m : (K, 2) float32, the query's wall points, in the query's frame. support : (K,) uint8, the
-    `Support` of each. weights : (K,) float32, 0..1, see `walls.permanence`. missed_m : (M, 2) float32, wall
-    points of the map, in the map frame, where the query observed free ground.
+    points_m : (K, 2) float32, the query's wall points, in the query's frame.
+    support : (K,) uint8, the `Support` of each.
+    weights : (K,) float32, 0..1, see `walls.permanence`.
+    missed_m : (M, 2) float32, wall points of the map, in the map frame, where the query observed free ground.
     """
 
     points_m: F32

@@ -121,8 +121,8 @@ WALL_MARGIN_M = 0.15
 class Isovist:
     """The area that is visible from `center_m` up to `sight_m`.
 
-    ranges_m : (B,) float32, length of ray b; its bearing is 2 pi b / B from the map's x axis. ends : (B,)
-    int8, WALL, OPEN (nothing within sight) or HIDDEN (reached unknown cells).
+    ranges_m : (B,) float32, length of ray b; its bearing is 2 pi b / B from the map's x axis.
+    ends : (B,) int8, WALL, OPEN (nothing within sight) or HIDDEN (reached unknown cells).
     """
 
     center_m: tuple[float, float]

@@ -60,9 +60,10 @@ KINDS = ("junction", "end")
 class GraphArrays:
     """A junction graph as plain arrays, to be stored.
 
-    center_m : (N, 2) float64. kind : (N,) uint8, index into `KINDS`. pixels : (N,) int32. edges : (E, 2)
-    int32, numbers of nodes, the lower one first. length_m : (E,) float64. path_start : (E + 1,) int64;
-    `path_m[path_start[e]:path_start[e + 1]]` is the way of edge e. path_m : (K, 2) float32.
+    center_m : (N, 2) float64. kind : (N,) uint8, index into `KINDS`. pixels : (N,) int32.
+    edges : (E, 2) int32, numbers of nodes, the lower one first. length_m : (E,) float64.
+    path_start : (E + 1,) int64; `path_m[path_start[e]:path_start[e + 1]]` is the way of edge e.
+    path_m : (K, 2) float32.
     """
 
     center_m: F64

@@ -66,10 +66,12 @@ class Provenance:
     """The origin of a session: enough to make it again. It has no time of day, so equal inputs give equal
     bytes.
 
-    source : file name of the recording or map, without its folder, which differs between machines. digest :
-    sha256 of the recording, hex. config : the whole effective configuration. start_s, duration_s : part of
-    the recording, seconds from its start; duration None: to the end. versions : program and library ->
-    version. label : building and floor.
+    source : file name of the recording or map, without its folder, which differs between machines.
+    digest : sha256 of the recording, hex.
+    config : the whole effective configuration.
+    start_s, duration_s : part of the recording, seconds from its start; duration None: to the end.
+    versions : program and library -> version.
+    label : building and floor.
     """
 
     source: str
@@ -88,11 +90,17 @@ class Provenance:
 class SessionInfo:
     """A session as `db info` shows it.
 
-    name : unique within the database. sensor : kind that made it, or "map". submaps : how many. area_m2 :
-    free space in its grid. path_m : distance driven, metres; 0 for an imported map. duration_s : time between
-    first and last pose. scans : poses in its trajectory. points : how many points in space are stored. report
-    : counts of what was read, and of what was lost while reading. consistency : agreement of its map with its
-    own scans; None for an imported map. odometry : agreement of odometry with its scans; None likewise.
+    name : unique within the database.
+    sensor : kind that made it, or "map".
+    submaps : how many.
+    area_m2 : free space in its grid.
+    path_m : distance driven, metres; 0 for an imported map.
+    duration_s : time between first and last pose.
+    scans : poses in its trajectory.
+    points : how many points in space are stored.
+    report : counts of what was read, and of what was lost while reading.
+    consistency : agreement of its map with its own scans; None for an imported map.
+    odometry : agreement of odometry with its scans; None likewise.
     precision : standard deviations of its places relative to each other; None likewise.
     """
 

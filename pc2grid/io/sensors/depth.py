@@ -231,8 +231,8 @@ def pixel_rays(
     """Return the directions (n, 3) of the used pixels, row-major, scaled to z = 1; computed once for a
     camera.
 
-    rectified : the image is undistorted already, so that `p` and not `k` with `d` describes it. stride :
-    every n-th row and column is used. camera : how errors name the CameraInfo.
+    rectified : the image is undistorted already, so that `p` and not `k` with `d` describes it.
+    stride : every n-th row and column is used. camera : how errors name the CameraInfo.
 
     Raises PointCloudError for numbers that no camera has, UnsupportedSchema for another distortion model.
     """
