@@ -66,7 +66,7 @@ class Scan:
     odometry_gap_s : longest time without a reading of odometry since the last scan that has `T_odom_base`;
         infinite if that is not known.
     T_first_last : (4, 4) motion of the base from the first to the last of the points' times, by odometry;
-    without odometry its rotation, by an IMU; None where that or the times are not recorded.
+        without odometry its rotation, by an IMU; None where that or the times are not recorded.
     T_level_base : (4, 4) attitude at `stamp_ns` by an IMU: z is up, the heading drifts, no translation; None
         if there is no IMU.
     sensor : kind of the sensor.
@@ -214,7 +214,7 @@ class OccupancyGrid:
     origin_m : (x, y) in the map frame of the lower-left corner of cell (0, 0).
     height_m : of the one plane that was observed, above the base; None: of all heights, or not known.
     heights : (H, W) uint8, the slices in which an occupied cell or a low obstacle was observed to be occupied
-    and to be free (`SLICES`); 0 where that is not known. None if it is known of no cell.
+        and to be free (`SLICES`); 0 where that is not known. None if it is known of no cell.
 
     >>> import numpy as np
     >>> grid = OccupancyGrid(cells=np.array([[0, 100], [-1, 0]]), resolution_m=0.5, origin_m=(-1.0, 2.0))

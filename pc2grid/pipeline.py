@@ -56,7 +56,7 @@ def follow(
     The memory needed is that of one local map, however many scans there are.
 
     observer : gets a warning of scans that are left out before the first that shows which way is up
-    (`pc2grid.estimation.spatial.begin`).
+        (`pc2grid.estimation.spatial.begin`).
 
     >>> import pc2grid
     >>> with pc2grid.open_log("tuesday.mcap") as log:

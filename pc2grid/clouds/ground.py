@@ -303,11 +303,9 @@ class UprightParameters:
     """Parameters of `vertical_of`. Chosen by hand, on simulated scans of a 16-beam lidar.
 
     points, voxel_m, normals : a random sample of the scan, reduced to one point a voxel so that near walls
-    count no
-        more; a normal is estimated for so many of these.
+        count no more; a normal is estimated for so many of these.
     neighbours : points for the estimate of a normal. squeeze : factor on heights in the search for
-    neighbours, so
-        that they lie on several rings of a lidar.
+        neighbours, so that they lie on several rings of a lidar.
     flatness : largest ratio of the variances across a surface and along its shorter side.
     breadth_m : least standard deviation along that side: points of a single ring have no normal.
     steepest_rad : normals nearer to the vertical than 90 degrees minus this are not of walls.

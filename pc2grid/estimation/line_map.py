@@ -37,13 +37,12 @@ class MatchingParameters:
         above the noise of a range: the errors of neighbours on one wall are not independent.
     sectors : number of directions of normals that are kept apart; a point uses its own and the two beside it.
     least_points : a direction of the position counts as not measured with fewer points (sum of their weights)
-    across it.
+        across it.
     residual_scale_m : scale of the Cauchy weight of a point, times the radius of its neighbourhood in cells.
     prior_scale : scale of the Cauchy weight of the prior, in standard deviations.
     near_sigma_m : the same of a point that KISS-ICP has brought near.
     radii_cells : half width of the neighbourhood in which the line of a point is fitted, one entry an
-    iteration:
-        wide first for a large basin of convergence, then narrow for accuracy.
+        iteration: wide first for a large basin of convergence, then narrow for accuracy.
     converged : the iterations end when x, y (m) and yaw (rad) change by less than this in sum.
     """
 
@@ -97,7 +96,7 @@ class TrackingParameters:
 
     min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
     known_m, known_rad : a scan of a sensor in the hand without odometry is lost if a standard deviation of
-    its pose on the local map is larger. The first is half of the tolerance of a right answer.
+        its pose on the local map is larger. The first is half of the tolerance of a right answer.
     give_up_scans : lost scans in a row after which tracking starts again.
     standing_m, standing_rad : a base stands while its odometry changes by no more.
     changed_s : time for which no scan of a standing base fits well, after which the walls have changed; a

@@ -57,12 +57,12 @@ class SmootherParameters(NamedTuple):
         metre (rad); it grows with the square root of the way. drift_turn_m : that of the position over a turn
         of one radian.
     unsteady, growth : without odometry, the change of the motion from one scan to the next has the standard
-    deviation `unsteady`, in m/s and rad/s, times the time between them to the power of 1 + `growth`: a robot
-    indoors starts, stops and turns. With a growth of 0.5, that of a hand does not depend on the rate of the
-    scans.
+        deviation `unsteady`, in m/s and rad/s, times the time between them to the power of 1 + `growth`: a
+        robot indoors starts, stops and turns. With a growth of 0.5, that of a hand does not depend on the
+        rate of the scans.
     gyroscope_radps : of a gyroscope, with its bias.
     steady_s : the velocity is averaged over this time, so that an error of one pose does not return in the
-    next with the opposite sign.
+        next with the opposite sign.
     scale, direction_rad, yaw_rad_per_m, turn : standard deviations, over robots, of the systematic errors.
     kernel : see `pc2grid.estimation.smoother.KERNEL`.
     iterations : of Gauss-Newton, at most. converged : they end when no unknown changes by more.

@@ -46,13 +46,13 @@ class SpatialParameters:
     """Parameters of `SpatialMatcher` and `begin`. Chosen by hand.
 
     least_agreement : least agreement, -1..1, of a credible pose with the known cells at its points. In a
-    hall, right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
+        hall, right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
     residual_weight_per_m : of two matches the one with the larger agreement - weight * residual is taken.
     starts : placements that a search refines in space. turned_rad : standard deviation of their orientation:
-    more than a step of the search.
+        more than a step of the search.
     most_waiting : scans kept, at most, until one shows the floor or a motion: some 50 MB.
     standing_s : a base that stands level for so long is on wheels: a robot that waits to be located must not
-    wait for its own motion, and a hand has trembled by then.
+        wait for its own motion, and a hand has trembled by then.
     """
 
     least_agreement: float = 0.85

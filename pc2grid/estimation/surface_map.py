@@ -48,11 +48,10 @@ class SurfaceParameters:
     least_points : with less information than that of so many points along it, a direction of the position is
         not measured.
     aside, aside_scale : points are displaced by this many edges to test which directions are observable, with
-    this scale of the Cauchy weight, in edges.
+        this scale of the Cauchy weight, in edges.
     least_kept : secant over tangent of an observable direction, at least. The least of the six has a median
-    of 0.4
-        to 0.6 in recordings of two rooms, a kitchen, an office and a hall, and of 0.15 to 0.2 in simulated
-        flats in which scans slipped.
+        of 0.4 to 0.6 in recordings of two rooms, a kitchen, an office and a hall, and of 0.15 to 0.2 in
+        simulated flats in which scans slipped.
     """
 
     edge_per_range: float = 0.04

@@ -356,7 +356,7 @@ class Disagreement:
     """The difference between the motion to a scan as reported by odometry and as shown by the scan.
 
     distance_m, turn_rad : size of the difference. is_outlier : True if it is larger than that of odometry
-    that is merely inexact.
+        that is merely inexact.
     """
 
     distance_m: float

@@ -71,7 +71,7 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
     and alpha is a mask: what is not opaque is -1, in trinary maps, too.
 
     warn : gets a sentence for the user on each of these differences, and on a map with a likely mistake: no
-    cell is occupied, or walls and floor are exchanged.
+        cell is occupied, or walls and floor are exchanged.
 
     Raises MapFileError naming the key or the image that is wrong.
 

@@ -45,8 +45,8 @@ class PoseGraphParameters:
     robust_sigmas : standard deviations at which a loop edge has half of its weight.
     annealing : factor by which the robust scale of loops shrinks in each iteration.
     kept : share of its weight with which a loop still counts in full when the graph is solved again: the
-    weight at a chi-square of three `robust_sigmas` squared, 27. Of true loops, which have three degrees of
-    freedom, six in a million are farther off.
+        weight at a chi-square of three `robust_sigmas` squared, 27. Of true loops, which have three degrees
+        of freedom, six in a million are farther off.
     """
 
     iterations: int = 25

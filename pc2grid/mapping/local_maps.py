@@ -36,8 +36,8 @@ class LocalMapParameters:
         observed.
     min_agreement : share of those that must meet an obstacle instead of free space, in both directions.
     edge : the weight of an overlap rises from 0 to 1 between so much below both limits and so much above.
-    With a step, the last bit of a number decides on a loop: most of those of a phone in a corridor
-    (depth/corridor_phone) are observed to 0.29 to 0.43.
+        With a step, the last bit of a number decides on a loop: most of those of a phone in a corridor
+        (depth/corridor_phone) are observed to 0.29 to 0.43.
     """
 
     range_m: float = 12.0

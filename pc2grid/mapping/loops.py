@@ -487,7 +487,7 @@ class PlaceMap:
     """The map of a few metres of travel, long enough to be recognised.
 
     index : number of this place map in its session, from 0, in the order of travel. The last one may be
-    shorter, and overlap the one before.
+        shorter, and overlap the one before.
     grid : its occupancy grid, in its own frame: the base at one of its keyframes, in the middle.
     poses : (K, 3) x, y, yaw of its keyframes in the same frame, metres and radians.
     scans : (K,) number of each keyframe's scan within the session.
@@ -509,7 +509,7 @@ class Recognition:
 
     older, newer : their indices.
     T_older_newer : the frame of the newer place map in that of the older one. Exact to some decimetres; loop
-    closure refines it on the local maps.
+        closure refines it on the local maps.
     probability : 0..1, calibrated, that both show the same place, by their appearance.
 
     At most one recognition of a newer place map is right, or those at one place that several older ones show.

@@ -35,8 +35,8 @@ class OptimisedKeyframes:
     scans : (K,) number of each keyframe's scan. poses : (K, 3) x, y, yaw of each in the session's frame.
     loops : between the scans at the anchors of local maps that overlap.
     segments : (K,) number of the segment of each; a new one begins where the pose relative to the keyframe
-    before is unknown. parts : (K,) number of the part of each: segments that loops join. Poses of different
-    parts are unrelated; see `pc2grid.mapping.parts`.
+        before is unknown. parts : (K,) number of the part of each: segments that loops join. Poses of
+        different parts are unrelated; see `pc2grid.mapping.parts`.
     anchors : (N,) numbers, in `scans`, of the keyframes at the anchors of the local maps.
     sigma_m : (N,) standard deviation of the position of each of these within its part, in the least certain
         direction; see `pc2grid.mapping.quality`.
@@ -301,7 +301,7 @@ def part_reports(
     """Return the report of each part that is kept.
 
     report : of the reader. It becomes part of that of the first part; the scans of the others are counted in
-    theirs.
+        theirs.
     walls_changed_ns : as of a `Track`.
     """
     first, *others = (part.report for part in kept)

@@ -32,7 +32,7 @@ class PartParameters:
     joining : different local maps on each of the two sides that must be in agreeing loops, to join
         them; a single room may look like another one. Chosen by hand.
     least_travel_m : a part with less travel is left out: later recordings are recognised by 8 m of travel and
-    more.
+        more.
     """
 
     joining: int = 2

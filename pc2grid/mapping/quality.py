@@ -47,10 +47,10 @@ class ConsistencyParameters:
     wall_m : a hit on free ground counts if it is farther than this from every wall; three cells of the
         default resolution. From the same trial.
     sectors, behind_m : a hit counts if no other hit in its sector of the view lies more than `behind_m`
-    behind it: an obstacle below the view of a lidar, or a floor taken for an obstacle, is no wall. Half a
-    degree.
+        behind it: an obstacle below the view of a lidar, or a floor taken for an obstacle, is no wall. Half a
+        degree.
     same_m : a neighbouring keyframe confirms a hit if it has a hit within this distance; two cells of the
-    default resolution.
+        default resolution.
     window_m : travel over which the share of contradicting hits is averaged.
     turn_m_per_rad : travel that a turn on the spot counts as, as in loop closure.
     fewest_hits : of a window; with fewer, the share is computed as if there were so many.

@@ -188,8 +188,7 @@ class SpatialFit:
         frame: along x, y, z, then about x, y, z.
     rmse_m : of the distances of corresponding points from the surfaces of the map.
     compared : all rays. rays : number of those that are on, through or before. on, through, before : shares
-    of these; their
-        sum is 1.
+        of these; their sum is 1.
     """
 
     T_map_query: F64

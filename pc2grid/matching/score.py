@@ -283,8 +283,7 @@ class SelfSimilarityParameters:
         and about as far as a robot sees.
     cell_m : shifts are multiples of about this, the spacing of wall points.
     overlap : least share of the walls, by weight, on known ground, shifted forward and back. The known ground
-    of
-        a single scan hardly overlaps with itself, so it is compared with nothing.
+        of a single scan hardly overlaps with itself, so it is compared with nothing.
     """
 
     nearest_m: float = 1.0

@@ -56,8 +56,8 @@ class SearchParameters:
     floor, keep : poses scoring below `floor`, or below `keep` times the best, are not reported.
     most : poses reported at most.
     apart_m, apart_rad : two reported poses differ by more than one of these; a pose nearer to a better one
-    lies on the shoulder of its peak. The pair with the least log loss on real recordings, of 0.5 m and 10
-    degrees to 1.5 m and 30.
+        lies on the shoulder of its peak. The pair with the least log loss on real recordings, of 0.5 m and 10
+        degrees to 1.5 m and 30.
     """
 
     step_rad: float = math.radians(1.7)

@@ -131,12 +131,11 @@ class WallParameters:
     spacing_m : one point is kept in each square of this side; chosen by hand, twice the usual cell.
     grain_cells : low obstacles are smoothed by a median over squares of so many cells. Chosen by hand.
     plane_m : planes so far above each other show different objects, one for example a table that the other
-    passes over. Chosen by hand.
+        passes over. Chosen by hand.
     fixed_m : an object at least this long is taken to stay where it is: longer than furniture that is moved
         about. Chosen by hand.
     movable : weight of a low obstacle, relative to a wall. Chosen by hand: with a quarter, and with 1, one or
-    two
-        windows less are located of a room whose chairs have been moved, and none is wrong.
+        two windows less are located of a room whose chairs have been moved, and none is wrong.
     """
 
     spacing_m: float = 0.1
@@ -155,11 +154,9 @@ class Walls:
 
     field : likelihood field of obstacles at any height.
     points_m : (K, 2) float32 centres of occupied cells, of solid obstacles those along the edges, one per
-    square
-        of `WallParameters.spacing_m`, in the grid's frame.
+        square of `WallParameters.spacing_m`, in the grid's frame.
     before_m : (K, 2) float32, points on the ground in front of them, where the other side must know the
-    ground;
-        `points_m` themselves if it does not matter from which side a wall was observed.
+        ground; `points_m` themselves if it does not matter from which side a wall was observed.
     weights : (K,) float32, 0..1, the permanence of each point, see `permanence`.
     height_m : see `OccupancyGrid.height_m`.
     at_all_heights : the same walls, with only those points that block every observed height; None for a grid
