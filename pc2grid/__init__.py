@@ -33,8 +33,8 @@ Types
     Scan, RegisteredScan, Health, Trajectory, Loop, OccupancyGrid, Submap, SessionMap
     SE2                 a planar pose
     Config, TimeSpan    settings; a part of a recording
-    Observer            is told of progress
-    Pc2GridError        every error that is raised on purpose; its `hint` says what to do
+    Observer            gets the progress
+    Pc2GridError        every error that is raised on purpose; its `hint` is what to do
 
 Everywhere metres, radians, int64 nanoseconds; `T_target_source` maps coordinates of source into target.
 """

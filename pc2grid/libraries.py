@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 class Extra:
     """An optional dependency of `pyproject.toml`.
 
-    modules : what is imported of it. packages : what pip is asked for. error : what its absence raises.
+    modules : names to import. packages : names for pip. error : raised if it is missing.
     """
 
     modules: tuple[str, ...]

@@ -58,7 +58,7 @@ class Observer:
 
 
 _UPDATE_EVERY_S = 0.1
-"""How often at most what shows progress is told of it, as often as rich draws; stages report each scan."""
+"""Least time between two updates of a progress bar, the period of rich; stages report each scan."""
 
 
 class ProgressBars(Observer):

@@ -94,7 +94,7 @@ class ColumnMap:
 
         points_m : (N, 3) returns. rays_m : (M, 3) of these, those whose rays clear what is before them.
         sensor_m : (3,) origin of the rays. floor_m : z of the floor. doubt_m : the floor may lie higher or
-        lower by so much: what is there is no obstacle.
+        lower by so much: points there are no obstacles.
         """
         p, edge_m = self._parameters, self._config.resolution_m
         self._center(sensor_m)

@@ -34,8 +34,8 @@ class Ground:
 
     normal : (3,) unit vector that points up from the floor.
     offset_m : height of the frame's origin above the floor, so that height = normal . p + offset_m.
-    ceiling_m : height of the ceiling above the floor, or None where none was seen.
-    seen : whether the floor was measured (False: assumed from the mounting).
+    ceiling_m : height of the ceiling above the floor, or None without one.
+    seen : True if the floor was measured, False if it is assumed from the mounting.
     """
 
     normal: F64
@@ -72,9 +72,9 @@ class CloudParameters:
 
     Ground plane:
 
-    ground_sample, ground_voxel_m, ground_points : the floor is looked for in a random sample of a scan, of
+    ground_sample, ground_voxel_m, ground_points : the floor is searched for in a random sample of a scan, of
         which Open3D keeps one point a voxel, and of these again a sample, each of at most this size.
-    ground_min_points : with fewer points no plane is looked for.
+    ground_min_points : with fewer points no plane is searched for.
     max_tilt_rad : largest angle between a floor's normal and the z axis of the base.
     plane_tolerance_m : half thickness of a floor, three to four times the range noise of a lidar.
     search_iterations, search_planes : RANSAC iterations for each plane, and how many planes are taken out
@@ -100,7 +100,7 @@ class CloudParameters:
 
     limit_sigmas : hits so many standard deviations before the farthest depth of a camera, or beyond, are left
         out; see `pc2grid.clouds.planar_scan`.
-    max_gap_bins : bearings without a return between two with one count as seen up to this many.
+    max_gap_bins : bearings without a return between two with one count as free up to this many.
     """
 
     ground_sample: int = 10_000
@@ -174,7 +174,7 @@ def find_ground(
 
 
 def assumed_ground(T_base_sensor: F64) -> Ground:
-    """Return the floor that is assumed where none is seen.
+    """Return the floor that is assumed where none is visible.
 
     It is z = 0 of the base if the sensor is mounted above that, else 1 m below the base's origin.
     """
@@ -335,9 +335,9 @@ class UprightParameters:
 
 UPRIGHT = UprightParameters()
 CAMERA_UPRIGHT = UprightParameters(voxel_m=0.1, squeeze=0.7, side_share=0.1)
-"""Of a depth camera. It sees small patches densely: with the voxels of a lidar, the neighbours of a point
+"""Of a depth camera. It measures small patches densely: with the voxels of a lidar, the neighbours of a point
 span less than `breadth_m`. Chosen by hand; in a room by a phone (`depth/room`) 3 planes of 25, tilted by 14
-to 27 degrees, are told from the floor by it."""
+to 27 degrees, are distinguished from the floor by it."""
 
 
 def level_floor(scan: Scan, points_m: NDArray[np.floating]) -> Ground | None:

@@ -51,8 +51,8 @@ class PlanarScan:
         around it (entry 0 looks along +x, counter-clockwise); 0 where nothing is known.
     low_m : (L, 2) float32, things on the floor that are no walls (tables, chairs), about one point per grid
         cell: the sensor looks over them, so they do not end what is free. Empty where heights are not known.
-    height_m : of the plane that a planar laser sees, above the base; None of sensors that see all heights.
-    above_floor_m : height of the base above the floor, where a sensor in the hand sees it; else None.
+    height_m : of the plane of a planar laser, above the base; None of sensors that measure at all heights.
+    above_floor_m : height of the base above the floor, if a sensor in the hand measures it; else None.
     heights : (M + L,) uint8, of the hits and then of the things, in which slices they were observed to be
         occupied and to be free (`pc2grid.model.SLICES`), 0 where that is not known; or empty.
     """

@@ -13,7 +13,7 @@ from pc2grid.model import SENSOR_MODELS, Scan
 
 _UPRIGHT_HEIGHT_M, _UPRIGHT_TILT_RAD = 0.05, math.radians(0.5)
 """A base on wheels keeps its height and its tilt within these, as its odometry reports them: an EKF in three
-dimensions says a few tenths of a degree; a phone in the hand (depth/room) 0.8 to 6.5 degrees within a second.
+dimensions reports some tenths of a degree; a phone in the hand (depth/room) 0.8 to 6.5 degrees in a second.
 Without odometry, a sensor that is mounted lower than this above its base is in the hand."""
 DECIDING_SCANS = 20
 """So many scans of a base that moves decide whether it is on wheels; what tilts and rises later is on a ramp.

@@ -58,7 +58,7 @@ class PlanarMatcher:
     def start(self, scan: Scan, points_m: F32) -> F64:
         """Implement `ScanMatcher.start`."""
         self._floor = GroundModel.start(points_m, scan, self._parameters)
-        narrow = SENSOR_MODELS[scan.sensor].narrow  # the sensor sees a part of its surroundings only
+        narrow = SENSOR_MODELS[scan.sensor].narrow  # the view is a part of the surroundings only
         self._matching = CAMERA_MATCHING if narrow else MATCHING_PARAMETERS
         self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
         self._points_m = self._floor.remove(points_m)

@@ -155,7 +155,7 @@ class MatchSelector:
         spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
         fit = self._sensor.observable(best.fit)
         alone, information = fit.alone
-        # The inverse of the sum of both covariances, also where a match tells nothing of a direction.
+        # The inverse of the sum of both covariances, also where a match has no information on a direction.
         believed = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
         estimate = alone, 0.5 * (believed + believed.T)
         return MatchedScan(fit.pose, estimate, sure=best.sure, measured=fit.measured)

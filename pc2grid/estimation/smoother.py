@@ -508,7 +508,7 @@ def _add_drifts(
         if window.jumps[k + 1]:
             continue
         _, by_report, by_errors = corrected(reports[k], state.errors)
-        # What slips, or comes late, says nothing of errors that are the same in every step.
+        # Slips and late readings are no evidence of errors that are the same in every step.
         weight = 1.0 / (1.0 + chi2[k] / (drift_scale * p.kernel) ** 2)
         jacobian, information = np.zeros((d, 4 * d + ERRORS)), np.zeros((d, d))
         _put(by_first[k], 1.0, free, 0, jacobian)

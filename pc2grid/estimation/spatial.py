@@ -291,7 +291,7 @@ class SpaceMapParameters:
     noise_m : points whose deviation is larger are not used. good_m : points whose deviation is smaller count
         fully when a scan is registered.
     step_m, step_rad : a scan joins the map after this motion.
-    assumed_m : height of the sensor above the floor as long as no floor is seen.
+    assumed_m : height of the sensor above the floor as long as no floor is visible.
     search_sigma_m : of the likelihood field that is searched. search_points : points that are searched with.
     """
 
@@ -307,7 +307,7 @@ class SpaceMapParameters:
 SPACE_MAP = SpaceMapParameters()
 _DOWN = np.array([(0.05 * i, 0.05 * j, -1.0) for i, j in np.ndindex(9, 9)]) - (0.2, 0.2, 0.0)
 """Rays from a sensor to the floor, in its height above that: who carries it walks on ground 0.4 m wide.
-So it is free, unless what was measured there says more."""
+So it is free, unless measurements there contradict it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -101,7 +101,7 @@ class Tracker:
         seconds = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
         reading, reported = self._reading(scan), self._odometer.reported(scan)
         continues = self._odometer.continues(scan, seconds)
-        # 1. What is expected: by odometry, or that the motion goes on. What is not plausible comes last.
+        # 1. Predict: by odometry, or by constant velocity. An implausible prediction comes last.
         steady = self._smoother.constant_velocity(seconds, turn := self._turn(scan))
         expected = [self._smoother.after(*steady)]
         if reading is not None and reported is not None:
@@ -217,7 +217,7 @@ class Tracker:
         span_s = float(np.ptp(offsets))
         if scan.T_first_last is not None and self._odometer.is_possible(scan.T_first_last, span_s):
             within = scan.T_first_last.copy()
-            if scan.T_odom_base is None:  # an IMU tells the turn alone
+            if scan.T_odom_base is None:  # an IMU measures the rotation alone
                 within[:3, 3] = motion[:3, 3] * span_s / seconds
             motion, seconds = within, span_s
         return deskew(points, offsets, motion, seconds)

@@ -386,7 +386,7 @@ _PNG_KIND, _PNG_GREY, _PNG_FIRST = 25, 0, 33  # where the kind of pixels stands,
 _JPEG_MAGIC, _JPEG_FRAMES = b"\xff\xd8\xff", {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
 # A block of 8 x 8 pixels takes a bit at least.
 _MOST_PIXELS_A_JPEG_BYTE = 512
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # what is damaged is said by our errors
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)  # our errors report the damage
 
 
 class MapImage(NamedTuple):

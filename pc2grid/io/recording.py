@@ -37,7 +37,7 @@ from pc2grid.model import ReadReport, Scan
 from pc2grid.settings import ReadConfig
 
 _STEP_NS = 1_000_000_000
-"""The last message is looked for in steps that begin with this; chosen by hand: a scanner is faster."""
+"""The last message is searched for in steps that begin with this; chosen by hand: a scanner is faster."""
 
 
 def open_log(path: str | Path, config: ReadConfig | None = None, *, recover: bool = False) -> Log:
@@ -75,7 +75,7 @@ class Log:
         """Return the facts that are known without decoding a message; its times are those of the scans."""
         try:
             return guarded(self._source.info.path, lambda: _with_scan_times(self._source, self._config.topic))
-        except LogError:  # said again where the scans are read
+        except LogError:  # raised again where the scans are read
             return self._source.info
 
     def __repr__(self) -> str:

@@ -63,7 +63,8 @@ PARAMETERS = StreamParameters()
 _MOST_FURTHER = 20
 """Sensors beside the first one, against hostile files; chosen by hand."""
 _FLOOR_BELOW_M, _FLOOR_SHARE = 0.05, 0.01
-"""A sensor sees so much of its points below itself, as far as the floor is not at its own height; by hand."""
+"""At least this share of the points lies so far below the sensor, unless the floor is at its height; by
+hand."""
 _MOST_PERIODS = 1.1  # that the beams of a laser's scan take; stamps jitter
 _UP = math.cos(math.radians(45.0))  # an axis that points more upwards than this
 _EMPTY_HINT = (

@@ -106,8 +106,8 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
         points = voxel_cloud(building_points(path, config.read, check_plausible), config.projection)
         T_map_file = level_cloud(points, floor_z=config.read.floor_z, up=config.read.up)
         level = transform_points(T_map_file, points)
-        # Viewpoints, unlike `drivable_plan(level)`, also know the ground that furniture hides from above, as
-        # the map of a robot does.
+        # Viewpoints, unlike `drivable_plan(level)`, also include the ground that furniture hides from above,
+        # as the map of a robot does.
         sparse = _sparse(points)
         try:
             grid = map_cloud(level, config.projection, origin_m=T_map_file[:3, 3])
@@ -651,7 +651,7 @@ def _refined(points: F64, ground: Ground, p: CloudMapParameters) -> Ground:
 
 _CELL_M = 0.2
 """Edge of the cells and voxels in which a building is judged: a door is four of them wide."""
-_SLICE_M = 0.05  # of heights, in which level surfaces are looked for
+_SLICE_M = 0.05  # of heights, in which level surfaces are searched for
 _NEAR_M = 0.15  # points this near to a surface belong to it
 _BAND_M = 0.5  # what stands within this from a floor separates its rooms
 _LEAST_HEIGHT_M = 1.9  # of a ceiling, or of another floor, above the floor
@@ -661,10 +661,10 @@ _CEILING_SHARE = 0.4  # of the points of the floor, at least, that a ceiling has
 _FLOOR_SHARE = 0.25  # the same of another floor
 _OVERHEAD_SHARE = 0.02  # of the cells of a floor, at least, that have walls or a ceiling above head height
 _CERTAIN = 0.2
-"""Evidence above which a cloud is said to be upside down. Chosen by hand; tried on 20 made clouds and a real
+"""Evidence above which a cloud is taken to be upside down. Chosen by hand; tried on 20 made clouds and a real
 one: at most 0.18 for all that are upright, at least 0.3 for those turned with doors or much furniture."""
 _LIES = 2.0
-"""A plane so many times as likely to be the floor, by `possible_floors`, as that at z = 0 says that the cloud
+"""A plane so many times as likely to be the floor, by `possible_floors`, as that at z = 0 shows a cloud that
 lies on its side. 3.4 in rooms of 5 m."""
 
 

@@ -115,7 +115,7 @@ class GridBuilder:
         update = np.zeros((rows, columns), dtype=np.int16)
         corners = polygon_corners(outline - low)
         cv2.fillPoly(update, [corners], p.miss, shift=SUBPIXEL_BITS)
-        # The outline runs through cells of obstacles, most of all along a wall that is seen at a small angle:
+        # The outline runs through cells of obstacles, most of all along a wall at a small angle to the view:
         # these cells are not drawn as free.
         cv2.polylines(update, _rims(corners, planar_scan.free_m), False, 0, shift=SUBPIXEL_BITS)
         hits, things = hits - low, things - low

@@ -262,9 +262,9 @@ def _of_scans(trajectory: Trajectory, scans: I64) -> Trajectory:
 # --- reports and warnings -----------------------------------------------------------------------------
 
 _WARN_DEGENERATE = 0.1
-"""Share of degenerate scans above which the report says so; chosen by hand."""
+"""Share of degenerate scans above which there is a warning; chosen by hand."""
 _MOST_LOST = 0.2
-"""Share of lost scans above which a laser gives no map without odometry: its parts do not hang together.
+"""Share of lost scans above which a laser gives no map without odometry: its parts are not connected.
 Chosen by hand."""
 _STOREY_M = 2.0
 """A hand lifts a sensor by less than this, and storeys are at least 2.4 m high; chosen by hand."""

@@ -1,4 +1,4 @@
-"""Checks of a whole session: which of its parts hang together, and whether odometry agrees with the scans.
+"""Checks of a whole session: which of its parts are connected, and whether odometry agrees with the scans.
 
 Where tracking was lost and started again, the pose relative to earlier scans is unknown: a new segment
 begins. Loops that were accepted between two segments join them again. A component of joined segments is a

@@ -177,7 +177,7 @@ class Rays:
 
 Unfit = Literal["unknown", "left"]
 """Why there is no fit: the map shows too little of the points, or of the floor, there; or ICP leaves the
-planar pose, as nothing there holds it."""
+planar pose, which nothing there constrains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -348,7 +348,7 @@ def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None
         near = points[np.linalg.norm(points[:, :2] - at_m[:2], axis=1) < REGISTRATION.floor_m]
         if not len(near):
             return None
-        # Half of all points and more may be of the floor, which is looked for below the middle height.
+        # Half of all points and more may be of the floor, which is searched for below the middle height.
         middle = np.array([at_m[0], at_m[1], 0.5 * float(near[:, 2].min() + near[:, 2].max())])
         ground = find_ground(near - middle, np.zeros(3))
         if ground is None:

@@ -27,7 +27,7 @@ from pc2grid.io.source import RawMessage, TopicInfo
 from pc2grid.settings import ReadConfig
 
 SUBPROTOCOLS = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""What the bridge speaks since version 3.2, and before; the messages used here are the same in both."""
+"""The protocols of the bridge since version 3.2, and before; the messages used here are the same in both."""
 _MESSAGE = 0x01
 _HEAD = struct.Struct("<BIQ")  # kind, subscription, time in ns
 _SENT_HEAD = struct.Struct("<BI")  # kind, channel
@@ -250,7 +250,7 @@ class FoxgloveWebsocket(Feed):
             channels = [self._advertised[name].document(name) for name in names]
         self._link.send({"op": "advertise", "channels": channels})
 
-    # --- what the server says -------------------------------------------------------------------------
+    # --- messages of the server -----------------------------------------------------------------------
 
     def _take(self, frame: str | bytes) -> None:
         if isinstance(frame, bytes):

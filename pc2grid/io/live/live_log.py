@@ -71,9 +71,9 @@ def is_robot(target: str) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class LiveParameters:
-    """What is reported, and when scans do not go on; chosen by hand.
+    """When silence is reported, and when a segment of scans ends; chosen by hand.
 
-    poll_s : longest time without a look at the clock. silent_s : time after which a topic without messages
+    poll_s : longest wait for a message. silent_s : time after which a topic without messages
     is named. clock_scans : so many scans in a row with stamps that go back or jump mean that the clock was
     set.
     """
