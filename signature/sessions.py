@@ -478,8 +478,8 @@ def add_session(
     >>> config = signature.Config()
     >>> with pc2grid.open_log("monday.mcap") as log:
     ...     monday = pc2grid.build_map(log, config, session="monday", span=pc2grid.TimeSpan(0.0, 2.0))
-    ...     add_session("new.submaps", monday, config, provenance(log.info.path, log.digest(), config))
-    >>> with signature.open_database("new.submaps") as database:
+    ...     add_session("again.submaps", monday, config, provenance(log.info.path, log.digest(), config))
+    >>> with signature.open_database("again.submaps") as database:
     ...     [session.name for session in database.sessions()]
     ['monday']
     """
