@@ -13,13 +13,21 @@ share of the mass joins "anywhere", of which each place has the mass of "nowhere
 So the past makes a place at most 1 / k times as likely, and a place that the robot was never believed to be
 at has the prior 1.
 
+Odometry carries the places of search s to t; their covariances grow. One test tells whether a place of t is
+one of them: the Mahalanobis distance of the two poses (`signature.localization.hypotheses.agree`).
+
 Off the map: where a map shows too little of what is seen (`PosteriorParameters.shown`), it tells nothing of
 a place, neither for it nor against it. So a place of search s stays as likely beside "nowhere" as it was, at
-the pose to which odometry carries it, whose covariance grows:
+the pose to which odometry carries it:
 
     mass_t(h)   =  (prior_t(h) - 1) / N,        which N contains, too
 
-When the robot comes back, the place that the map shows there has this mass before it.
+What walls find there, too, is the same place, and both masses count if the walls say it more exactly. While
+the map shows too little it is held at the pose of odometry, since on few walls a pose slides. When the robot
+comes back, the place that the map shows there has this mass before it.
+
+After a slip that is more likely than not, nothing that was known before counts; the place where the robot was
+held to be is remembered, and is given up when the scans since say so.
 
 Fox, Burgard and Thrun 1999, "Markov localization for mobile robots in dynamic environments"; Thrun, Burgard
 and Fox, "Probabilistic Robotics", chapter 8.
@@ -27,140 +35,109 @@ and Fox, "Probabilistic Robotics", chapter 8.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from pc2grid.geometry import F64, SE2
+from pc2grid.geometry import SE2
 from pc2grid.matching.score import score_fit
 from signature.localization.answer import Answer, OffMap, Verdict
-from signature.localization.hypotheses import Hypothesis, same_pose
+from signature.localization.decision import place_of
+from signature.localization.hypotheses import Hypothesis, agree, more_exact
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import POSTERIOR, PRIOR, Prior
+from signature.localization.posterior import POSTERIOR, PRIOR
 from signature.localization.query import QueryMap
 
 State = Literal["searching", "located", "off_map", "doubtful", "lost", "recovered"]
 """searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`; and the
 robot was located there before, or the searches in a row that found it there leave no more doubt, multiplied,
 than `PosteriorParameters.certain`. off_map: most likely it is where the map shows too little of what it sees.
-doubtful: none of these, nor has all else together than where it was at least the mass `accept`. lost: this
-has, or the robot was carried away. recovered: located elsewhere, or again after it was lost."""
+doubtful: none of these; lost: nor is it where it was, as all else together has at least the mass `accept`, or
+it was carried away. What a map shows does not contradict a place that it does not show: off the map, a robot
+is not lost but doubtful until it is located elsewhere. recovered: located elsewhere, or again after it was
+lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Masses:
-    """The masses of places at one moment.
+    """The places that a robot may be at, with their masses, at one moment or carried on from it.
 
-    part : of the query, see `QueryMap.part`. place : of each hypothesis, number of its mass.
-    off_map : places that the map does not show.
+    part : of the query, see `QueryMap.part`. places : each as it lies in the maps that show it.
     """
 
     part: int
     path_m: float
     T_odom_base: SE2
-    hypotheses: tuple[Hypothesis, ...] = ()
-    places: tuple[int, ...] = ()
-    masses: tuple[float, ...] = ()
-    off_map: tuple[OffMap, ...] = ()
+    places: tuple[tuple[OffMap, ...], ...] = ()
 
     @staticmethod
     def of(query: QueryMap, found: Verdict | Answer) -> Masses:
-        """The masses that a query gives."""
+        """The masses that a query gives, first place first. One of which the map shows too little to align
+        it stays where odometry has carried the robot."""
+        beside = list(found.off_map)
+        places: list[tuple[OffMap, ...]] = []
+        for number, mass in enumerate(found.masses):
+            place = place_of(found, number)
+            for k, away in enumerate(beside):
+                if place[0].fit.overlap < POSTERIOR.shown and agree(
+                    query.T_odom_base, away.hypothesis, place[0]
+                ):
+                    places.append((replace(beside.pop(k), mass=away.mass + mass),))
+                    break
+            else:
+                places.append(tuple(_seen(h, mass, query) for h in place))
+        places += [(away,) for away in beside]
         return Masses(
-            part=query.part,
-            path_m=query.path_m,
-            T_odom_base=query.T_odom_base,
-            hypotheses=found.hypotheses,
-            places=found.places,
-            masses=found.masses,
-            off_map=found.off_map,
+            part=query.part, path_m=query.path_m, T_odom_base=query.T_odom_base, places=tuple(places)
+        )
+
+    def carried(self, now: QueryMap | Masses, odds: float = 1.0) -> Masses:
+        """The same places where odometry has carried the robot since, each with its covariance there and so
+        many times its mass."""
+        places = tuple(tuple(_carried(one, now, odds) for one in place) for place in self.places)
+        return replace(self, path_m=now.path_m, T_odom_base=now.T_odom_base, places=places)
+
+    def mass(self, place: Iterable[Hypothesis]) -> float:
+        """Mass of the places that put the robot where one of these hypotheses does."""
+        hypotheses = tuple(place)
+        return sum(
+            known[0].mass
+            for known in self.places
+            if any(agree(self.T_odom_base, one.hypothesis, h) for one in known for h in hypotheses)
         )
 
     @property
-    def first(self) -> tuple[Hypothesis, ...]:
-        """The first place."""
-        return self.hypotheses[: self.places.count(0)]
+    def most(self) -> Masses:
+        """The likeliest place alone."""
+        return replace(self, places=(max(self.places, key=lambda place: place[0].mass),))
 
-    def mass(self, place: Sequence[Hypothesis]) -> float:
-        """Mass of the places that put the robot, at this moment, where one of these hypotheses does."""
-        at = [(h.session_index, h.fit.T_map_query @ self.T_odom_base) for h in place]
-        found = {
-            number
-            for h, number in zip(self.hypotheses, self.places, strict=True)
-            for session, base in at
-            if h.session_index == session and same_pose(h.fit.T_map_query @ self.T_odom_base, base)
-        }
-        beside = [
-            away.mass
-            for away in self.off_map
-            if any(
-                away.hypothesis.session_index == session and region_of(away, self.T_odom_base).allows(base)
-                for session, base in at
-            )
-        ]
-        return sum(self.masses[number] for number in found) + sum(beside)
-
-    def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
-        """Prior of a place, relative to that of "nowhere", for a query of later scans. What was beside the
-        map stays there until the map shows enough of the place."""
+    def prior(self, place: Sequence[Hypothesis]) -> float:
+        """Prior of a place, relative to that of "nowhere", as the masses are (`Belief.before`)."""
         shown = place[0].fit.overlap >= POSTERIOR.shown
-        before = self if shown else replace(self, off_map=())
-        return 1.0 + self.odds(query, before.mass(place))
-
-    def odds(self, query: QueryMap, mass: float) -> float:
-        """A mass of this moment, relative to that of "nowhere", before a query of later scans."""
-        share = kept(query)
-        total = sum(self.masses) + sum(away.mass for away in self.off_map)
-        return share * mass / (1.0 - share * total)
-
-    def carried(self, query: QueryMap) -> Iterator[OffMap]:
-        """The places of this moment, where odometry has carried them; `mass`: `odds`."""
-        beside = list(self.off_map)
-        for number, mass in enumerate(self.masses):
-            h = self.hypotheses[self.places.index(number)]
-            k = self._beside(h)
-            if k is not None:
-                beside[k] = replace(beside[k], mass=beside[k].mass + mass)
-                continue
-            yield OffMap(
-                hypothesis=h,
-                mass=self.odds(query, mass),
-                seen_m=self.path_m,
-                T_odom_seen=self.T_odom_base,
-                seen=h.fit.covariance,
-            )
-        for away in beside:
-            yield replace(away, mass=self.odds(query, away.mass))
-
-    def _beside(self, h: Hypothesis) -> int | None:
-        """The place beside the map that a hypothesis is at, if the map shows too little to align it."""
-        if h.fit.overlap >= POSTERIOR.shown:
-            return None
-        base = h.fit.T_map_query @ self.T_odom_base
-        for k, away in enumerate(self.off_map):
-            same = away.hypothesis.session_index == h.session_index
-            if same and region_of(away, self.T_odom_base).allows(base):
-                return k
-        return None
+        found = (known for known in self.places if shown or more_exact(place[0], known[0].hypothesis))
+        return 1.0 + replace(self, places=tuple(found)).mass(place)
 
 
-def region_of(away: OffMap, T_odom_base: SE2) -> Prior:
-    """Where the robot may be if it is beside the map."""
-    fit = away.hypothesis.fit
-    return Prior.of_pose(fit.T_map_query @ T_odom_base, fit.covariance)
+def _seen(h: Hypothesis, mass: float, query: QueryMap) -> OffMap:
+    """A place that the map shows now."""
+    return OffMap(
+        hypothesis=h, mass=mass, seen_m=query.path_m, T_odom_seen=query.T_odom_base, seen=h.fit.covariance
+    )
 
 
-def grown(away: OffMap, query: QueryMap) -> F64:
-    """The covariance (3, 3) of the base now, by the odometry since the map showed the place."""
-    T_map_query = away.hypothesis.fit.T_map_query
-    begin, now = T_map_query @ away.T_odom_seen, T_map_query @ query.T_odom_base
+def _carried(place: OffMap, now: QueryMap | Masses, odds: float) -> OffMap:
+    """The place with the covariance of the base now, by the odometry since the map showed it."""
+    fit = place.hypothesis.fit
+    begin, end = fit.T_map_query @ place.T_odom_seen, fit.T_map_query @ now.T_odom_base
     J = np.eye(3)
-    J[:2, 2] = begin.y - now.y, now.x - begin.x
-    way_m = (query.path_m - away.seen_m) / PRIOR.sigmas
+    J[:2, 2] = begin.y - end.y, end.x - begin.x
+    way_m = (now.path_m - place.seen_m) / PRIOR.sigmas
     drift = np.array([PRIOR.drift, PRIOR.drift, PRIOR.drift_rad_m]) * way_m
-    return np.asarray(J @ away.seen @ J.T + np.diag(drift**2))
+    covariance = np.asarray(J @ place.seen @ J.T + np.diag(drift**2))
+    hypothesis = replace(place.hypothesis, fit=replace(fit, covariance=covariance))
+    return replace(place, hypothesis=hypothesis, mass=odds * place.mass)
 
 
 def kept(query: QueryMap) -> float:
@@ -175,83 +152,73 @@ class Belief:
         """accept : least mass to say where the robot is, and to say that it is not where it was."""
         self._accept = accept
         self._searches: list[Masses] = []
-        self._place: tuple[int, tuple[Hypothesis, ...]] | None = None  # part and place of the last "located"
+        self._place: Masses | None = None  # where it is held to be, located or off the map
         self._found: tuple[Masses, float] | None = None  # the last search, if it located the robot; doubt
-        self._was_located = False
+        self._beside = self._was_located = False  # _beside: it is held to be where the map shows too little
 
     @property
     def located(self) -> bool:
-        """Whether the robot is held to be where it was located last."""
+        """Whether the robot is held to be somewhere, in the map or off it."""
         return self._place is not None
 
     @property
     def session_index(self) -> int | None:
-        """Of the map in which it was located last."""
-        return self._place[1][0].session_index if self._place else None
+        """Of the map in which it is held to be."""
+        return self._place.places[0][0].hypothesis.session_index if self._place else None
 
     def restart(self) -> None:
         """The scans do not go on from those before. It is remembered that the robot was located once."""
         self._searches.clear()
-        self._place = self._found = None
+        self._beside, self._place, self._found = False, None, None
 
-    def prior(self, query: QueryMap, place: Sequence[Hypothesis]) -> float:
-        """Prior of a place, relative to that of "nowhere", by the searches before the scans of a query."""
-        before = self._before(query)
-        return before[-1].prior(query, place) if before else 1.0
+    def before(self, index: MapIndex, query: QueryMap) -> tuple[Masses, tuple[OffMap, ...]]:
+        """What was known before all scans of a query, where odometry has carried it; and those of its places
+        of which the map shows too little. Their masses are relative to that of "nowhere"."""
+        known = Masses(part=query.part, path_m=query.path_m, T_odom_base=query.T_odom_base)
+        beside, share = [], kept(query)
+        for past in self._before(query)[-1:]:
+            odds = share / (1.0 - share * sum(place[0].mass for place in past.places))
+            known = past.carried(query, odds)
+            for place, *_ in known.places:
+                h = place.hypothesis
+                walls = index.maps_for(query)[h.session_index].walls
+                fit = score_fit(walls, query.walls, h.fit.T_map_query, h.fit.covariance)
+                if place.mass >= 1.0 - POSTERIOR.certain and fit.overlap < POSTERIOR.shown:
+                    beside.append(replace(place, hypothesis=replace(h, fit=fit)))
+        return known, tuple(beside)
 
-    def off_map(self, index: MapIndex, query: QueryMap) -> tuple[OffMap, ...]:
-        """Where the robot may be beside the map: the places of before of which it shows too little.
+    def _before(self, query: QueryMap) -> list[Masses]:
+        """The searches that lie before all scans of a query, and after a slip before it."""
+        first_m = query.keyframes[0].path_m if query.keyframes else 0.0
+        return [
+            past
+            for past in self._searches
+            if past.part == query.part and query.slipped_m <= past.path_m < first_m
+        ]
 
-        mass : relative to that of "nowhere".
-        """
-        before = self._before(query)
-        found: list[OffMap] = []
-        for away in before[-1].carried(query) if before else ():
-            h = away.hypothesis
-            walls = index.maps_for(query)[h.session_index].walls
-            fit = score_fit(walls, query.walls, h.fit.T_map_query, grown(away, query))
-            if away.mass >= POSTERIOR.forgotten and fit.overlap < POSTERIOR.shown:
-                found.append(replace(away, hypothesis=replace(h, fit=fit)))
-        return tuple(found)
-
-    def add(self, query: QueryMap, found: Verdict | Answer) -> Masses:
-        """Keep the masses of a search; those that no later query follows from are forgotten."""
-        now = Masses.of(query, found)
+    def follow(self, query: QueryMap, answer: Answer) -> State:
+        """The state of a running robot after a search. Its masses are kept, those that no later query follows
+        from are forgotten."""
+        now = Masses.of(query, answer)
         forgotten = max(len(self._before(query)) - 1, 0)
         here = [known for known in self._searches if known.part == query.part]
         self._searches = [*here[forgotten:], now]
-        return now
-
-    def _before(self, query: QueryMap) -> list[Masses]:
-        """The searches that lie before all scans of a query."""
-        first_m = query.keyframes[0].path_m if query.keyframes else 0.0
-        return [past for past in self._searches if past.part == query.part and past.path_m < first_m]
-
-    def follow(self, now: Masses, *, located: bool) -> State:
-        """The state of a running robot after a search. located : at the first place."""
-        here = 0.0
-        if self._place is not None and self._place[0] == now.part:
-            here = now.mass(self._place[1])
-        doubt, before = 1.0, self._found
-        if located:
-            doubt -= now.masses[0]
-            if (
-                before is not None
-                and before[0].part == now.part
-                and now.mass(before[0].first) >= self._accept
-            ):
-                doubt *= before[1]
-        self._found = (now, doubt) if located else None
-        if located:
-            goes_on = here >= POSTERIOR.likely
-            if goes_on or doubt <= 1.0 - POSTERIOR.certain:
-                state: State = "located" if goes_on or not self._was_located else "recovered"
-                self._was_located, self._place = True, (now.part, now.first)
-                return state
-            return "doubtful" if self._place is not None else self._nowhere
-        if any(away.mass >= POSTERIOR.likely for away in now.off_map):
-            return "off_map"
-        if here > 1.0 - self._accept:
+        on = _mass_there(now, self._place)
+        if answer.status == "located":
+            doubt = 1.0 - answer.confidence
+            if self._found is not None and _mass_there(now, self._found[0]) >= self._accept:
+                doubt *= self._found[1]
+            self._found = now.most, doubt
+            if on >= POSTERIOR.likely or doubt <= 1.0 - POSTERIOR.certain:
+                goes_on = on >= POSTERIOR.likely or not self._was_located
+                self._was_located, self._beside, self._place = True, False, now.most
+                return "located" if goes_on else "recovered"
+        else:
+            self._found = None
+            if answer.beside_map is not None:
+                self._beside, self._place = True, now.most
+                return "off_map"
+        if on > 1.0 - self._accept or self._beside:
             return "doubtful"
         self._place = None
         return self._nowhere
@@ -260,3 +227,10 @@ class Belief:
     def _nowhere(self) -> State:
         """The state of a robot that no place is told of."""
         return "lost" if self._was_located else "searching"
+
+
+def _mass_there(now: Masses, before: Masses | None) -> float:
+    """Mass of the places that a robot may be at now, where odometry has carried it from one place before."""
+    if before is None or before.part != now.part:
+        return 0.0
+    return now.mass(one.hypothesis for one in before.carried(now).places[0])

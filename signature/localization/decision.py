@@ -12,16 +12,12 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
-from pc2grid.geometry import wrap_angle
 from pc2grid.matching.score import Fit
-from signature.localization.answer import OffMap, Status, Verdict
-from signature.localization.hypotheses import Hypothesis, same_pose
+from signature.localization.answer import Answer, OffMap, Status, Verdict
+from signature.localization.hypotheses import Hypothesis, agree, more_exact, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
     NO_EVIDENCE,
-    PRIOR,
     evidence_of,
     masses,
     tail_of,
@@ -119,15 +115,18 @@ def beside_map(
     """
     if not off_map:
         return verdict
+    first, at = place_of(verdict, 0), query.T_odom_base
     odds = 1.0
     if verdict.confidence:
-        first = tuple(h for h, n in zip(verdict.hypotheses, verdict.places, strict=True) if n == 0)
         odds = prior_of(first) * math.exp(verdict.evidence.log_odds()) / verdict.masses[0]
     share = 1.0 / (odds + sum(away.mass for away in off_map))
     masses = tuple(mass * odds * share for mass in verdict.masses)
-    confidence = masses[0] if masses else 0.0
-    for best in verdict.hypotheses[:1]:
-        confidence += share * sum(away.mass for away in off_map if _agree(query, away, best))
+    here = [
+        away
+        for away in off_map
+        if any(agree(at, away.hypothesis, h) and more_exact(h, away.hypothesis) for h in first)
+    ]
+    confidence = sum(masses[:1]) + share * sum(away.mass for away in here)
     doubtful = verdict.status == "located" and confidence < accept
     return replace(
         verdict,
@@ -140,16 +139,9 @@ def beside_map(
     )
 
 
-def _agree(query: QueryMap, away: OffMap, h: Hypothesis) -> bool:
-    """Whether the walls put the robot where odometry does, by the covariances of both, and more exactly: on
-    few walls a pose slides."""
-    by_odometry, by_walls = away.hypothesis.fit, h.fit
-    base, other = (fit.T_map_query @ query.T_odom_base for fit in (by_odometry, by_walls))
-    off = np.array([base.x - other.x, base.y - other.y, wrap_angle(base.yaw - other.yaw)])
-    squared = off @ np.linalg.solve(by_odometry.covariance + by_walls.covariance, off)
-    exact = np.trace(by_walls.covariance[:2, :2]) < np.trace(by_odometry.covariance[:2, :2])
-    same_map = away.hypothesis.session_index == h.session_index
-    return same_map and bool(exact and squared <= PRIOR.sigmas**2)
+def place_of(found: Verdict | Answer, number: int) -> Place:
+    """The hypotheses of one place."""
+    return tuple(h for h, of in zip(found.hypotheses, found.places, strict=True) if of == number)
 
 
 def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:

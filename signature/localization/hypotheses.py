@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
 from pc2grid.geometry import F32, F64, SE2, wrap_angle
 from pc2grid.matching.score import Fit, refine, score_fit
@@ -58,6 +59,9 @@ class HypothesisParameters:
 
 
 HYPOTHESES = HypothesisParameters()
+
+ONE_PLACE = float(chdtri(3, 1.0 - 0.999))
+"""Squared Mahalanobis distance of x, y, yaw within which 99.9 % of all poses of one place lie."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,6 +191,19 @@ def _one_peak(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
 def _at(query: QueryMap, h: Hypothesis) -> SE2:
     """Where a hypothesis puts `QueryMap.center_m`, which its covariance is about."""
     return h.fit.T_map_query @ SE2(*query.center_m, 0.0)
+
+
+def agree(T_odom_base: SE2, a: Hypothesis, b: Hypothesis) -> bool:
+    """Whether two hypotheses put the base at one place, by the covariances of both."""
+    one, other = (h.fit.T_map_query @ T_odom_base for h in (a, b))
+    off = np.array([one.x - other.x, one.y - other.y, wrap_angle(one.yaw - other.yaw)])
+    squared = float(off @ np.linalg.solve(a.fit.covariance + b.fit.covariance, off))
+    return a.session_index == b.session_index and squared <= ONE_PLACE
+
+
+def more_exact(a: Hypothesis, b: Hypothesis) -> bool:
+    """Whether one hypothesis says more exactly than another where the base is."""
+    return bool(np.trace(a.fit.covariance[:2, :2]) < np.trace(b.fit.covariance[:2, :2]))
 
 
 def same_pose(a: SE2, b: SE2) -> bool:

@@ -26,7 +26,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from functools import partial
 from types import TracebackType
 from typing import Generic, Literal, Protocol, TypeVar
 
@@ -145,7 +144,7 @@ class Localizer:
         self._answer = answer if self._on_the_way is self.index else None
         self._last = query.part, query.path_m, answer.hypotheses
         self._history.append(answer.history[-1])
-        state = self._belief.follow(self._belief.add(query, answer), located=answer.status == "located")
+        state = self._belief.follow(query, answer)
         if state == "lost" and self._was_located_since_prior():
             self.query.forget_prior()
         elapsed_s = time.perf_counter() - begin
@@ -222,14 +221,14 @@ class Localizer:
         seen, index = query.map(), index or self.index
         self._clock.lap("describe")
         part, _, carried = self._last
-        off_map = self._belief.off_map(index, seen) if prior_of is None else ()
+        before, off_map = self._belief.before(index, seen)
         return answer_query(
             index,
             query,
             seen,
             (*(carried if part == seen.part else ()), *known),
-            prior_of=prior_of or partial(self._belief.prior, seen),
-            off_map=off_map,
+            prior_of=prior_of or before.prior,
+            off_map=off_map if prior_of is None else (),
             session_index=self._belief.session_index,
             history=tuple(self._history),
             clock=self._clock,

@@ -52,6 +52,7 @@ from itertools import compress
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import chdtri
 
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import F64, SE2, BoolGrid, wrap_angle
@@ -75,7 +76,7 @@ class PriorParameters:
         50 m and 2.0 % of 200 m, and by 0.07 and 0.03 degrees a metre.
     """
 
-    sigmas: float = 3.035
+    sigmas: float = math.sqrt(chdtri(2, 1.0 - 0.99))
     drift: float = 0.03
     drift_rad_m: float = math.radians(0.3)
 
@@ -250,7 +251,6 @@ class PosteriorParameters:
     certain : a robot is told where it is if the searches in a row that found it there are that sure; by hand.
     shown : a map that knows the ground of less than this share of the walls that are seen says nothing of a
         place; half, as where the recordings are judged.
-    forgotten : least mass, beside that of "nowhere", of a place that is carried on; by hand.
     """
 
     bias: float = -7.33
@@ -265,7 +265,6 @@ class PosteriorParameters:
     likely: float = 0.5
     certain: float = 0.99
     shown: float = 0.5
-    forgotten: float = 1e-3
 
 
 POSTERIOR = PosteriorParameters()

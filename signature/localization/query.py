@@ -71,6 +71,7 @@ class QueryMap:
     grid : local map in the odom frame. views : best observed first. walls : the local map as verification
     takes it. center_m : (x, y) in the odom frame that poses of the query rotate about.
     part : number of times that registration was lost before; each part has an odom frame of its own.
+    slipped_m : metres driven until the robot was likely carried away or tracking slipped; none counts before.
     T_odom_prior : the base at the scan nearest to the time that a prior is about; None if it is not known in
     this odom frame. since_prior_m : metres driven since that scan.
     keyframes : the scans that it was drawn from, oldest first, and the last scan; none of a drawn map.
@@ -84,6 +85,7 @@ class QueryMap:
     walls: Walls
     center_m: tuple[float, float]
     part: int = 0
+    slipped_m: float = 0.0
     T_odom_prior: SE2 | None = None
     since_prior_m: float = 0.0
     keyframes: tuple[Keyframe, ...] = ()
@@ -184,6 +186,7 @@ class Query:
         self._made_with, self._config, self._prior_ns = made_with, config, prior_ns
         self.in_space = QueryInSpace() if in_space else None
         self.part = self.lost_scans = 0
+        self._slipped_m = 0.0
         self.first_ns: int | None = None
         self._keyframes: deque[Keyframe] = deque()
         self._newest: Keyframe | None = None
@@ -205,6 +208,7 @@ class Query:
         if registered.health is Health.LOST:
             self.part += 1
             self.lost_scans += 1
+            self._slipped_m = 0.0
             self._keyframes.clear()
             self._newest = Keyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
             self._at_prior = min(self._at_prior[0], self._off_prior(planar_scan)), None
@@ -243,17 +247,19 @@ class Query:
         return later
 
     def since(self, scans: int) -> Query:
-        """The query that begins with the last so many `QueryMap.keyframes`: a part of its own."""
+        """The query that begins with the last so many `QueryMap.keyframes`, before which tracking slipped."""
         keyframes = self.map().keyframes[-scans:]
-        begin_m = keyframes[0].path_m
         later = self.anew()
-        later.in_space = None if self.in_space is None else self.in_space.since(self.path_m - begin_m)
-        later.part, later.first_ns = self.part + 1, keyframes[0].planar_scan.stamp_ns
-        later._keyframes.extend(replace(k, path_m=k.path_m - begin_m) for k in keyframes)
-        later._newest = later._keyframes[-1]
-        off, at_prior = self._at_prior
-        if at_prior is not None and at_prior.path_m >= begin_m:
-            later._at_prior = off, replace(at_prior, path_m=at_prior.path_m - begin_m)
+        later._slipped_m = keyframes[0].path_m
+        later.in_space = (
+            None if self.in_space is None else self.in_space.since(self.path_m - later._slipped_m)
+        )
+        later.part, later.first_ns = self.part, keyframes[0].planar_scan.stamp_ns
+        later._keyframes.extend(keyframes)
+        later._newest = keyframes[-1]
+        at_prior = self._at_prior[1]
+        if at_prior is not None and at_prior.path_m >= later._slipped_m:
+            later._at_prior = self._at_prior
         return later
 
     def forget_prior(self) -> None:
@@ -286,6 +292,7 @@ class Query:
             stamp_ns=newest.planar_scan.stamp_ns,
             path_m=newest.path_m,
             part=self.part,
+            slipped_m=self._slipped_m,
             T_odom_prior=None if at_prior is None else at_prior.T_odom_base,
             since_prior_m=0.0 if at_prior is None else newest.path_m - at_prior.path_m,
             keyframes=keyframes if newest is keyframes[-1] else (*keyframes, newest),
