@@ -21,8 +21,7 @@ from pc2grid_cli.commands import export_command, simulate_command
 from pc2grid_cli.console import print_result
 from pc2grid_cli.documents import DOCUMENTS, schema
 from pc2grid_cli.main import app
-from pc2grid_lab.commands import compare_recordings_command
-from signature.config import Config, ShortlistBy
+from signature.config import Config
 from tests.helpers.json_schema import closed, keys
 
 
@@ -139,7 +138,6 @@ def test_every_command_shows_an_example_that_parses(name: str, command: Any) -> 
     [
         (simulate_command, "sensor", SensorKind),
         (export_command, "map_of_", MapOf),
-        (compare_recordings_command, "shortlist", ShortlistBy),
     ],
 )
 def test_an_option_takes_all_values_of_its_type(command: Any, option: str, values: Any) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import typer
 
@@ -45,20 +45,6 @@ def compare_recordings_command(
         ),
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="a small part of all, always the same")] = False,
-    shortlist: Annotated[
-        Literal[
-            "signatures",
-            "boundary",
-            "freespace",
-            "symmetry",
-            "boundary+freespace",
-            "boundary+symmetry",
-            "freespace+symmetry",
-            "shuffled",
-            "random",
-        ],
-        typer.Option("--shortlist", help="what selects places; a control is not written to the table"),
-    ] = "signatures",
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="processes at a time")] = 2,
 ) -> None:
     """Map every real recording, locate parts of it in other maps, and tell what changed since the last time.
@@ -78,7 +64,6 @@ def compare_recordings_command(
         only=only,
         of_base=of_base,
         quick=quick,
-        shortlist=shortlist,
         jobs=jobs,
     )
 
@@ -189,17 +174,9 @@ def compare_paper_command(
             "--offset", help="Farthest a query lies from a submap centre, m; repeatable. [1.0 and 0.5]"
         ),
     ] = None,
-    open_choices: Annotated[
-        bool,
-        typer.Option("--open-choices", help="Also what each open choice moves of the method to the letter."),
-    ] = False,
     ablation: Annotated[
-        bool, typer.Option("--ablation", help="Also the method to the letter without some of its signatures.")
+        bool, typer.Option("--ablation", help="Also the method without some of its signatures.")
     ] = False,
-    speckles: Annotated[
-        float,
-        typer.Option("--speckles", min=0.0, help="Spread of the boundary noise, m; the paper gives none."),
-    ] = 0.1,
     jobs: _Jobs = None,
     seed: Annotated[int, typer.Option("--seed", help="Of the queries and their noise.")] = 1,
 ) -> None:
@@ -208,7 +185,7 @@ def compare_paper_command(
     Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
     """
     extras.require({"paper": "compare paper"})
-    from pc2grid_lab.paper import report as command
+    from pc2grid_lab.paper import tables as command
 
     command.run(
         maps,
@@ -217,9 +194,7 @@ def compare_paper_command(
         queries=queries,
         methods=methods,
         offset=offset,
-        open_choices=open_choices,
         ablation=ablation,
-        speckles=speckles,
         jobs=jobs,
         seed=seed,
     )

@@ -54,7 +54,7 @@ from pc2grid_lab.experiments.sensor_matrix import SENSORS, PlanDrives, SensorMap
 from pc2grid_lab.experiments.trial import MatrixCell, Trial, matrix, reliability
 from pc2grid_lab.peers.programs import PEERS, PINS, PeerCell, PeerTrial, answers, counted, missing
 from pc2grid_lab.peers.site import Site, recorded_site, simulated_site, truth_file
-from signature.config import Config, ShortlistBy
+from signature.config import Config
 from signature.localization.shown.picture import BLUE, GREEN, ORANGE, VERMILLION
 from signature.sessions import digest_of
 
@@ -78,7 +78,6 @@ def compare_recordings(
     only: str | None,
     of_base: bool,
     quick: bool,
-    shortlist: ShortlistBy,
     jobs: int,
 ) -> None:
     """Map and locate what is not in `out` yet, judge all, and print the table and what changed."""
@@ -87,9 +86,8 @@ def compare_recordings(
     work = out / "work" / (digest_of_product() + state_of(data, own[0]))
     make_folder(work)
     _remove_others(work)
-    folder = Folder(data.absolute(), work.absolute(), shortlist)
-    is_control = shortlist != "signatures"
-    followed = () if is_control else followed_in(catalogue, folder, only)
+    folder = Folder(data.absolute(), work.absolute())
+    followed = followed_in(catalogue, folder, only)
     if not (catalogue.mapped or catalogue.pairs or followed):
         raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
     with terminal.progress("recordings") as advance, _note_kept(terminal, out):
@@ -99,7 +97,7 @@ def compare_recordings(
         found = judged_table(
             catalogue, folder, followed, program=digest_of_product(), commit=commit(), advance=advance
         )
-    is_whole = only is None and not quick and not is_control
+    is_whole = only is None and not quick
     _tell(found, table or out / "real.json", replace=is_whole)
 
 

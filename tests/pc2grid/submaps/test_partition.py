@@ -102,7 +102,7 @@ def test_junction_graph_of_a_cross_is_a_star_with_four_arms() -> None:
 
 @pytest.mark.skipif(not (DATA / "maps").is_dir(), reason="no real maps: set PC2GRID_DATA")
 def test_number_of_submaps_is_near_table_1_with_one_set_of_parameters() -> None:
-    from pc2grid_lab.paper.cells import SUBMAPS, read_map
+    from pc2grid_lab.paper.tables import SUBMAPS, read_map
 
     for name, published in SUBMAPS.items():
         found = len(partition(read_map(DATA / "maps" / f"{name}.yaml"), PAPER))

@@ -13,9 +13,9 @@ from pc2grid.errors import MapFileError
 from pc2grid.io.maps import save_map
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
-from pc2grid_lab.paper import learned
-from pc2grid_lab.paper.cells import cells_of, paper_tasks, read_map
-from pc2grid_lab.paper.learned import COLUMNS, CONFIG, Learned, Unlearned, Vectors, vector, weight
+from pc2grid_lab.paper import methods
+from pc2grid_lab.paper.methods import COLUMNS, CONFIG, Learned, Unlearned, Vectors, vector, weight
+from pc2grid_lab.paper.tables import cells_of, paper_tasks, read_map
 from signature.boundary import boundary_edges, boundary_points
 from signature.paper import describe
 from tests.helpers.field import DATA
@@ -93,7 +93,7 @@ def test_without_learning_the_distances_of_the_parts_are_added() -> None:
 def test_nothing_is_learned_from_the_map_that_is_asked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(learned, "LEARNED_FROM", 3)
+    monkeypatch.setattr(methods, "LEARNED_FROM", 3)
     (tmp_path / "maps").mkdir()
     shapes = {"a": cross(6.0, 2.0), "b": l_shape(), "c": random_rooms(1)}
     for name, shape in shapes.items():
@@ -121,10 +121,10 @@ def test_on_a_real_floor_it_is_right_more_often_than_the_paper(
     maps = DATA / "maps"
     if not (maps / "csail.yaml").is_file():
         pytest.skip("the maps of the paper are not in PC2GRID_DATA")
-    monkeypatch.setattr(learned, "LEARNED_FROM", 60)
+    monkeypatch.setattr(methods, "LEARNED_FROM", 60)
     grid = read_map(maps / "intel.yaml")
-    within = learned.differences(grid, partition(grid, PartitionConfig.paper()), 1)
-    monkeypatch.setattr("pc2grid_lab.paper.cells.within_others", lambda *_: within)
+    within = methods.differences(grid, partition(grid, PartitionConfig.paper()), 1)
+    monkeypatch.setattr("pc2grid_lab.paper.tables.within_others", lambda *_: within)
     names = ["learned", "unlearned", "proposed"]
     tasks = [
         t

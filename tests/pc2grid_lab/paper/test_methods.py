@@ -10,16 +10,7 @@ import pytest
 from pc2grid.geometry import F64
 from pc2grid.model import Submap
 from pc2grid_lab.paper.experiment import Matcher, Method, rotated_submap
-from pc2grid_lab.paper.learned import vector
-from pc2grid_lab.paper.methods import (
-    EXTRA_METHOD_NAMES,
-    METHOD_NAMES,
-    SeveralCentres,
-    lattice,
-    make_methods,
-    smaller_disc,
-)
-from pc2grid_lab.paper.proposed import Proposed
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, Proposed, make_methods, vector
 from pc2grid_lab.paper.rivals import DistanceFeatures, ShapeContext
 from signature.config import SignatureConfig
 from signature.freespace import freespace_paths
@@ -110,7 +101,7 @@ def test_methods_that_differ_in_comparing_share_the_description_of_a_query(
     matchers = [method.fit(submaps) for method in (*shared.values(), coarse)]
     described = []
     monkeypatch.setattr(
-        "pc2grid_lab.paper.proposed.freespace_paths",
+        "pc2grid_lab.paper.methods.freespace_paths",
         lambda *of: described.append(of) or freespace_paths(*of),
     )
     found = [matcher.similarities(query) for matcher in matchers]
@@ -147,27 +138,3 @@ def test_descriptors_turn_with_the_room() -> None:
     found = DistanceFeatures().fit([submap_of(polygon(corners)), submap_of(l_shape())])
     scores = found.similarities(submap_of(polygon([(c * x - s * y, s * x + c * y) for x, y in corners])))
     assert scores[0] > 1.5 * scores[1]
-
-
-def test_several_centres_find_a_query_beside_the_centre() -> None:
-    """Places 3 m apart; the queries lie 0.9 m beside their centres."""
-    halls = [submap_of(random_rooms(seed, walls=40)) for seed in (3, 4, 5)]
-    at = [(hall, offset_m) for hall in halls for offset_m in lattice(3.0, 3.0)]
-    submaps = [smaller_disc(hall, offset_m, 4.0) for hall, offset_m in at]
-    matchers = {
-        "plain": ShapeContext().fit(submaps),
-        "several": SeveralCentres(method=ShapeContext()).fit(submaps),
-    }
-    right = dict.fromkeys(matchers, 0)
-    for number, (hall, offset_m) in enumerate(at):
-        beside = smaller_disc(hall, offset_m + 0.9 * np.array([math.cos(number), math.sin(number)]), 4.0)
-        turned = rotated_submap(beside.grid, _middle(beside), beside.radius_m, 0.7 * number)
-        for name, matcher in matchers.items():
-            right[name] += int(np.argmax(matcher.similarities(turned))) == number
-    assert right["several"] > right["plain"]
-
-
-def _middle(submap: Submap) -> tuple[float, float]:
-    height, width = submap.grid.cells.shape
-    x, y = np.asarray(submap.grid.origin_m) + 0.5 * submap.grid.resolution_m * np.array([width, height])
-    return float(x), float(y)

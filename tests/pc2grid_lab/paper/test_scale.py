@@ -16,18 +16,18 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
 from pc2grid_lab.commands import compare_scale_command
-from pc2grid_lab.paper import learned, scale
-from pc2grid_lab.paper.cells import rescaled, within_others
+from pc2grid_lab.paper import methods, scale
 from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, draw_queries
 from pc2grid_lab.paper.methods import make_methods
 from pc2grid_lab.paper.scale import Counted, count, mean_recall, sources_of
+from pc2grid_lab.paper.tables import rescaled, within_others
 from tests.helpers.rooms import cross, grid_of, l_shape, random_rooms, rectangle
 
 
 @pytest.fixture
 def maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Three small buildings, no simulated floor."""
-    monkeypatch.setattr(learned, "LEARNED_FROM", 6)
+    monkeypatch.setattr(methods, "LEARNED_FROM", 6)
     monkeypatch.setattr(scale, "FLOORS", 0)
     monkeypatch.setattr(scale, "FACTORS", (1.0, 0.8))
     folder = tmp_path / "maps"

@@ -1,31 +1,240 @@
-"""The methods of the comparison by name: the paper's own and its six rivals (paper IV-A).
+"""The methods of the comparison by name: the paper's own, its six rivals (paper IV-A), and what beats it.
 
-Other settings of the method to the letter: what each signature adds, and what each choice moves.
-
-A place described from several centres: any method, given smaller discs around many points of a submap.
-
-It is not in the paper, whose submaps have one centre each. A query lies up to a metre beside it, and its disc
-then shows other walls at the rim and other distances inside. Here every submap of the map is cut into smaller
-discs around the points of a lattice, and the best of them counts; the query is cut to the same size around
-its own centre only. All discs lie inside the submaps, so that no method sees more of the map than the others.
+`Learned` is not in the paper, whose Eq. 6 weighs all bins alike: the boundary at several radii, compared by a
+metric that was learned on other maps. A submap is a vector of square roots of shares, and the distance of two
+of them is Mahalanobis's, with the covariance of how a query differs from the submap of its own place: bins
+that change when one stands a metre beside it, or turned, count less. The covariance is that of queries
+without noise on the other maps, so that nothing is learned from the map that is asked, nor from noise.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from pc2grid.geometry import F64, I64
-from pc2grid.model import UNKNOWN, OccupancyGrid, Submap
-from pc2grid_lab.paper.experiment import Matcher, Method
-from pc2grid_lab.paper.learned import LEARNED, UNLEARNED, Learned, Unlearned, Vectors
-from pc2grid_lab.paper.proposed import Proposed, Signatures
+from pc2grid.geometry import F64
+from pc2grid.model import OccupancyGrid, Submap
+from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, Method, draw_queries, weighed_pairs
 from pc2grid_lab.paper.rivals import DistanceFeatures, ShapeContext, Vocabulary, Words, sift, surf
+from signature.boundary import bins_of_squares, boundary_edges, boundary_points
 from signature.config import SignatureConfig
+from signature.freespace import freespace_paths
+from signature.paper import Signature, SignatureTable, described, distances, similarity
+
+_OF_COMPARING = {"weight_boundary", "symmetry_scale", "symmetry_sigma", "histogram_distance"}
+"""Fields of a configuration that do not change a signature."""
+
+
+@dataclass(slots=True)
+class Signatures:
+    """Signatures, with those of the last submap cached: methods that share them describe a query once."""
+
+    _read: Submap | None = None
+    _found: dict[str, Signature] = field(default_factory=dict)
+
+    def of(self, submap: Submap, config: SignatureConfig) -> Signature:
+        """The signature that `signature.paper` gives, without a graph that would only be unpacked."""
+        if self._read is not submap:
+            self._read, self._found = submap, {}
+        key = config.model_dump_json(exclude=_OF_COMPARING)
+        if key not in self._found:
+            self._found[key] = described(submap, freespace_paths(submap, config), config)
+        return self._found[key]
+
+
+@dataclass(frozen=True, slots=True)
+class Proposed:
+    """Three signatures, compared by Eq. 6."""
+
+    config: SignatureConfig = field(default_factory=SignatureConfig)
+    signatures: Signatures = field(default_factory=Signatures)
+
+    def fit(self, submaps: Sequence[Submap]) -> _Signed:
+        """Describe every submap."""
+        signatures = [self.signatures.of(submap, self.config) for submap in submaps]
+        return _Signed(self, SignatureTable.of(signatures, [submap.center_m for submap in submaps]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Signed:
+    method: Proposed
+    table: SignatureTable
+
+    def similarities(self, query: Submap) -> F64:
+        config = self.method.config
+        return similarity(distances(self.method.signatures.of(query, config), self.table, config))
+
+
+CONFIG = SignatureConfig.paper().model_copy(update={"thinning": "zhang_suen"})
+"""The letter, but with the thinning of III-A for the boundary, too: on aces at noise level 2, the learned
+boundary is right for .93 of 200 queries with it, and for .91 with Guo and Hall's."""
+
+LEARNED_FROM = 400
+"""Queries of each other map: the first of its own stream in the experiment."""
+_SHRUNK = 0.6
+"""The covariance is shrunk by this share to its diagonal; .3, .6 and .8 gave the same within .01."""
+_RIDGE = 1e-6
+"""Of the mean variance, added to each, since some bins are always empty."""
+
+_SOFT_M, _NEAR_M = (2.0, 8.0), (2.5, 4.5)
+"""A point weighs 1 up to the first distance from the centre, 0 from the second one on; chosen by hand."""
+_NEAR_BINS = 48
+"""Of pairs near the centre, which are at most 9 m apart."""
+_RING_M, _RINGS = 0.8, 10
+"""Width and number of the bins of distances from the centre."""
+
+BOUNDARY_PARTS = ("boundary", "soft", "near", "radial")
+"""The paper's histogram; the same with a soft rim; pairs near the centre; distances from the centre: 218."""
+_SIZES = MappingProxyType(
+    {"boundary": 80, "soft": 80, "near": _NEAR_BINS, "radial": _RINGS, "freespace": 80, "symmetry": 2}
+)
+_ENDS = np.cumsum(list(_SIZES.values()))
+SIZE = int(_ENDS[-1])
+COLUMNS: Mapping[str, slice] = MappingProxyType(
+    {part: slice(int(end) - size, int(end)) for (part, size), end in zip(_SIZES.items(), _ENDS, strict=True)}
+)
+"""Where each part lies in a vector."""
+
+
+def weight(distance_m: F64, full_m: float, none_m: float) -> F64:
+    """1 up to `full_m` from the centre, 0 from `none_m` on, half a cosine between."""
+    return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip((distance_m - full_m) / (none_m - full_m), 0, 1)))
+
+
+def vector(submap: Submap) -> F64:
+    """All parts of a submap of 8 m (SIZE,): square roots of shares, and the symmetry as a share of white.
+
+    Free space and symmetry are the paper's.
+    """
+    signature = Signatures().of(submap, CONFIG)
+    return np.concatenate((boundary_vector(submap), _roots(signature.freespace), signature.symmetry / 255))
+
+
+def boundary_vector(submap: Submap) -> F64:
+    """Its first parts, `BOUNDARY_PARTS`."""
+    resolution_m = submap.grid.resolution_m
+    edges = boundary_edges(submap, CONFIG)
+    cells = boundary_points(edges, resolution_m, CONFIG)
+    away_m = np.hypot(*((cells - (np.array(edges.shape) - 1) / 2) * resolution_m).T)
+    weights = np.stack((np.ones(len(cells)), weight(away_m, *_SOFT_M), weight(away_m, *_NEAR_M)))
+    bins = _SIZES["boundary"]
+    bin_of = bins_of_squares(resolution_m / CONFIG.boundary_bin_m, bins)
+    whole, soft, near = weighed_pairs(cells, weights, bin_of, bins)
+    rings = np.bincount(np.minimum((away_m / _RING_M).astype(np.int64), _RINGS - 1), minlength=_RINGS)
+    return np.concatenate([_roots(counts) for counts in (whole, soft, near[:_NEAR_BINS], rings)])
+
+
+def _roots(counts: NDArray[np.number]) -> F64:
+    return np.asarray(np.sqrt(counts / max(counts.sum(), 1e-9)))
+
+
+LEARNED = {
+    "learned": BOUNDARY_PARTS,
+    "learned_without_soft": ("boundary", "near", "radial"),
+    "learned_without_near": ("boundary", "soft", "radial"),
+    "learned_without_radial": ("boundary", "soft", "near"),
+    "learned_boundary": ("boundary",),
+    "learned_with_freespace": (*BOUNDARY_PARTS, "freespace"),
+    "learned_with_symmetry": (*BOUNDARY_PARTS, "symmetry"),
+}
+"""The parts of each method that learns."""
+UNLEARNED = {"boundary": 0.5, "near": 0.4, "radial": 0.1}
+"""Weights of the method that does not learn, chosen by hand."""
+
+
+@dataclass(slots=True)
+class Vectors:
+    """`vector`, with the last submap cached: methods that share it describe a query once."""
+
+    _read: Submap | None = None
+    _vector: F64 = field(default_factory=lambda: np.empty(0))
+
+    def of(self, submap: Submap) -> F64:
+        """The vector of a submap."""
+        if self._read is not submap:
+            self._read, self._vector = submap, vector(submap)
+        return self._vector
+
+
+def differences(grid: OccupancyGrid, submaps: Sequence[Submap], seed: int) -> F64:
+    """(Q, SIZE) vectors of queries of a map, without noise, less those of the submaps of their places."""
+    centers_m = np.array([submap.center_m for submap in submaps])
+    table = np.array([vector(submap) for submap in submaps])
+    experiment = Experiment(queries=LEARNED_FROM, seed=seed)
+    queries = list(draw_queries(grid, centers_m, submaps[0].radius_m, experiment, NOISE_LEVELS[0]))
+    own = cKDTree(centers_m).query([query.center_m for query in queries])[1]
+    return np.asarray(np.array([vector(query) for query in queries]) - table[own])
+
+
+def metric(within: F64) -> F64:
+    """(K, K): Mahalanobis's distance is the Euclidean one of vectors times it. within : `differences`."""
+    covariance = within.T @ within / len(within)
+    variances = np.diag(covariance)
+    covariance = (1 - _SHRUNK) * covariance + np.diag(_SHRUNK * variances + _RIDGE * variances.mean())
+    return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)))
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """Parts of the vectors, compared by Mahalanobis's distance.
+
+    within (Q, SIZE) : `differences` of other maps.
+    """
+
+    vectors: Vectors
+    parts: tuple[str, ...]
+    within: F64
+
+    def fit(self, submaps: Sequence[Submap]) -> _Vectors:
+        """Describe every submap."""
+        columns = np.concatenate([np.arange(SIZE)[COLUMNS[part]] for part in self.parts])
+        whitening = np.zeros((SIZE, len(columns)))
+        whitening[columns] = metric(self.within[:, columns])
+        return _Vectors(self.vectors, whitening, np.array([self.vectors.of(s) for s in submaps]) @ whitening)
+
+
+@dataclass(frozen=True, slots=True)
+class _Vectors:
+    vectors: Vectors
+    whitening: F64
+    table: F64
+
+    def similarities(self, query: Submap) -> F64:
+        return np.asarray(-np.linalg.norm(self.table - self.vectors.of(query) @ self.whitening, axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class Unlearned:
+    """Parts of the vectors, compared by the sum of their distances sqrt(1 - BC) with weights."""
+
+    vectors: Vectors
+    weights: Mapping[str, float]
+
+    def fit(self, submaps: Sequence[Submap]) -> _Parts:
+        """Describe every submap."""
+        return _Parts(self, np.array([self.vectors.of(submap) for submap in submaps]))
+
+
+@dataclass(frozen=True, slots=True)
+class _Parts:
+    method: Unlearned
+    table: F64
+
+    def similarities(self, query: Submap) -> F64:
+        apart = self.table - self.method.vectors.of(query)
+        # Of roots of shares, |a - b|^2 is 2 (1 - BC).
+        terms = [
+            share * np.linalg.norm(apart[:, COLUMNS[part]], axis=1) / np.sqrt(2.0)
+            for part, share in self.method.weights.items()
+        ]
+        return np.asarray(-np.sum(terms, axis=0))
+
 
 METHOD_NAMES = (
     "proposed",
@@ -43,36 +252,37 @@ METHOD_NAMES = (
 OURS = (*METHOD_NAMES[:2], "as_used_here")
 """What stands beside the published row in both tables; the last one with the default settings."""
 
-EXTRA_METHOD_NAMES = (
-    "as_used_here",
-    *LEARNED,
-    "unlearned",
-    "as_used_here_centres",
-    "boundary_centres",
-    "shape_context_centres",
-)
+EXTRA_METHOD_NAMES = ("as_used_here", *LEARNED, "unlearned")
 """Beyond the paper: the default settings; the boundary at several radii with a learned metric, with more and
-fewer parts, and nothing learned; places described from several centres, by Eq. 6, by its boundary alone, and
-by the shape context."""
+fewer parts, and nothing learned."""
+
+_NO_SYMMETRY = {"symmetry_sigma": 1e6}
+"""A spread that makes Omega of Eq. 6 equal to 1."""
+VARIANTS: Mapping[str, Mapping[str, Any]] = {
+    "without_symmetry": _NO_SYMMETRY,
+    "boundary_alone": {"weight_boundary": 1.0, **_NO_SYMMETRY},
+    "freespace_alone": {"weight_boundary": 0.0, **_NO_SYMMETRY},
+    "symmetry_counts": {"symmetry_sigma": 4.0},
+    "proposed_ln_bc": {"histogram_distance": "bhattacharyya"},
+}
+"""Fields of the method to the letter with other values: without some of its signatures, with a symmetry that
+counts (its sigma is 120), and with the other reading of the distance."""
+ABLATION = tuple(VARIANTS)[:-1]
+"""What each signature adds."""
 
 
-def make_methods(
-    names: Iterable[str], within: F64 | None = None, signatures: Signatures | None = None
-) -> dict[str, Method]:
+def make_methods(names: Iterable[str], within: F64 | None = None) -> dict[str, Method]:
     """Methods by name, with the paper's parameters.
 
     Methods with the same features share them when they are made together, so that the features of a submap
     are extracted once. within : `learned.differences` of other maps, without which no method can be made that
     learns. Raises KeyError for a name that is not known.
     """
-    signatures, vectors = signatures or Signatures(), Vectors()
+    signatures, vectors = Signatures(), Vectors()
     sift_words, surf_words = Vocabulary(sift), Vocabulary(surf)
-    # A spread of 1e6 makes Omega of Eq. 6 equal to 1.
-    boundary = Proposed(SignatureConfig(weight_boundary=1.0, symmetry_sigma=1e6))
-    ln_bc = SignatureConfig.paper().model_copy(update={"histogram_distance": "bhattacharyya"})
+    letter = SignatureConfig.paper()
     known: dict[str, Method] = {
-        "proposed": Proposed(SignatureConfig.paper(), signatures),
-        "proposed_ln_bc": Proposed(ln_bc, signatures),
+        "proposed": Proposed(letter, signatures),
         "as_used_here": Proposed(),
         "shape_context": ShapeContext(),
         "sift_bow": Words(sift_words, tfidf=False),
@@ -81,149 +291,9 @@ def make_methods(
         "surf_tfidf": Words(surf_words, tfidf=True),
         "sdf": DistanceFeatures(),
         "unlearned": Unlearned(vectors, UNLEARNED),
-        "as_used_here_centres": SeveralCentres(method=Proposed()),
-        "boundary_centres": SeveralCentres(method=boundary),
-        "shape_context_centres": SeveralCentres(method=ShapeContext()),
     }
+    for name, changed in VARIANTS.items():
+        known[name] = Proposed(letter.model_copy(update=dict(changed)), signatures)
     if within is not None:
         known |= {name: Learned(vectors, parts, within) for name, parts in LEARNED.items()}
     return {name: known[name] for name in names}
-
-
-@dataclass(frozen=True, slots=True)
-class SettingChoice:
-    """Another setting of the method to the letter, to measure what it moves.
-
-    name : in a few words. paper : what the paper says of it. letter : what the letter does.
-    overrides : fields of SignatureConfig with the other values.
-    """
-
-    name: str
-    paper: str
-    letter: str
-    overrides: tuple[tuple[str, Any], ...]
-
-
-_NO_SYMMETRY = ("symmetry_sigma", 1e6)
-
-ABLATION = (
-    SettingChoice("boundary and free space", "Eq. 6 with Omega = 1", "Eq. 6", (_NO_SYMMETRY,)),
-    SettingChoice(
-        "boundary alone", "omega_b = 1, Omega = 1", "Eq. 6", (("weight_boundary", 1.0), _NO_SYMMETRY)
-    ),
-    SettingChoice(
-        "free space alone", "omega_b = 0, Omega = 1", "Eq. 6", (("weight_boundary", 0.0), _NO_SYMMETRY)
-    ),
-    SettingChoice("symmetry made to count", "sigma = 120", "sigma = 120; here 4", (("symmetry_sigma", 4.0),)),
-)
-"""What each signature adds."""
-
-OPEN_CHOICES = tuple(
-    SettingChoice(name, paper, letter, (override,))
-    for name, paper, letter, override in (
-        (
-            "Guo-Hall thinning",
-            "two works: III-A, III-B",
-            "Guo-Hall for the boundary, Zhang-Suen for free space",
-            ("thinning", "guo_hall"),
-        ),
-        ("blocks of 0.1 m", "skeleton of the map", "cells of 0.05 m", ("freespace_cell_m", 0.1)),
-        ("eroded by 0.2 m", "III-C names no erosion", "none", ("freespace_clearance_m", 0.2)),
-        ("limit in S^G", "no limit", "none", ("symmetry_limited", True)),
-        ("vote by length", "voting on the angles", "one vote each", ("axis_vote", "length")),
-        (
-            "Zhang-Suen thinning",
-            "two works: III-A, III-B",
-            "Guo-Hall for the boundary, Zhang-Suen for free space",
-            ("thinning", "zhang_suen"),
-        ),
-        ("boundary points 0.05 m", "-", "0.1 m", ("boundary_spacing_m", 0.05)),
-        ("boundary points 0.2 m", "-", "0.1 m", ("boundary_spacing_m", 0.2)),
-        ("nodes 0.4 m apart", "-", "0.6 m", ("freespace_spacing_m", 0.4)),
-        ("nodes 1.0 m apart", "-", "0.6 m", ("freespace_spacing_m", 1.0)),
-        ("nodes joined to 1.5 m", "all that see each other", "the same", ("freespace_join_m", 1.5)),
-        ("S^G peaks at 255", "-", "34", ("symmetry_peak", 255.0)),
-        ("omega_b = 0.7", "0.9", "0.9", ("weight_boundary", 0.7)),
-    )
-)
-"""Where our default departs from the paper (the first five, which together are the row "as_used_here"), and
-other values of what the paper leaves open."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SeveralCentres:
-    """`method` on discs around the points of a lattice.
-
-    reach_m : farthest centre of a disc from that of its submap; the discs are smaller by as much.
-    spacing_m : of the lattice. Both are chosen by hand, for queries within 1 m of a centre.
-    """
-
-    method: Method
-    reach_m: float = 1.0
-    spacing_m: float = 0.5
-
-    def fit(self, submaps: Sequence[Submap]) -> _Centres:
-        """Describe every disc of every submap."""
-        offsets = lattice(self.reach_m, self.spacing_m)
-        discs = [smaller_disc(submap, offset, self.reach_m) for submap in submaps for offset in offsets]
-        own = np.repeat(np.arange(len(submaps)), len(offsets))
-        centers_m = np.array([submap.center_m for submap in submaps]).reshape(-1, 2)
-        at_m = centers_m[own] + np.tile(offsets, (len(submaps), 1))
-        return _Centres(self.method.fit(discs), _nearest(at_m, centers_m, own), len(submaps), self.reach_m)
-
-
-def _nearest(at_m: F64, centers_m: F64, own: I64) -> I64:
-    """For each disc, at (N, 2), the submap with the nearest centre (M, 2); its own (N,) if none is nearer.
-
-    Submaps overlap. A disc of one of them that lies beside the centre of another one stands for that one.
-    """
-    if not len(at_m):
-        return own
-    away_m, nearest = cKDTree(centers_m).query(at_m)
-    own_m = np.hypot(*(at_m - centers_m[own]).T)
-    return np.where(own_m <= away_m + 1e-9, own, nearest)
-
-
-@dataclass(frozen=True, slots=True)
-class _Centres:
-    matcher: Matcher
-    owner: I64
-    count: int
-    reach_m: float
-
-    def similarities(self, query: Submap) -> F64:
-        scores = self.matcher.similarities(smaller_disc(query, np.zeros(2), self.reach_m))
-        best = np.full(self.count, -np.inf)
-        np.maximum.at(best, self.owner, scores)
-        return best
-
-
-def lattice(reach_m: float, spacing_m: float) -> F64:
-    """(K, 2) points of a square lattice within `reach_m` of (0, 0), which is one of them."""
-    steps = np.arange(-int(reach_m / spacing_m), int(reach_m / spacing_m) + 1) * spacing_m
-    points = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
-    return np.asarray(points[np.hypot(*points.T) <= reach_m + 1e-9])
-
-
-def smaller_disc(submap: Submap, offset_m: F64, less_m: float) -> Submap:
-    """The part of a submap within its radius less `less_m` of its centre plus `offset_m` (2,)."""
-    grid = submap.grid
-    radius_m = submap.radius_m - less_m
-    height, width = grid.cells.shape
-    middle_m = np.asarray(grid.origin_m) + 0.5 * grid.resolution_m * np.array([width, height]) + offset_m
-    part = grid.crop((float(middle_m[0]), float(middle_m[1])), radius_m)
-    rows, columns = np.indices(part.cells.shape)
-    x_m, y_m = (
-        (np.stack((columns, rows), axis=-1) + 0.5) * part.resolution_m + np.asarray(part.origin_m) - middle_m
-    ).transpose(2, 0, 1)
-    inside = np.hypot(x_m, y_m) <= radius_m + 0.5 * part.resolution_m
-    return Submap(
-        submap_id=submap.submap_id,
-        center_m=submap.center_m,
-        radius_m=radius_m,
-        grid=OccupancyGrid(
-            cells=np.where(inside, part.cells, np.int8(UNKNOWN)),
-            resolution_m=part.resolution_m,
-            origin_m=part.origin_m,
-        ),
-    )

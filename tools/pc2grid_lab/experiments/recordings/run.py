@@ -60,7 +60,7 @@ from pc2grid_lab.experiments.recordings.catalogue import (
     write_drive,
 )
 from pc2grid_lab.experiments.truth import AHEAD_M, SAME_NS, fit_frame, nearest, pose_at, trajectory_error
-from signature.config import Config, ShortlistBy
+from signature.config import Config
 from signature.database import open_database
 
 _CLI = "from pc2grid_cli.main import main; main()"
@@ -184,12 +184,11 @@ class Folder:
     """Where the maps and answers of one run are.
 
     data : the folder of recordings. work : of everything that is made. Both are absolute, as the commands
-        run in another folder. shortlist : `signature.config.RelocalizeConfig.shortlist_by` of the answers.
+        run in another folder.
     """
 
     data: Path
     work: Path
-    shortlist: ShortlistBy = "signatures"
 
     def source(self, recording: Recording) -> Path:
         """The file that the commands read; if it is thinned or driven, `_make` makes it.
@@ -236,8 +235,7 @@ class Folder:
     def answer(self, pair: Pair, window: TimeSpan) -> Path:
         """The result of `relocalize` for a window."""
         named = f"{plain(pair.query)}.in.{plain(pair.map_name)}"
-        answers = "answers" if self.shortlist == "signatures" else f"answers_{self.shortlist}"
-        return self.work / answers / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
+        return self.work / "answers" / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
 
     def missing(self, recording: Recording) -> bool:
         """Whether the data folder lacks the recording, so that it is a gap of the page."""
@@ -383,7 +381,7 @@ def _bare(folder: Folder, recording: Recording) -> Task:
 
 def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) -> Task:
     span = ("--start", f"{window.start_s:.3f}", "--duration", f"{window.duration_s:g}")
-    options = (*recording.options, *span, "--set", f"relocalize.shortlist_by={folder.shortlist}")
+    options = (*recording.options, *span)
     where = (folder.source(recording), "-d", folder.map(pair.map_name))
     return Task(
         folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *where, *options, "--json"), 0.0

@@ -1,6 +1,7 @@
-"""The cells of the paper's tables as tasks: each runs independently and keeps its results in a file.
+"""`pc2grid compare paper`: the paper's Tables III and IV on the paper's maps, published beside measured.
 
-The numbers that the paper has printed: Tables I, III and IV.
+The cells of the tables are tasks: each runs independently and keeps its results in a file. At the end stand
+the numbers that the paper has printed: Tables I, III and IV.
 """
 
 from __future__ import annotations
@@ -15,38 +16,48 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
-from pc2grid.errors import MapFileError
+from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.geometry import F64
 from pc2grid.io.maps import load_map
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
-from pc2grid_lab.experiments.program import once
+from pc2grid_cli.console import Console, json_text
+from pc2grid_cli.output import make_folder, show, table
+from pc2grid_lab.compare import picture
+from pc2grid_lab.experiments.program import (
+    BACK,
+    FRONT,
+    LABORATORY,
+    digest_of_sources,
+    in_processes,
+    once,
+    write_text,
+)
 from pc2grid_lab.paper.experiment import (
     NOISE_LEVELS,
     BestMatches,
     Experiment,
     MatchMeasures,
-    Method,
     best_matches,
 )
-from pc2grid_lab.paper.learned import LEARNED, differences
-from pc2grid_lab.paper.methods import METHOD_NAMES, OURS, SettingChoice, make_methods
-from pc2grid_lab.paper.proposed import Proposed, Signatures
-from signature.config import SignatureConfig
+from pc2grid_lab.paper.methods import (
+    ABLATION,
+    EXTRA_METHOD_NAMES,
+    LEARNED,
+    METHOD_NAMES,
+    OURS,
+    differences,
+    make_methods,
+)
 
-Overrides = tuple[tuple[str, Any], ...]
 RADII_M = (6.0, 8.0, 10.0)
 """Table IV."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperTask:
-    """A method on one map at one noise level.
-
-    overrides : fields of SignatureConfig that differ from those of the method to the letter.
-    speckle_sigma_m : spread of the boundary noise, which the paper leaves open.
-    """
+    """A method on one map at one noise level."""
 
     map_path: Path
     method: str
@@ -55,8 +66,6 @@ class PaperTask:
     offset_m: float
     queries: int
     seed: int
-    overrides: Overrides = ()
-    speckle_sigma_m: float = NOISE_LEVELS[0].speckle_sigma_m
 
     @property
     def map_name(self) -> str:
@@ -65,10 +74,9 @@ class PaperTask:
 
     def file(self, folder: Path) -> Path:
         """The file of the results."""
-        changed = "".join(f".{key}={value}" for key, value in self.overrides)
         return folder / (
             f"{self.map_name}.{self.method}.noise{self.level}.r{self.radius_m:g}.offset{self.offset_m:g}"
-            f".q{self.queries}.seed{self.seed}.speckles{self.speckle_sigma_m:g}{changed}.pickle"
+            f".q{self.queries}.seed{self.seed}.pickle"
         )
 
 
@@ -77,18 +85,14 @@ def paper_tasks(
     *,
     methods: Sequence[str] = METHOD_NAMES,
     offsets_m: Sequence[float] = (1.0, 0.5),
-    choices: Sequence[SettingChoice] = (),
     **setting: Any,
 ) -> Iterator[PaperTask]:
-    """Every task of Tables III and IV, and those that measure other `choices`. setting : of all tasks."""
+    """Every task of Tables III and IV. setting : of all tasks."""
     for offset_m, method, path in itertools.product(offsets_m, methods, maps):
         task = PaperTask(map_path=path, method=method, level=0, radius_m=8.0, offset_m=offset_m, **setting)
         yield from (replace(task, level=level) for level in range(len(NOISE_LEVELS)))
         if method in OURS:
             yield from (replace(task, level=1, radius_m=r) for r in RADII_M if r != task.radius_m)
-        if method == "proposed":
-            for choice, level in itertools.product(choices, (0, 2)):
-                yield replace(task, level=level, overrides=choice.overrides)
 
 
 def that_share_submaps(tasks: Iterable[PaperTask]) -> list[list[PaperTask]]:
@@ -142,7 +146,7 @@ class PaperCell:
         """What the paper has printed for it, or for its own method if it does not have this one; None of maps
         and settings that it does not have."""
         task = self.task
-        if task.overrides or task.map_name not in MAPS:
+        if task.map_name not in MAPS:
             return None
         if task.radius_m == 8.0:
             rows = TABLE_3[task.level]
@@ -151,7 +155,7 @@ class PaperCell:
 
     def summary(self) -> dict[str, Any]:
         """Everything except the single queries, for JSON."""
-        task = {**asdict(self.task), "map_path": self.task.map_name, "overrides": dict(self.task.overrides)}
+        task = {**asdict(self.task), "map_path": self.task.map_name}
         half = {f"{name}_half_width": value for name, value in self.half_widths._asdict().items()}
         published = None if self.published is None else self.published._asdict()
         measures = {**self.measures._asdict(), **half, "published": published}
@@ -176,32 +180,17 @@ def _run(tasks: Sequence[PaperTask], folder: Path) -> Iterator[PaperCell]:
         return
     grid = read_map(tasks[0].map_path)
     submaps = partition(grid, PartitionConfig.paper(tasks[0].radius_m))
-    matchers = {key: method.fit(submaps) for key, method in _methods_of(tasks, folder).items()}
-    for shared, some in itertools.groupby(tasks, lambda task: replace(task, method="", overrides=())):
-        by_method = {(task.method, task.overrides): task for task in some}
+    names = dict.fromkeys(task.method for task in tasks)
+    learns = not LEARNED.keys().isdisjoint(names)
+    within = within_others(tasks[0].map_path, tasks[0].radius_m, tasks[0].seed, folder) if learns else None
+    matchers = {name: method.fit(submaps) for name, method in make_methods(names, within).items()}
+    for shared, some in itertools.groupby(tasks, lambda task: replace(task, method="")):
+        by_method = {task.method: task for task in some}
         experiment = Experiment(queries=shared.queries, offset_m=shared.offset_m, seed=shared.seed)
-        noise = replace(NOISE_LEVELS[shared.level], speckle_sigma_m=shared.speckle_sigma_m)
-        asked = {key: matchers[key] for key in by_method}
-        for key, matches in best_matches(asked, grid, submaps, experiment, noise).items():
-            yield PaperCell(by_method[key], len(submaps), matches, matches.measures(), matches.half_widths())
-
-
-def _methods_of(tasks: Sequence[PaperTask], folder: Path) -> dict[tuple[str, Overrides], Method]:
-    """The methods of tasks of one map, those of the same features made together."""
-    plain = dict.fromkeys(task.method for task in tasks if not task.overrides)
-    within = (
-        None
-        if LEARNED.keys().isdisjoint(plain)
-        else within_others(tasks[0].map_path, tasks[0].radius_m, tasks[0].seed, folder)
-    )
-    signatures = Signatures()
-    made = make_methods(plain, within, signatures)
-    found: dict[tuple[str, Overrides], Method] = {(name, ()): method for name, method in made.items()}
-    for task in tasks:
-        if task.overrides:
-            config = SignatureConfig.paper().model_copy(update=dict(task.overrides))
-            found[task.method, task.overrides] = Proposed(config, signatures)
-    return found
+        asked = {name: matchers[name] for name in by_method}
+        found = best_matches(asked, grid, submaps, experiment, NOISE_LEVELS[shared.level])
+        for name, matches in found.items():
+            yield PaperCell(by_method[name], len(submaps), matches, matches.measures(), matches.half_widths())
 
 
 def within_others(asked: Path, radius_m: float, seed: int, folder: Path) -> F64:
@@ -237,6 +226,156 @@ def known_maps(path: Path) -> list[Path]:
             f"{path}: no map is here", hint="a map.yaml, or a folder with intel.yaml, fr079.yaml, ..."
         )
     return found
+
+
+_LEVELS = ("without noise", "noise level 1", "noise level 2")
+_MEASURES = ("auc", "rp9", "f1", "r_at_1")
+"""Those that the paper has come first."""
+
+
+def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
+    """Tables I, III and IV on stdout, in the order of a reader's questions: does the method hold, how do its
+    rivals do, what beats it, and what do its parts and open choices move.
+    """
+    maps = list(dict.fromkeys(r.task.map_name for r in results))
+    counts = {r.task.map_name: r.submaps for r in results if r.task.radius_m == 8.0}
+    first = table("Table I, number of submaps", ["map"], ["paper", "ours"])
+    for name in maps:
+        first.add_row(name, str(SUBMAPS.get(name, "")), str(counts[name]))
+    show(
+        first,
+        "Of three numbers: paper, ours, difference, in thousandths; +-: half of the interval from 5 to 95 %,"
+        " by bootstrap over the queries. Methods that the paper does not have stand beside its own.",
+    )
+    ours, rivals, beyond, parts = (
+        [name for name in methods if name in group]
+        for group in (OURS, METHOD_NAMES, EXTRA_METHOD_NAMES, ("proposed", *ABLATION))
+    )
+    rivals, beyond = ([name for name in group if name not in OURS] for group in (rivals, beyond))
+    for offset_m in dict.fromkeys(r.task.offset_m for r in results):
+        plain = [r for r in results if r.task.offset_m == offset_m]
+        where = f"queries within {offset_m:g} m of a submap centre"
+        at_8_m = [(str(level), level, 8.0) for level in range(len(_LEVELS))]
+        _print_measures(f"Table III, does it hold: {where}", "noise", at_8_m, plain, maps, ours)
+        by_radius = [(f"{radius_m:g} m", 1, radius_m) for radius_m in RADII_M]
+        _print_measures(f"Table IV, noise level 1: {where}", "radius", by_radius, plain, maps, ours)
+        _print_measures(f"Table III, its rivals: {where}", "noise", at_8_m, plain, maps, rivals)
+        _print_measures(f"What beats it: {where}", "noise", at_8_m, plain, maps, beyond)
+        if len(parts) > 1:
+            _print_measures(f"What each signature adds: {where}", "noise", at_8_m, plain, maps, parts)
+
+
+def _print_measures(
+    title: str,
+    heading: str,
+    settings: Sequence[tuple[str, int, float]],
+    plain: Sequence[PaperCell],
+    maps: Sequence[str],
+    methods: Sequence[str],
+) -> None:
+    """A table of some methods: a row for each measure and setting (its name, noise level and radius), a
+    column for each map and one for their mean."""
+    shown = table(title, (heading, "measure", "method"), (*maps, "mean"))
+    for (name, level, radius_m), measure, method in itertools.product(settings, _MEASURES, methods):
+        wanted = (method, level, radius_m)
+        row = {r.task.map_name: r for r in plain if (r.task.method, r.task.level, r.task.radius_m) == wanted}
+        if row:
+            title_of = "R@1" if measure == "r_at_1" else measure.upper()
+            cells = [_cell([row[m]], measure) if m in row else "" for m in maps]
+            shown.add_row(name, title_of, method, *cells, _cell(list(row.values()), measure))
+    if shown.row_count:
+        show(shown)
+
+
+def _cell(cells: Sequence[PaperCell], measure: str) -> str:
+    """The mean over maps: paper, ours, difference and interval; only ours if the paper lacks one of them."""
+    ours = 1000 * float(np.mean([getattr(cell.measures, measure) for cell in cells]))
+    halves = [getattr(cell.half_widths, measure) for cell in cells]
+    # The queries of the maps are independent of each other.
+    spread = f"+-{1000 * float(np.linalg.norm(halves)) / len(cells):<2.0f}"
+    published = [p for cell in cells if (p := getattr(cell.published, measure, None)) is not None]
+    if len(published) < len(cells):
+        return f"{ours:.0f} {spread}"
+    there = 1000 * float(np.mean(published))
+    return f"{there:3.0f} {ours:4.0f} {ours - there:+4.0f} {spread}"
+
+
+def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Path:
+    """Draw figure-9-offset-OFFSET.png, precision over recall by map and noise level; returns its path."""
+    from matplotlib import colormaps
+
+    plain = [r for r in results if (r.task.offset_m, r.task.radius_m) == (offset_m, 8.0)]
+    maps = list(dict.fromkeys(r.task.map_name for r in plain))
+    path = out / f"figure-9-offset-{offset_m:g}.png"
+    with picture(path, 3.2 * len(maps), 9.0) as figure:
+        axes = figure.subplots(len(_LEVELS), len(maps), squeeze=False, sharex=True, sharey=True)
+        colours = colormaps["tab20"]
+        number = {name: k for k, name in enumerate(dict.fromkeys(r.task.method for r in plain))}
+        for (level, title), (k, name) in itertools.product(enumerate(_LEVELS), enumerate(maps)):
+            axis = axes[level, k]
+            for cell in (r for r in plain if (r.task.level, r.task.map_name) == (level, name)):
+                curve = cell.matches.curve()
+                if len(curve.recall):
+                    # Like the area under the curve: from recall 0 at the precision of the first point.
+                    recall, precision = [0.0, *curve.recall], [curve.precision[0], *curve.precision]
+                    colour = colours(number[cell.task.method] % colours.N)
+                    axis.plot(recall, precision, label=cell.task.method, linewidth=1.2, color=colour)
+            axis.set_title(f"{name}, {title}", fontsize=9)
+            axis.set(xlim=(0, 1.01), ylim=(0, 1.01), xlabel="recall", ylabel="precision")
+            axis.label_outer()
+            axis.grid(alpha=0.3)
+        if axes[0, 0].lines:
+            figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    return path
+
+
+def run(
+    maps: Path,
+    out: Path,
+    terminal: Console,
+    *,
+    queries: int,
+    methods: Sequence[str] | None,
+    offset: Sequence[float] | None,
+    ablation: bool,
+    jobs: int | None,
+    seed: int,
+) -> None:
+    """Compute the cells that are not in `out` yet, and write the tables and figures."""
+    chosen = (*_chosen(methods), *(ABLATION if ablation else ()))
+    offsets_m = tuple(offset or (1.0, 0.5))
+    if min(offsets_m) <= 0:
+        raise ConfigError("--offset: expected a distance above 0 m")
+    found = known_maps(maps)
+    make_folder(out)
+    tasks = list(paper_tasks(found, methods=chosen, offsets_m=offsets_m, queries=queries, seed=seed))
+    with terminal.progress(f"{len(tasks)} cells of the tables") as advance:
+        kept = kept_in(out, found)
+        groups = [(group, kept) for group in that_share_submaps(tasks)]
+        cells = itertools.chain.from_iterable(in_processes(cells_of, groups, jobs=jobs, advance=advance))
+    by_task = {cell.task: cell for cell in cells}
+    results = [by_task[task] for task in tasks]
+    document = {"queries": queries, "seed": seed, "cells": [cell.summary() for cell in results]}
+    write_text(out / "results.json", json_text(document) + "\n")
+    pictures = [draw_figure(results, offset_m, out) for offset_m in offsets_m]
+    print_tables(results, chosen)
+    print(f"written: {out / 'results.json'}, {', '.join(map(str, pictures))}")
+
+
+def kept_in(out: Path, maps: Sequence[Path]) -> Path:
+    """The folder of the results of these sources, these maps, and those beside them to learn from."""
+    beside = {path for folder in {path.parent for path in maps} for path in known_maps(folder)}
+    images = {file for path in {*maps, *beside} for file in path.parent.glob(f"{path.stem}.*")}
+    return out / "cells" / digest_of_sources((FRONT, BACK, LABORATORY, *sorted(images)))
+
+
+def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
+    """The methods that are compared. Raises ConfigError if one is not known."""
+    chosen, known = tuple(methods or METHOD_NAMES), METHOD_NAMES + EXTRA_METHOD_NAMES
+    for name in chosen:
+        if name not in known:
+            raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
+    return chosen
 
 
 MAPS = ("fr079", "intel", "csail", "aces", "killian")
