@@ -127,7 +127,7 @@ class SeenStatistics:
     @staticmethod
     def load(path: Path = _FILE) -> SeenStatistics:
         """Read what `save` has written; by default the statistics that come with the program, which
-        `pc2grid_lab.fit.signatures` has learned from real logs."""
+        `pc2grid_lab.fit.queries` has learned from real logs."""
         with np.load(path, allow_pickle=False) as file:
             return SeenStatistics(
                 **{field.name: file[field.name].astype(np.float64) for field in fields(SeenStatistics)}

@@ -17,7 +17,7 @@ from pc2grid.geometry import SE2, hand_over
 from pc2grid.io.atomic import replace_file
 from pc2grid.model import Health, Loop, OccupancyGrid, Scan, SessionMap, Trajectory
 from pc2grid.settings import load_settings
-from pc2grid_lab.experiments.truth import read_relations, relation_error
+from pc2grid_lab.truth import read_relations, relation_error
 from signature.config import Config
 from signature.paper import Signature, SignatureTable
 from signature.retrieval.places import LazySequence

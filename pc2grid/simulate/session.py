@@ -72,7 +72,6 @@ class Session:
     drive : true motion in the plan's map frame.
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
     shell : geometry of a real building; None where the plan is extruded.
-    added : further objects that the plan does not show.
     """
 
     sensor: Sensor
@@ -82,7 +81,6 @@ class Session:
     odometry: SimulatedOdometry | None
     config: SimulationConfig
     shell: Mesh | None = None
-    added: tuple[Furniture, ...] = ()
 
     @property
     def scan_count(self) -> int:
@@ -92,7 +90,7 @@ class Session:
     def mesh(self) -> Mesh:
         """Return building and objects as triangles in the map frame."""
         shell = extrude(self.grid, self.config.wall_height_m) if self.shell is None else self.shell
-        return Mesh.join([shell, *(furniture.mesh() for furniture in (*self.clutter, *self.added))])
+        return Mesh.join([shell, *(furniture.mesh() for furniture in self.clutter)])
 
     def readings(self) -> Iterator[Reading]:
         """Cast all scans, several in a call; each ray starts at the robot's pose at the time of the ray."""
@@ -165,12 +163,10 @@ def prepare_session(
     sensor: SensorKind,
     grid: OccupancyGrid | Building | None = None,
     config: SimulationConfig | None = None,
-    added: tuple[Furniture, ...] = (),
 ) -> Session:
     """Place the clutter, plan the drive and compute its odometry.
 
     grid : the floor plan, or a real building; None for the procedural office of `config.building_seed`.
-    added : further objects that the plan does not show.
     Raises ConfigError if there is no room for the robot in the building, or at the given start.
     """
     config = config or SimulationConfig()
@@ -187,13 +183,13 @@ def prepare_session(
         robot_m=config.drive.clearance_m,
         keep_free_m=() if config.start_m is None else (config.start_m,),
     )
-    blocked, clearance_m = covered(plan, (*clutter, *added)), config.drive.clearance_m
+    blocked, clearance_m = covered(plan, clutter), config.drive.clearance_m
     route = plan_route(
         plan, blocked, config.length_m, start_m=config.start_m, least_m=clearance_m, rng=stream(_ROUTE)
     )
     drive = drive_along(route, config.drive, stream(_DRIVE))
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
-    return Session(make_sensor(sensor, config), plan, clutter, drive, odometry, config, shell, added)
+    return Session(make_sensor(sensor, config), plan, clutter, drive, odometry, config, shell)
 
 
 def iter_session(

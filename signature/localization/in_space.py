@@ -17,7 +17,7 @@
 
 The place that is likeliest is the answer, and its pose that of ICP, in six degrees of freedom.
 
-`pc2grid_lab.fit.in_space` fits a, b, c and `left`, and judges them on buildings that were left out.
+`pc2grid_lab.fit.posterior` fits a, b, c and `left`, and judges them on buildings that were left out.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ from pc2grid.settings import Config
 from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
-from pc2grid_lab.experiments.truth import read_relations, relation_error
+from pc2grid_lab.truth import read_relations, relation_error
 from tests.helpers.rooms import RESOLUTION_M
 
 Mapped = tuple[Session, list[tuple[Scan, SE2]], OccupancyGrid, Trajectory]

@@ -19,7 +19,6 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from pc2grid_cli.view import Locator, ViewServer
-from pc2grid_lab.experiments.answers import localize
 from signature.config import Config
 from signature.database import open_database
 from tests.helpers.rooms import RESOLUTION_M
@@ -146,20 +145,6 @@ def test_localizer_of_the_library(expected: tuple[Path, Expected]) -> None:
         for registered, planar_scan in pc2grid.follow(log.scans(), config):
             localizer.add(registered, planar_scan)
         assert_same(localizer.answer().to_json(), last)
-
-
-def test_laboratory(expected: tuple[Path, Expected]) -> None:
-    """Several maps are compared with one query."""
-    folder, last = expected
-    with (
-        open_database(folder / "monday.submaps") as database,
-        pc2grid.open_log(folder / "tuesday.mcap") as log,
-    ):
-        config = database.config()
-        index = pc2grid.MapIndex.of(database, config)
-        (found,) = localize(pc2grid.follow(log.scans(), config), [index, index])
-    for answer in found.answers:
-        assert_same(answer.to_json(), last)
 
 
 def relocalize_at_once(folder: Path, *words: object) -> Any:

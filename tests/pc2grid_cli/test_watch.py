@@ -21,7 +21,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.documents import schema
 from pc2grid_cli.main import app, main
-from pc2grid_lab.experiments.recordings.kidnaps import Part, write_joined
+from pc2grid_lab.recordings.run import Part, write_joined
 from signature.localization.localizer import ResetPolicy
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed

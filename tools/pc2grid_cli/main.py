@@ -287,7 +287,7 @@ REMOVED = {
         ("pc2grid compare log", "pc2grid compare maps"),
         "`pc2grid compare recordings FOLDER`, with true poses in NAME.tum beside NAME.mcap",
     ),
-    "pc2grid compare signatures": "`pc2grid compare recordings DATA --shortlist shuffled`: without them",
+    "pc2grid compare signatures": "`pc2grid relocalize --set relocalize.shortlist_by=shuffled`: without them",
     "pc2grid compare real": "its rows are those of `pc2grid compare recordings DATA --only 'other sensor'`",
     "pc2grid watch --last": "a finished recording is followed whole, and ws://ROBOT:8765 while it runs",
     "pc2grid watch --keep": "`pc2grid watch` goes on to the end; `--first` stops when it is located",

@@ -45,25 +45,29 @@ def compare_recordings_command(
         ),
     ] = False,
     quick: Annotated[bool, typer.Option("--quick", help="a small part of all, always the same")] = False,
+    page: Annotated[
+        bool, typer.Option("--page", help="print the page, in Markdown, in place of a table")
+    ] = False,
     jobs: Annotated[int, typer.Option("--jobs", min=1, help="processes at a time")] = 2,
 ) -> None:
     """Map every real recording, locate parts of it in other maps, and tell what changed since the last time.
 
-    Of recordings that the catalogue does not name, later parts are located in the map of the beginning. They
-    are judged by NAME.tum or NAME.relations beside them; without, by whether the answers fit together.
+    Recordings of your own are located in the map of their beginning, and in those of the others of their
+    folder. Answers are judged by NAME.tum beside them; without, by whether they fit together.
 
     Example: pc2grid compare recordings data --output real-recordings --quick
     """
-    from pc2grid_lab import compare as recordings
+    from pc2grid_lab.recordings.compare import compare_recordings
 
-    recordings.compare_recordings(
+    compare_recordings(
         data,
         out,
-        table,
+        table or out / "real.json",
         console.of(context),
         only=only,
         of_base=of_base,
         quick=quick,
+        as_page=page,
         jobs=jobs,
     )
 
@@ -91,9 +95,9 @@ def compare_sensors_command(
 
     Example: pc2grid compare sensors maps/fr079.yaml maps/intel.yaml --queries 40 --out matrix
     """
-    from pc2grid_lab import compare as sensors
+    from pc2grid_lab.sensors import compare_sensors
 
-    sensors.compare_sensors(
+    compare_sensors(
         plans,
         out,
         console.of(context),
@@ -135,9 +139,9 @@ def compare_peers_command(
 
     Example: pc2grid compare peers intel.mcap fr079.mcap hall.mcap --mapped intel=900 --mapped fr079=600
     """
-    from pc2grid_lab import compare as peers
+    from pc2grid_lab.peers.programs import compare_peers
 
-    peers.compare_peers(
+    compare_peers(
         recordings,
         out,
         console.of(context),

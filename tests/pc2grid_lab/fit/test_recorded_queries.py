@@ -3,9 +3,9 @@
 import math
 
 from pc2grid.observer import TimeSpan
-from pc2grid_lab.experiments.recordings.catalogue import Catalogue
 from pc2grid_lab.fit.posterior import known_of
 from pc2grid_lab.fit.queries import Window, rows
+from pc2grid_lab.recordings.catalogue import Catalogue
 from signature.config import Config
 from signature.localization.query import Query
 from tests.helpers.simulated_drives import building, drive, office, plan

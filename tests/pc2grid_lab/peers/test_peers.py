@@ -17,21 +17,23 @@ from pc2grid.io.maps import save_map
 from pc2grid.model import Scan
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
-from pc2grid_lab.compare import _tasks
-from pc2grid_lab.experiments.registered_session import RegisteredSession
 from pc2grid_lab.peers import programs
-from pc2grid_lab.peers.particle_filter import carmen_log
+from pc2grid_lab.peers.locators import carmen_log
 from pc2grid_lab.peers.programs import (
     PEERS,
     PINS,
-    PeerAnswer,
     PeerFailed,
     PeerTrial,
+    Site,
+    SiteQuery,
+    _tasks,
     answers,
     best_threshold,
     missing,
+    save_beams,
 )
-from pc2grid_lab.peers.site import Site, SiteQuery, save_beams
+from pc2grid_lab.runner import once
+from pc2grid_lab.sensors import RegisteredSession
 from tests.helpers.simulated_drives import drive, office
 
 
@@ -47,7 +49,7 @@ def judged(
 ) -> PeerTrial:
     """The answer to a query, so far beside the truth; None: no answer."""
     pose = None if error_m is None else (4.0, 3.0 + error_m, 0.5 + turned_rad)
-    answer = PeerAnswer(pose=pose, score=score, cpu_s=cpu_s, peak_mb=100.0)
+    answer = {"pose": pose, "score": score, "cpu_s": cpu_s, "peak_mb": 100.0}
     return PeerTrial.of(
         peer, "here", map_, SiteQuery(pose=(4.0, 3.0, 0.5), covered=covered, travel_m=10.0), answer
     )
@@ -125,7 +127,7 @@ def test_what_is_missing_is_named_with_its_command(tmp_path: Path, monkeypatch: 
         *(Site(name=name, sensor="lidar", folder=tmp_path) for name in "bc"),
     ]
     not_installed = {name: command for name, command in commands.items() if command is not None}
-    assert [(name, site.name, other.name) for name, site, other in _tasks(sites, not_installed)] == [
+    assert [(kind.name, site.name, other.name) for kind, site, other in _tasks(sites, not_installed)] == [
         ("pc2grid", "a", "a"),
         *(("pc2grid", *pair) for pair in ("bb", "bc", "cc", "cb")),
         *(("fpfh-ransac", *pair) for pair in ("bb", "bc", "cc", "cb")),
@@ -153,8 +155,8 @@ def test_clouds_are_matched_in_a_process_of_its_own(tmp_path: Path) -> None:
     np.savez(tmp_path / "00.cloud.npz", points_m=seen.astype(np.float32))
     (fpfh,) = (kind for kind in PEERS if kind.name == "fpfh-ransac")
     (answer,) = answers(fpfh, tmp_path / "map", [tmp_path / "00"], tmp_path / "kept.json")
-    assert answer.pose == pytest.approx((1.0, 2.0, 0.4), abs=0.1)
-    assert answer.cpu_s > 0.0 and answer.peak_mb > 50.0
+    assert answer["pose"] == pytest.approx((1.0, 2.0, 0.4), abs=0.1)
+    assert answer["cpu_s"] > 0.0 and answer["peak_mb"] > 50.0
     assert answers(fpfh, tmp_path / "gone", [tmp_path / "00"], tmp_path / "kept.json") == [answer]
 
 
@@ -174,12 +176,12 @@ def test_the_particle_filter_is_told_the_map_and_the_scans(
     monkeypatch.setenv("PATH", str(tmp_path), prepend=os.pathsep)
     save_map(office(), tmp_path / "map")
     driven = session()
-    driven.save(tmp_path / "00.pickle")
+    once(tmp_path / "00.pickle", lambda: driven)
     ranges_m = np.ones((len(driven), 5))
     np.savez(tmp_path / "00.ranges.npz", ranges_m=ranges_m, fov_rad=3.0, T_base_middle=np.eye(4))
     (kind,) = (kind for kind in PEERS if kind.name == "particle-filter")
     (answer,) = answers(kind, tmp_path / "map", [tmp_path / "00"], tmp_path / "kept.json")
-    assert answer.pose == pytest.approx((1.0, 2.0, math.radians(30.0))) and answer.score == -0.25
+    assert answer["pose"] == pytest.approx((1.0, 2.0, math.radians(30.0))) and answer["score"] == -0.25
     assert (tmp_path / "query.rawlog").read_text() == carmen_log(driven, ranges_m, 3.0, SE2())
     config = (tmp_path / "query.ini").read_text().splitlines()
     assert {"particles_count=30000", "init_PDF_max_x=20.0", "init_PDF_max_y=14.0"} < set(config)
@@ -202,4 +204,3 @@ def test_a_drive_through_a_plan_beside_the_peers(tmp_path: Path, monkeypatch: py
     assert own["peer"] == "pc2grid" and own["cpu_s"] > 0.0
     assert own["covered"] == own["right"] == 1 and own["wrong"] == 0
     assert set(document["setting"]["not_installed"]) == {"kiss-matcher", "map-closures", "particle-filter"}
-    assert (out / "peers.png").read_bytes().startswith(b"\x89PNG")

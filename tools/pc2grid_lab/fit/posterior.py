@@ -1,11 +1,13 @@
-"""Fits the posterior to queries whose truth is known, and judges it on buildings that were left out.
+"""Fits the posterior and its factor in space to known truths, and judges both on buildings left out.
 
-    python -m pc2grid_lab.fit.posterior EVIDENCE.json ...
+    python -m pc2grid_lab.fit.posterior EVIDENCE.json ... [--in-space]
 
-Each file is one that `recorded_queries` has written. An answer is judged by a fit without all answers whose
+Each file is one that `queries evidence` has written. An answer is judged by a fit without all answers whose
 query or map is of one of its buildings. Prints by kind of query how many answers are right, and how many
 would be located by the parameters in use and by those fitted without the building, rightly and wrongly; the
-log loss; and the parameters for `signature.localization.posterior`.
+log loss; and the parameters for `signature.localization.posterior`. With --in-space the same of
+`signature.localization.in_space`: by the masses in the plane, the parameters in use, these with the
+rays of places drawn at random, those fitted, and those fitted without the buildings of query and map.
 
 Queries whose place was found and all others weigh the same in the fit, however many of each there are. So the
 probability holds for queries half of which lie in the map.
@@ -16,10 +18,10 @@ from __future__ import annotations
 import json
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import typer
@@ -28,8 +30,9 @@ from scipy.optimize import minimize
 from sklearn.metrics import roc_auc_score
 
 from pc2grid.geometry import F64
-from pc2grid_lab.experiments.recordings.page import clopper_pearson
+from pc2grid_lab.pages import clopper_pearson
 from signature.config import Config
+from signature.localization.in_space import SPACE, masses_in_space
 from signature.localization.posterior import POSTERIOR, Evidence, PosteriorParameters, masses
 
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
@@ -88,13 +91,12 @@ def known_of(rows: Iterable[dict[str, Any]]) -> Iterator[Known]:
             buildings=frozenset((row["log"], row["map"])),
             session=f"{row['log']} {row['start']}",
             places=tuple(Evidence(**evidence) for evidence in row["evidence"]),
-            first=_first_right(errors) if own else None,
+            first=next((k for k, error in enumerate(errors) if own and is_right(error)), None),
         )
 
 
-def _first_right(errors: Sequence[tuple[float, float]]) -> int | None:
-    """The number of the first place that is right, by metres and radians from the truth."""
-    return next((k for k, error in enumerate(errors) if is_right(error)), None)
+Q = TypeVar("Q", "Known", "Compared")
+P = TypeVar("P")
 
 
 def is_right(error: Sequence[float]) -> bool:
@@ -111,7 +113,7 @@ def fit(answers: Sequence[Known]) -> PosteriorParameters:
     found = np.array([answer.first is not None for answer in answers])
     if found.all() or not found.any():
         raise ValueError("a fit needs queries whose place was found and others")
-    weights = 0.5 * np.where(found, 1.0 / found.sum(), 1.0 / (~found).sum())
+    weights = balanced(found)
     likelihood = _Likelihood.of(answers)
 
     def loss(x: F64) -> float:
@@ -166,35 +168,24 @@ class _Likelihood:
         return np.asarray(truth / (every.sum(axis=1) + lost))
 
 
-def left_out(answers: Sequence[Known]) -> F64:
-    """(N,) mass of the best place of each answer by the parameters fitted to the answers in which neither
-    query nor map is of one of its buildings."""
+def balanced(found: NDArray[np.bool_]) -> F64:
+    """Return weights (N,), by which queries whose place was found weigh as much as all others."""
+    return np.asarray(0.5 * np.where(found, 1.0 / max(found.sum(), 1), 1.0 / max((~found).sum(), 1)))
+
+
+def left_out(queries: Sequence[Q], fit: Callable[[Sequence[Q]], P]) -> list[P]:
+    """Return for each query what is fitted to those whose query and map are of none of its buildings."""
     models = {
-        buildings: fit([a for a in answers if not a.buildings & buildings])
-        for buildings in {answer.buildings for answer in answers}
+        buildings: fit([q for q in queries if not q.buildings & buildings])
+        for buildings in {q.buildings for q in queries}
     }
-    return np.array([answer.probability(models[answer.buildings]) for answer in answers])
+    return [models[q.buildings] for q in queries]
 
 
 def log_loss(answers: Sequence[Known], probabilities: F64) -> float:
     """Mean negative logarithm of the probability (N,) of what is true."""
     right = np.array([answer.right for answer in answers])
     return float(-np.log(np.clip(np.where(right, probabilities, 1.0 - probabilities), 1e-4, 1.0)).mean())
-
-
-def main(files: list[Path]) -> None:
-    """Fit, judge and print. FILES: what `recorded_queries` has written."""
-    known = [k for file in files for k in known_of(json.loads(file.read_text()))]
-    for buildings in {k.buildings for k in known}:
-        if len({k.first is None for k in known if not k.buildings & buildings}) < 2:
-            raise SystemExit(
-                "the fit is judged by leaving buildings out, and without"
-                f" {' and '.join(sorted(buildings))} not both kinds of queries are left: found and not"
-            )
-    in_use = np.array([k.probability(POSTERIOR) for k in known])
-    for name, probabilities in (("in use", in_use), ("fitted without the building", left_out(known))):
-        print_judged(known, name, probabilities)
-    print(fit(known))
 
 
 def print_judged(known: Sequence[Known], name: str, probabilities: F64) -> None:
@@ -214,6 +205,128 @@ def print_judged(known: Sequence[Known], name: str, probabilities: F64) -> None:
         f" {roc_auc_score([k.right for k in known], probabilities):.4f}, wrong in {len(wrong_in)} of"
         f" {len(drives)} drives (90 %: {least:.2%} to {most:.2%})"
     )
+
+
+_IN_USE = np.array([SPACE.on, SPACE.through, SPACE.before, SPACE.left])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Compared:
+    """A query whose places were compared in space.
+
+    building : of the query. buildings : of query and map. in_plane : (P,) masses of its places in the plane.
+    terms : (P, 4), what the parameters are multiplied with, NaN of a place that is not compared. right : the
+    places that are truly the query's.
+    """
+
+    building: str
+    buildings: frozenset[str]
+    in_plane: F64
+    terms: F64
+    right: frozenset[int]
+
+    def masses(self, x: F64) -> F64:
+        """(P,) by the parameters on, through, before and left."""
+        return masses_in_space(self.in_plane, self.terms @ x)[0]
+
+    def of_truth(self, x: F64) -> float:
+        """The probability of what is true."""
+        masses = self.masses(x)
+        return float(masses[min(self.right)] if self.right else max(1.0 - masses.sum(), 0.0))
+
+
+def compared_of(rows: Iterable[dict[str, Any]]) -> Iterator[Compared]:
+    """The queries whose places were compared in space, each once in a map."""
+    compared = (row for row in rows if row.get("in_space"))
+    # Two maps of one building have one name, but other evidence.
+    once = {(row["start"], row["map"], str(row["evidence"])): row for row in compared}
+    for row in once.values():
+        places = [Evidence(**told) for told in row["evidence"]]
+        terms, errors = np.full((len(places), 4), np.nan), dict(enumerate(row["errors"]))
+        for place, told in row["in_space"].items():
+            terms[int(place)], errors[int(place)] = told["terms"], told["error"]
+        yield Compared(
+            building=row["log"],
+            buildings=frozenset((row["log"], row["map"])),
+            in_plane=masses(places),
+            terms=terms,
+            right=frozenset(k for k, error in errors.items() if is_right(error)),
+        )
+
+
+def fit_in_space(queries: Sequence[Compared]) -> F64:
+    """(4,) the parameters under which the truth is likeliest."""
+    weights = balanced(np.array([bool(q.right) for q in queries]))
+
+    def loss(x: F64) -> float:
+        p = np.array([q.of_truth(x * _IN_USE) for q in queries])
+        return float(-weights @ np.log((1.0 - LAPSE) * p + LAPSE) + 0.5 * PENALTY * x @ x)
+
+    # The masses of alike places are those of the best of them, so the loss has edges.
+    return np.asarray(minimize(loss, np.ones(4), method="Nelder-Mead", options={"xatol": 0.01}).x * _IN_USE)
+
+
+def shuffled(queries: Sequence[Compared]) -> list[Compared]:
+    """The control that must fail: each place gets what the points tell for a place drawn at random."""
+    rng = np.random.default_rng(0)
+    every = np.concatenate([q.terms for q in queries])
+    every = every[np.isfinite(every).all(axis=1)]
+
+    def drawn(terms: F64) -> F64:
+        compared = np.isfinite(terms).all(axis=1, keepdims=True)
+        return np.where(compared, every[rng.integers(len(every), size=len(terms))], np.nan)
+
+    return [replace(q, terms=drawn(q.terms)) for q in queries]
+
+
+def print_in_space(queries: Sequence[Compared], name: str, masses: Iterable[F64]) -> None:
+    """Print what is located by masses (P,), rightly and wrongly, by building of the query."""
+    asked, right, wrong = Counter[str](), Counter[str](), Counter[str]()
+    for query, mass in zip(queries, masses, strict=True):
+        asked[query.building] += len(query.buildings) == 1
+        if mass.max(initial=0.0) >= Config().relocalize.accept:
+            (right if int(mass.argmax()) in query.right else wrong)[query.building] += 1
+    told = ", ".join(f"{b} {right[b]} of {asked[b]}, {wrong[b]} wrong" for b in sorted(asked))
+    totals = f"{right.total()} of {asked.total()} right, {wrong.total()} of {len(queries)} wrong"
+    print(f"{name}: {totals} ({told})")
+
+
+def print_plane(rows: Sequence[dict[str, Any]]) -> None:
+    """Fit, judge and print the numbers of the posterior in the plane."""
+    known = list(known_of(rows))
+    for buildings in {k.buildings for k in known}:
+        if len({k.first is None for k in known if not k.buildings & buildings}) < 2:
+            raise SystemExit(
+                "the fit is judged by leaving buildings out, and without"
+                f" {' and '.join(sorted(buildings))} not both kinds of queries are left: found and not"
+            )
+    in_use = np.array([k.probability(POSTERIOR) for k in known])
+    judged_by = [k.probability(p) for k, p in zip(known, left_out(known, fit), strict=True)]
+    for name, probabilities in (("in use", in_use), ("fitted without the building", np.array(judged_by))):
+        print_judged(known, name, probabilities)
+    print(fit(known))
+
+
+def print_space(rows: Sequence[dict[str, Any]]) -> None:
+    """Fit, judge and print those of its factor in space."""
+    queries = list(compared_of(rows))
+    in_space = fit_in_space(queries)
+    judged = (q.masses(x) for q, x in zip(queries, left_out(queries, fit_in_space), strict=True))
+    print_in_space(queries, "in the plane", (q.in_plane for q in queries))
+    print_in_space(queries, "in use", (q.masses(_IN_USE) for q in queries))
+    print_in_space(queries, "in use, shuffled", (q.masses(_IN_USE) for q in shuffled(queries)))
+    print_in_space(queries, "fitted", (q.masses(in_space) for q in queries))
+    print_in_space(queries, "fitted without the building", judged)
+    print("on, through, before, left:", *(f"{value:.1f}" for value in in_space))
+
+
+def main(
+    files: list[Path],
+    in_space: Annotated[bool, typer.Option("--in-space", help="its factor in space")] = False,
+) -> None:
+    """Fit, judge and print. FILES: what `queries evidence` has written."""
+    rows = [row for file in files for row in json.loads(file.read_text())]
+    (print_space if in_space else print_plane)(rows)
 
 
 if __name__ == "__main__":

@@ -8,13 +8,21 @@ queries are its later parts, registered as a user's would be. DATA holds `laser/
 
 The windows of `pc2grid compare recordings`, asked once more: what tells for each place that is found.
 
-    python -m pc2grid_lab.fit.queries DATA WORK OUT.json [--only PATTERN] [--everywhere]
+    python -m pc2grid_lab.fit.queries evidence DATA WORK OUT.json [--only PATTERN] [--everywhere]
 
 DATA is the folder of recordings, WORK the one in which `compare recordings` has kept its maps and answers.
 Each window is asked in its map and in that of another building, with --everywhere in all of these;
 where the map knows its place, also with all that it sees there made unknown ("blanked"), and standing, by its
-last scan alone. Where both have points, the likeliest places are compared in space, too. `posterior` and
-`in_space` fit the posterior to them.
+last scan alone. Where both have points, the likeliest places are compared in space, too. `posterior` is
+fitted to them.
+
+    python -m pc2grid_lab.fit.queries weights DATA WORK OUT.npz [--without BUILDING]
+
+learns the weights of the signatures. Pairs of views and of the same points of a map are of two kinds: later
+parts of a log in the map of its first part, drawn at true poses, and the windows of `compare recordings` in
+the map of another day, whose places WORK knows. Other places are those of these maps, of drawn maps
+(`maps/NAME.yaml`), and of office floors. --without leaves a building out, so that what has been learned can
+be judged there.
 """
 
 from __future__ import annotations
@@ -24,9 +32,11 @@ import json
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
 import typer
 
@@ -34,20 +44,18 @@ from pc2grid.errors import Pc2GridError
 from pc2grid.geometry import F32, F64, SE2, BoolGrid
 from pc2grid.io import open_log
 from pc2grid.io.maps import load_map
-from pc2grid.model import OCCUPIED, OccupancyGrid
+from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.observer import TimeSpan
 from pc2grid.pipeline import follow
 from pc2grid.simulate import office_floorplan
 from pc2grid.simulate.scene import covered, place_clutter
 from pc2grid.submaps.submaps import look_around, submap_centers
-from pc2grid_lab.experiments.answers import unseen_by
-from pc2grid_lab.experiments.recordings.catalogue import Catalogue, Pair
-from pc2grid_lab.experiments.recordings.judging import Judge
-from pc2grid_lab.experiments.recordings.run import Folder, config_of
-from pc2grid_lab.experiments.registered_session import RegisteredSession
-from pc2grid_lab.experiments.sensor_matrix import PlanMap
-from pc2grid_lab.experiments.truth import apart
-from pc2grid_lab.peers.site import recorded_site
+from pc2grid_lab.peers.programs import recorded_site
+from pc2grid_lab.recordings.catalogue import Catalogue, Pair
+from pc2grid_lab.recordings.judging import Judge, config_of
+from pc2grid_lab.recordings.run import Folder
+from pc2grid_lab.sensors import PlanMap, RegisteredSession
+from pc2grid_lab.truth import apart
 from signature.config import Config
 from signature.database import open_database
 from signature.localization.hypotheses import Hypothesis
@@ -56,7 +64,7 @@ from signature.localization.map_index import MapIndex
 from signature.localization.posterior import evidence_of, tail_of
 from signature.localization.query import Query, QueryInSpace, QueryMap, best_observed
 from signature.visible import PROFILE_BEARINGS, seen_signatures, viewpoints_of
-from signature.weights import Pairs
+from signature.weights import Pairs, SeenStatistics
 
 TRAVELS_M = (1.0, 3.0, 8.0)
 """Metres of travel after which a query is asked."""
@@ -67,6 +75,8 @@ _EVERY = 3
 _BESIDE_M = 0.3
 """The place of the map lies up to so far from the view along each axis: places are a metre apart."""
 _VIEW_SPACING_M = 2.0 * _BESIDE_M
+_WALL_M = 0.4
+"""What a query has seen is widened by this: the far side of a wall does not count as unseen. By hand."""
 
 
 def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
@@ -275,6 +285,20 @@ def _blanked(index: MapIndex, window: Window) -> MapIndex:
     return MapIndex(grids, index.places.table, index.made_with, Config(relocalize=index.config))
 
 
+def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:
+    """A map in which all that a query has seen, placed at a pose, is made unknown."""
+    n = math.ceil(_WALL_M / grid.resolution_m)
+    known = (query.grid.cells != UNKNOWN).astype(np.uint8)
+    known = cv2.dilate(known, np.ones((2 * n + 1, 2 * n + 1), np.uint8))
+    cells = np.argwhere(grid.cells != UNKNOWN)
+    at = query.grid.to_cell(T_map_query.inverse().apply(grid.to_point(cells)))
+    inside = np.all((at >= 0) & (at < known.shape), axis=1)
+    seen = cells[inside][known[tuple(at[inside].T)] > 0]
+    left = grid.cells.copy()
+    left[tuple(seen.T)] = UNKNOWN
+    return replace(grid, cells=left)
+
+
 @functools.cache
 def index_of(database: Path) -> MapIndex:
     """The maps of a database, which stays open: they are read when they are first used."""
@@ -285,7 +309,32 @@ def index_of(database: Path) -> MapIndex:
 Only = Annotated[str | None, typer.Option(help="of recordings, buildings or kinds of pairs, such as 'wean*'")]
 
 
-def main(
+_FIRST_FLOOR, _FLOORS = 30_010, 10
+"""Office floors that are other places, besides the maps of other buildings."""
+
+
+def in_logs(logs: Mapping[str, Drawn], config: Config) -> Iterator[Asked]:
+    """The later parts of logs in the maps of their first parts."""
+    for grid, driven in logs.values():
+        for session in driven:
+            for query, T_map_query in queries_of(session, config):
+                yield query, T_map_query, [(grid, SE2())]
+
+
+def in_maps(known: Sequence[Window], folder: Folder) -> Iterator[Asked]:
+    """Windows of recordings, each in the session of its map that shows its place."""
+    for window in known:
+        index = index_of(folder.map(window.pair.map_name))
+        session, T_map_base = next(iter(window.truth.items()))
+        grid = index.grids[index.sessions.index(session)]
+        yield window.whole, T_map_base @ window.whole.T_odom_base.inverse(), [(grid, SE2())]
+
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def evidence(
     data: Path,
     work: Path,
     out: Path,
@@ -310,5 +359,32 @@ def main(
         print(window.pair.query, "in", window.pair.map_name, f"{window.span.start_s:.1f} s", flush=True)
 
 
+@app.command()
+def weights(
+    data: Path,
+    work: Path,
+    out: Path,
+    without: Annotated[str, typer.Option(help="building that is left out")] = "",
+    logs: str = ",".join(MAPPED_S),
+    maps: str = "aces,workshop_1",
+    queries: int = 24,
+) -> None:
+    """Learn and store the statistics."""
+    config, kept = Config(), out.parent / "drives"
+    kept.mkdir(parents=True, exist_ok=True)
+    catalogue, folder = Catalogue.of(), Folder(data.resolve(), work.resolve())
+    building = {name: recording.building for name, recording in catalogue.recordings.items()}
+    drawn = {name: read(data, name, queries, kept, config) for name in logs.split(",") if name != without}
+    known = [w for w in windows(catalogue, folder) if w.covered and building[w.pair.map] != without]
+    names = [name for name in maps.split(",") if building[f"{name}.yaml"] != without]
+    floors = [load_map(data / "maps" / f"{name}.yaml") for name in names]
+    floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
+    floors += [grid for grid, _ in drawn.values()]
+    floors += [index_of(folder.map(name)).grids[0] for name in sorted({w.pair.map_name for w in known})]
+    pairs = pairs_of(chain(in_logs(drawn, config), in_maps(known, folder)), floors, config)
+    SeenStatistics.of(pairs).save(out)
+    print(f"{out}: learned from {len(pairs.queries):,} pairs and {len(pairs.other):,} other places")
+
+
 if __name__ == "__main__":
-    typer.run(main)
+    app()

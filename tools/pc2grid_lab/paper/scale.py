@@ -28,11 +28,11 @@ from pc2grid.simulate.plan import office_floorplan
 from pc2grid.submaps.submaps import partition
 from pc2grid_cli.console import Console, json_text
 from pc2grid_cli.output import make_folder, show, table
-from pc2grid_lab.compare import picture
-from pc2grid_lab.experiments.program import in_processes, once, write_text
+from pc2grid_lab.pages import picture
 from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, draw_queries
 from pc2grid_lab.paper.methods import BOUNDARY_PARTS, COLUMNS, Signatures, boundary_vector, metric
 from pc2grid_lab.paper.tables import kept_in, known_maps, read_map, rescaled, within_others
+from pc2grid_lab.runner import in_processes, once, write_text
 from signature.config import SignatureConfig
 from signature.paper import SignatureTable, score_matrix
 

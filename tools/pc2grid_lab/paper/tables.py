@@ -24,16 +24,7 @@ from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
 from pc2grid_cli.console import Console, json_text
 from pc2grid_cli.output import make_folder, show, table
-from pc2grid_lab.compare import picture
-from pc2grid_lab.experiments.program import (
-    BACK,
-    FRONT,
-    LABORATORY,
-    digest_of_sources,
-    in_processes,
-    once,
-    write_text,
-)
+from pc2grid_lab.pages import picture
 from pc2grid_lab.paper.experiment import (
     NOISE_LEVELS,
     BestMatches,
@@ -49,6 +40,15 @@ from pc2grid_lab.paper.methods import (
     OURS,
     differences,
     make_methods,
+)
+from pc2grid_lab.runner import (
+    BACK,
+    FRONT,
+    LABORATORY,
+    digest_of_sources,
+    in_processes,
+    once,
+    write_text,
 )
 
 RADII_M = (6.0, 8.0, 10.0)
@@ -235,7 +235,7 @@ _MEASURES = ("auc", "rp9", "f1", "r_at_1")
 
 def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
     """Tables I, III and IV on stdout, in the order of a reader's questions: does the method hold, how do its
-    rivals do, what beats it, and what do its parts and open choices move.
+    rivals do, what beats it, and what does each of its parts add.
     """
     maps = list(dict.fromkeys(r.task.map_name for r in results))
     counts = {r.task.map_name: r.submaps for r in results if r.task.radius_m == 8.0}

@@ -1,4 +1,9 @@
-"""Programs that match clouds: MapClosures, KISS-Matcher, and Open3D's FPFH + RANSAC; see `serving`.
+"""Programs that match clouds: MapClosures, KISS-Matcher, and Open3D's FPFH + RANSAC.
+
+    python PROGRAM.py NAME MAP_STEM ANSWERS.json QUERY_STEM...
+
+`serve` is what the processes of all programs share: they locate each query and write all answers to one file.
+This file imports nothing of pc2grid, because the environment of two of the programs does not contain it.
 
 The parameters are those that performed best in rooms and corridors; the default ones of MapClosures are made
 for streets and describe nothing here.
@@ -6,14 +11,54 @@ for streets and describe nothing here.
 
 from __future__ import annotations
 
+import json
+import math
+import sys
 from collections.abc import Callable
+from pathlib import Path
+from resource import RUSAGE_CHILDREN, RUSAGE_SELF, getrusage
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-# Run as a file, in an environment without pc2grid: the folder of this file is where imports are looked for.
-from serving import Found, Matrix, serve  # type: ignore[import-not-found]
+Matrix = NDArray[np.float64]
+Found = tuple[Matrix, float] | None
+"""T_map_base (4, 4) and a score, or None."""
+
+
+def serve(locator: Callable[[str, str], Callable[[str], Found]]) -> None:
+    """Answer the queries of the command line.
+
+    locator : what locates the queries, of the name of the program and the stem of the map. The first query is
+        located once more before: that functions are compiled does not count.
+    """
+    name, map_stem, out, *queries = sys.argv[1:]
+    locate, answers = locator(name, map_stem), []
+    for query in queries[:1]:
+        locate(query)
+    for query in queries:
+        begin_s = _cpu_s()
+        found = locate(query)
+        cpu_s = _cpu_s() - begin_s
+        T, score = (None, 0.0) if found is None else found
+        pose = None if T is None else [T[0, 3], T[1, 3], math.atan2(T[1, 0], T[0, 0])]
+        answers.append({"pose": pose, "score": score, "cpu_s": cpu_s, "peak_mb": _peak_mb()})
+    Path(out).write_text(json.dumps(answers))
+
+
+def _cpu_s() -> float:
+    """Processor time of this process, and of those that it has started and that have ended."""
+    used = map(getrusage, (RUSAGE_SELF, RUSAGE_CHILDREN))
+    return sum(one.ru_utime + one.ru_stime for one in used)
+
+
+def _peak_mb() -> float:
+    """Largest resident memory so far of this process or of one that it has started."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    own_kb = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
+    return max(own_kb, getrusage(RUSAGE_CHILDREN).ru_maxrss) / 1000.0
+
 
 Cloud = NDArray[np.floating]
 Locate = Callable[[Cloud], Found]

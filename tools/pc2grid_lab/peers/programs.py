@@ -1,9 +1,14 @@
-"""Which programs are compared, which are installed, how the others are installed, and what they answer.
+"""`pc2grid compare peers`: other programs that locate a robot, with the same maps and queries.
+
+A site is a building as all programs get it: a map of one part of a recording, and later parts as queries. The
+map is drawn at the true poses, so that the decision is measured and not mapping. The queries are registered
+as a user's would be; every program gets the registered poses as its odometry, which is better than that of
+wheels. A site is a folder: `map.yaml` and `map.png` (nav2), `map.npz` (clouds along the path, of a lidar
+only) and `queries/NN.*`: `.json` (the truth), `.pickle` (registered planar scans), `.ranges.npz` (the beams
+of a laser) or `.cloud.npz` (the points of a lidar).
 
 MapClosures and KISS-Matcher need other versions of libraries than pc2grid, so they live in a virtual
 environment of their own. Open3D and pc2grid are in this one, MRPT's particle filter is a package of Debian.
-
-What the answers are worth: right, wrong or none, each program with the threshold that is best for it.
 
 pc2grid decides by itself whether it answers. The others give an answer and a score. Their threshold is chosen
 on these very answers, which is more than a user could do: it is the one with the most right answers less the
@@ -12,26 +17,304 @@ wrong ones, in the own building and in another one. So the comparison is in favo
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import shutil
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
-from typing import Literal
+from typing import Any, Literal
 
-from pc2grid.errors import Pc2GridError
-from pc2grid.geometry import SE2
-from pc2grid.model import SensorKind
-from pc2grid_lab.experiments.recordings.page import clopper_pearson
-from pc2grid_lab.experiments.recordings.run import run
-from pc2grid_lab.experiments.truth import apart
-from pc2grid_lab.peers.particle_filter import PROGRAMS
-from pc2grid_lab.peers.site import SiteQuery
+import numpy as np
+
+from pc2grid.errors import ConfigError, LogNotFound, Pc2GridError
+from pc2grid.geometry import F32, F64, SE2, transform_points
+from pc2grid.io import Log, open_log
+from pc2grid.io.atomic import replace_file
+from pc2grid.io.building_file import is_building_file
+from pc2grid.io.maps import load_map, save_map
+from pc2grid.io.trajectory import read_tum
+from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.model import SENSOR_MODELS, RegisteredScan, Scan, SensorKind
+from pc2grid.pipeline import follow
+from pc2grid.simulate import Session, load_building, prepare_session
+from pc2grid_cli.console import Console, json_text, warn
+from pc2grid_cli.output import make_folder
+from pc2grid_lab.pages import clopper_pearson, print_cells
+from pc2grid_lab.peers.locators import PROGRAMS
+from pc2grid_lab.recordings.catalogue import drive_config
+from pc2grid_lab.recordings.judging import known_share
+from pc2grid_lab.runner import BACK, FRONT, LABORATORY, digest_of_sources, once, run, write_text
+from pc2grid_lab.sensors import MAP_SEED, register, start_on
+from pc2grid_lab.truth import JUDGEMENT, apart, is_right, nearest
+from signature.config import Config
+from signature.sessions import digest_of
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteParameters:
+    """How maps and queries are cut from recordings. All chosen by hand, before any peer was run.
+
+    mapped : share of a recording that becomes the map, unless its seconds are given.
+    query_s : a query lasts at most so long, and at most this share (`query_share`) of what is not mapped.
+    gap : seconds between map and first query, as a share of the longest query.
+    keyframe_m, keyframe_rad : a scan of the map is used if the robot has moved or turned so far; of a lidar,
+        which sees all around, after `lidar_keyframe_m`.
+    cloud_voxel_m : edge of the voxels that clouds are thinned to; each matcher thins further as it needs.
+    map_length_m : driven in a 3D scan for a map of it, as by `compare recordings`.
+    """
+
+    mapped: float = 0.55
+    query_s: float = 60.0
+    query_share: float = 0.25
+    gap: float = 1.0 / 30.0
+    keyframe_m: float = 0.15
+    lidar_keyframe_m: float = 0.5
+    keyframe_rad: float = 0.1
+    cloud_voxel_m: float = 0.1
+    map_length_m: float = 150.0
+
+
+SITE = SiteParameters()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SiteQuery:
+    """What a query is judged by.
+
+    pose : true x, y, yaw of the base in the map at the last scan. covered : the map shows what was seen
+        there. travel_m : metres driven.
+    """
+
+    pose: tuple[float, float, float]
+    covered: bool
+    travel_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Site:
+    """A prepared building. folder : where its files are."""
+
+    name: str
+    sensor: SensorKind
+    folder: Path
+
+    @property
+    def planar(self) -> bool:
+        """Whether its sensor is a 2D laser."""
+        return SENSOR_MODELS[self.sensor].planar
+
+    @property
+    def map_stem(self) -> Path:
+        """`map.yaml`, `map.png` and, of a lidar, `map.npz` without their suffixes."""
+        return self.folder / "map"
+
+    def stem(self, number: int) -> Path:
+        """The files of a query without their suffixes."""
+        return self.folder / "queries" / f"{number:02d}"
+
+    def queries(self) -> dict[int, SiteQuery]:
+        """All queries by their numbers."""
+        files = sorted((self.folder / "queries").glob("*.json"))
+        return {int(file.stem): SiteQuery(**json.loads(file.read_text())) for file in files}
+
+
+PosedScan = tuple[Scan, F64 | None]
+"""A scan with its true pose T_world_base (4, 4)."""
+
+
+def truth_file(log: Path) -> Path:
+    """The true poses beside a recording: `NAME.tum` or `NAME_corrected.tum`.
+
+    Raises LogNotFound if there is neither.
+    """
+    for file in (log.with_suffix(".tum"), log.with_name(f"{log.stem}_corrected.tum")):
+        if file.is_file():
+            return file
+    raise LogNotFound(
+        f"{log}: no true poses beside it", hint=f"put them into {log.stem}.tum, stamped as the scans"
+    )
+
+
+def recorded_site(
+    log: Path,
+    folder: Path,
+    config: Config,
+    *,
+    queries: int,
+    travel_m: float,
+    mapped_s: float | None = None,
+    of_base: bool = False,
+) -> Site:
+    """The site of a recording with true poses beside it. What exists in `folder` is not made again.
+
+    queries : how many, evenly spread over what is not mapped; fewer where it has fewer scans.
+    mapped_s : seconds from the start that become the map; None: `SiteParameters.mapped` of all.
+    of_base : the true poses are of the base, not of the sensor.
+
+    Raises ConfigError if nothing is left to locate, and what `open_log` and `read_tum` do.
+    """
+    with open_log(log, config.read) as opened:
+        end_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
+        mapped_s = mapped_s if mapped_s is not None else SITE.mapped * end_s
+        longest_s = min(SITE.query_s, SITE.query_share * (end_s - mapped_s))
+        if longest_s <= 0.0:
+            raise ConfigError(
+                f"{log}: nothing is left to locate after {mapped_s:g} s; it lasts {end_s:.1f} s",
+                hint=f"for example --mapped {log.stem}={end_s / 2:.0f}",
+            )
+        site = Site(name=log.stem, sensor=opened.choose().sensor, folder=folder)
+        truth = read_tum(truth_file(log))
+
+        def posed(start_s: float, duration_s: float) -> Iterator[PosedScan]:
+            for scan in opened.scans(start_s, duration_s):
+                (i,) = nearest(truth.stamps_ns, np.array([scan.stamp_ns]))
+                T = None if i < 0 else truth.T_session_base[i]
+                yield scan, T if T is None or of_base else T @ np.linalg.inv(scan.T_base_sensor)
+
+        _save_map(site, posed(0.0, mapped_s), config)
+        starts_s = np.linspace(mapped_s + SITE.gap * longest_s, end_s - longest_s, queries)
+        for number, start_s in enumerate(_distinct(opened, starts_s.tolist())):
+            _save_query(site, number, posed(start_s, longest_s), config, travel_m)
+    return site
+
+
+def simulated_site(
+    building_file: Path, folder: Path, config: Config, *, queries: int, travel_m: float
+) -> Site:
+    """The site of a lidar that is simulated in a real 3D scan of a building (PLY, PCD or a mesh)."""
+    building = load_building(building_file)
+    site = Site(name=building_file.stem, sensor="lidar", folder=folder)
+
+    def driven(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> Session:
+        simulation = drive_config(length_m, seed, start_m)
+        return prepare_session(sensor="lidar", grid=building, config=simulation)
+
+    def posed(session: Session) -> Iterator[PosedScan]:
+        return ((scan, truth.lift()) for scan, truth in session.scans())
+
+    mapping = driven(SITE.map_length_m, MAP_SEED)
+    _save_map(site, posed(mapping), config)
+    for k in range(queries):
+        start_m = start_on(mapping.drive, k + 1)
+        _save_query(site, k, posed(driven(travel_m + 3.0, k + 1, start_m)), config, travel_m)
+    return site
+
+
+def _distinct(log: Log, starts_s: Iterable[float]) -> list[float]:
+    """The starts, without those that begin with the same scan as an earlier one."""
+    by_scan = {next(iter(log.scans(start_s))).stamp_ns: start_s for start_s in reversed([*starts_s])}
+    return sorted(by_scan.values())
+
+
+def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
+    """Draw the grid at the true poses and, of a lidar, keep the clouds; unless there is a map."""
+    if site.map_stem.with_suffix(".yaml").exists():
+        return
+    builder = GridBuilder(config.projection)
+    path, clouds = [], []
+    for scan, T_world_base in _keyframes(site, scans):
+        ((registered, planar_scan),) = follow([scan], config)
+        builder.add(planar_scan, SE2.from_matrix(T_world_base))
+        path.append(T_world_base)
+        clouds.append(_thinned(transform_points(T_world_base, registered.scan.points_m)))
+    grid = builder.grid()
+    site.folder.mkdir(parents=True, exist_ok=True)
+    if not site.planar:
+        _write_arrays(
+            site.map_stem.with_suffix(".npz"),
+            T_map_base=np.array(path),
+            points_m=np.concatenate(clouds),
+            count=[len(c) for c in clouds],
+        )
+    save_map(grid, site.map_stem, image_format="png")  # last: it says that the map is complete
+
+
+def _keyframes(site: Site, scans: Iterable[PosedScan]) -> Iterator[tuple[Scan, F64]]:
+    """The scans with a true pose between which the robot has moved or, with a laser, turned."""
+    step_m, last = SITE.keyframe_m if site.planar else SITE.lidar_keyframe_m, None
+    for scan, T_world_base in scans:
+        if T_world_base is None:
+            continue
+        pose = SE2.from_matrix(T_world_base)
+        metres, radians = (math.inf, math.inf) if last is None else apart(last, pose)
+        if metres >= step_m or (site.planar and radians >= SITE.keyframe_rad):
+            last = pose
+            yield scan, T_world_base
+
+
+def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Config, travel_m: float) -> None:
+    """Register a query and keep what the peers need of it, unless it exists; without a true pose, nothing."""
+    stem = site.stem(number)
+    if stem.with_suffix(".json").exists():
+        return
+    stem.parent.mkdir(parents=True, exist_ok=True)
+    seen: list[RegisteredScan] = []
+    posed = ((scan, None if T is None else SE2.from_matrix(T)) for scan, T in scans)
+    session = register(posed, config, sensor=site.sensor, until_m=travel_m, see=seen.append)
+    if np.isnan(session.T_world_base[:, 0]).all():
+        return
+    truth = session.T_world_odom() @ SE2(*session.T_odom_base[-1].tolist())
+    once(stem.with_suffix(".pickle"), lambda: session)
+    if site.planar:
+        save_beams(stem.with_suffix(".ranges.npz"), [registered.scan for registered in seen])
+    else:
+        T_query_odom = np.linalg.inv(seen[-1].T_session_base)
+        cloud = [transform_points(T_query_odom @ r.T_session_base, r.scan.points_m) for r in seen]
+        _write_arrays(stem.with_suffix(".cloud.npz"), points_m=_thinned(np.concatenate(cloud)))
+    # What registration made of the scans before must not decide which queries count.
+    ((_, alone),) = follow([seen[-1].scan], config)
+    grid = load_map(site.map_stem.with_suffix(".yaml"))
+    query = SiteQuery(
+        pose=(truth.x, truth.y, truth.yaw),
+        covered=known_share(grid, truth.apply(alone.hits_m)) >= JUDGEMENT.mapped,
+        travel_m=float(session.path_m()[-1]),
+    )
+    write_text(stem.with_suffix(".json"), json.dumps(asdict(query)))  # last: the query is complete
+
+
+def save_beams(path: Path, scans: list[Scan]) -> None:
+    """Write the ranges of a 2D laser, one row a scan, for beams that are evenly spread.
+
+    `ranges_m` (N, B), infinite where nothing came back; `fov_rad` from the first beam to the last;
+    `T_base_middle` (4, 4), a frame in the sensor whose x axis is in the middle of them. The
+    bearings of the beams are found from the points that a `Scan` holds.
+    """
+    T_base_sensor = scans[0].T_base_sensor
+    T_sensor_base = np.asarray(np.linalg.inv(T_base_sensor), np.float64)
+    points_m = [transform_points(T_sensor_base, scan.points_m) for scan in scans]
+    bearings_rad = [np.arctan2(p[:, 1], p[:, 0]) for p in points_m]
+    step_rad = float(np.median(np.diff(np.sort(max(bearings_rad, key=len)))))
+    first_rad, last_rad = (f(np.concatenate(bearings_rad)) for f in (np.min, np.max))
+    beams = round((last_rad - first_rad) / step_rad) + 1
+    rows = np.full((len(scans), beams), np.inf, np.float32)
+    for row, bearing_rad, p in zip(rows, bearings_rad, points_m, strict=True):
+        row[np.rint((bearing_rad - first_rad) / step_rad).astype(int)] = np.hypot(p[:, 0], p[:, 1])
+    T_sensor_middle = SE2(0.0, 0.0, float(first_rad + last_rad) / 2.0).lift()
+    _write_arrays(
+        path,
+        ranges_m=rows,
+        fov_rad=float(last_rad - first_rad),
+        T_base_middle=T_base_sensor @ T_sensor_middle,
+    )
+
+
+def _write_arrays(path: Path, **arrays: Any) -> None:
+    with replace_file(path) as draft, draft.open("wb") as file:
+        np.savez(file, **arrays)
+
+
+def _thinned(points_m: F64) -> F32:
+    """One point for each voxel."""
+    voxels = np.floor(points_m / SITE.cloud_voxel_m).astype(np.int32)
+    _, first = np.unique(voxels, axis=0, return_index=True)
+    return points_m[np.sort(first)].astype(np.float32)
+
 
 PINS = ("map-closures==2.2.0", "kiss-matcher==1.0.2")
 """The versions that the parameters of `cloud_matchers` were chosen for."""
@@ -60,12 +343,12 @@ class PeerKind:
 
 
 PEERS = (
-    PeerKind(name="pc2grid", title="pc2grid", sensors=("laser", "lidar"), file="own.py"),
+    PeerKind(name="pc2grid", title="pc2grid", sensors=("laser", "lidar"), file="locators.py"),
     PeerKind(
         name="particle-filter",
         title="MRPT, particle filter",
         sensors=("laser",),
-        file="particle_filter.py",
+        file="locators.py",
     ),
     PeerKind(name="kiss-matcher", title="KISS-Matcher", sensors=("lidar",), apart=True),
     PeerKind(name="map-closures", title="MapClosures", sensors=("lidar",), apart=True),
@@ -88,18 +371,20 @@ def missing(kind: PeerKind) -> str | None:
     return None
 
 
-def answers(kind: PeerKind, map_stem: Path, queries: Sequence[Path], kept: Path) -> list[PeerAnswer]:
-    """What a program says to each query in a map. kept : the file of the answers; if it exists, it is read.
+def answers(kind: PeerKind, map_stem: Path, queries: Sequence[Path], kept: Path) -> list[dict[str, Any]]:
+    """Return what a program says to each query in a map: pose (x, y, yaw of the base in the map, None without
+    an answer), score (larger is surer, in a unit of its own), cpu_s (processor time from the registered query
+    to the pose), peak_mb (largest memory of the process so far, with the map and the libraries).
 
-    Raises PeerFailed.
+    kept : the file of the answers; if it exists, it is read. Raises PeerFailed.
     """
     if not kept.exists():
         paths = (path.absolute() for path in (map_stem, kept, *queries))
-        command = (kind.python, Path(__file__).with_name(kind.file), kind.name, *paths)
-        done = run(tuple(map(str, command)))
+        done = run(kind.python, Path(__file__).with_name(kind.file), kind.name, *paths)
         if not kept.exists():
             raise PeerFailed(f"{kind.name}: no answers to the queries of {queries[0].parent}: {done.error}")
-    return [PeerAnswer(**fields) for fields in json.loads(kept.read_text())]
+    found: list[dict[str, Any]] = json.loads(kept.read_text())
+    return found
 
 
 Place = Literal["covered", "uncovered", "elsewhere"]
@@ -108,28 +393,11 @@ building."""
 
 DECIDES = "pc2grid"
 """The program whose answers need no threshold."""
-RIGHT_M, RIGHT_RAD = 0.3, math.radians(5.0)
-"""The truth is another program's map, good to some centimetres. By hand."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PeerAnswer:
-    """What a program says to one query.
-
-    pose : x, y, yaw of the base in the map, None without an answer. score : how sure it is, larger is surer,
-        in a unit of its own. cpu_s : processor time from the registered query to the pose. peak_mb : largest
-        memory of the process so far, with the map and the libraries.
-    """
-
-    pose: tuple[float, float, float] | None
-    score: float
-    cpu_s: float
-    peak_mb: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PeerTrial:
-    """One answer with its truth.
+    """One judged answer, see `answers`.
 
     site : the building of the query. right : near the true pose; false without a pose and elsewhere.
     error_m : None without a pose and elsewhere.
@@ -138,54 +406,29 @@ class PeerTrial:
     peer: str
     site: str
     place: Place
-    answer: PeerAnswer
+    pose: tuple[float, float, float] | None
+    score: float
+    cpu_s: float
+    peak_mb: float
     right: bool
     error_m: float | None
 
     @staticmethod
-    def of(peer: str, site: str, map_: str, query: SiteQuery, answer: PeerAnswer) -> PeerTrial:
-        """The answer to a query, judged. map_ : the building of the map."""
+    def of(peer: str, site: str, map_: str, query: SiteQuery, answer: Mapping[str, Any]) -> PeerTrial:
+        """Judge the answer to a query. map_ : the building of the map."""
         place: Place = "elsewhere" if map_ != site else "covered" if query.covered else "uncovered"
         right, error_m = False, None
-        if answer.pose is not None and place != "elsewhere":
-            error_m, error_rad = apart(SE2(*query.pose), SE2(*answer.pose))
-            right = error_m <= RIGHT_M and error_rad <= RIGHT_RAD
-        return PeerTrial(peer=peer, site=site, place=place, answer=answer, right=right, error_m=error_m)
+        if answer["pose"] is not None and place != "elsewhere":
+            right, error_m = is_right(SE2(*answer["pose"]), SE2(*query.pose), JUDGEMENT.right_recorded_m)
+        return PeerTrial(peer=peer, site=site, place=place, right=right, error_m=error_m, **answer)
 
     def answered(self, threshold: float) -> bool:
-        """Whether there is an answer at this threshold of the score."""
-        return self.answer.pose is not None and self.answer.score >= threshold
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PeerCell:
-    """One program in the queries of one building.
-
-    threshold: of its score; null if it decides by itself, or never answers. right, wrong: of the covered
-    queries; interval: 5 and 95 % of the share that is right, null without such queries. The others are wrong
-    answers to the queries that have no right one. cpu_s, elsewhere_cpu_s: median of an answer in the own and
-    in another building's map.
-    """
-
-    peer: str
-    site: str
-    threshold: float | None
-    covered: int
-    right: int
-    wrong: int
-    interval: tuple[float, float] | None
-    uncovered: int
-    uncovered_wrong: int
-    elsewhere: int
-    elsewhere_wrong: int
-    median_error_m: float | None
-    cpu_s: float | None
-    elsewhere_cpu_s: float | None
-    peak_mb: float
+        """Return whether there is an answer at this threshold of the score."""
+        return self.pose is not None and self.score >= threshold
 
 
 def best_threshold(trials: Sequence[PeerTrial]) -> float:
-    """The threshold with the most right answers less the wrong ones; of several the highest.
+    """Return the threshold with the most right answers less the wrong ones; of several the highest.
 
     Infinite, which is never to answer, if wrong answers outnumber the right ones at every threshold.
     """
@@ -193,12 +436,20 @@ def best_threshold(trials: Sequence[PeerTrial]) -> float:
     def gain(threshold: float) -> int:
         return sum(1 if t.right else -1 for t in trials if t.answered(threshold))
 
-    scores = {t.answer.score for t in trials if t.answer.pose is not None}
+    scores = {t.score for t in trials if t.pose is not None}
     return max([math.inf, *sorted(scores, reverse=True)], key=gain)
 
 
-def counted(trials: Sequence[PeerTrial]) -> list[PeerCell]:
-    """A cell for each site and program, in the order of the trials. A program has one threshold for all."""
+Cell = dict[str, Any]
+
+
+def counted(trials: Sequence[PeerTrial]) -> list[Cell]:
+    """Return a cell for each site and program, in their order. A program has one threshold for all.
+
+    threshold: None if the program decides by itself, or never answers. right, wrong: of the covered queries;
+    interval: 5 and 95 % of the share that is right. The others are wrong answers to the queries that have no
+    right one. cpu_s, elsewhere_cpu_s: median of an answer in the own and in another building's map.
+    """
     thresholds = {
         name: -math.inf if name == DECIDES else best_threshold([t for t in trials if t.peer == name])
         for name in dict.fromkeys(t.peer for t in trials)
@@ -207,34 +458,120 @@ def counted(trials: Sequence[PeerTrial]) -> list[PeerCell]:
     return [_cell([t for t in trials if (t.site, t.peer) == pair], thresholds[pair[1]]) for pair in pairs]
 
 
-def _cell(trials: Sequence[PeerTrial], threshold: float) -> PeerCell:
+def _cell(trials: Sequence[PeerTrial], threshold: float) -> Cell:
     answered = [trial for trial in trials if trial.answered(threshold)]
     of_place = Counter(trial.place for trial in trials)
     wrong = Counter(trial.place for trial in answered if not trial.right)
-    right = [trial for trial in answered if trial.right and trial.place == "covered"]
-    covered = of_place["covered"]
-    return PeerCell(
-        peer=trials[0].peer,
-        site=trials[0].site,
-        threshold=threshold if math.isfinite(threshold) else None,
-        covered=covered,
-        right=len(right),
-        wrong=wrong["covered"],
-        interval=clopper_pearson(len(right), covered, 0.1) if covered else None,
-        uncovered=of_place["uncovered"],
-        uncovered_wrong=wrong["uncovered"],
-        elsewhere=of_place["elsewhere"],
-        elsewhere_wrong=wrong["elsewhere"],
-        median_error_m=_median([t.error_m for t in right if t.error_m is not None]),
-        cpu_s=_cpu_s(trials, elsewhere=False),
-        elsewhere_cpu_s=_cpu_s(trials, elsewhere=True),
-        peak_mb=max(t.answer.peak_mb for t in trials),
+    errors_m = [t.error_m for t in answered if t.right and t.place == "covered" and t.error_m is not None]
+    covered, right = of_place["covered"], len(errors_m)
+    return {
+        "site": trials[0].site,
+        "peer": trials[0].peer,
+        "threshold": threshold if math.isfinite(threshold) else None,
+        "covered": covered,
+        "right": right,
+        "interval": clopper_pearson(right, covered, 0.1) if covered else None,
+        "wrong": wrong["covered"],
+        "uncovered": of_place["uncovered"],
+        "uncovered_wrong": wrong["uncovered"],
+        "elsewhere": of_place["elsewhere"],
+        "elsewhere_wrong": wrong["elsewhere"],
+        "median_error_m": _median(errors_m),
+        "cpu_s": _median(t.cpu_s for t in trials if t.place != "elsewhere"),
+        "elsewhere_cpu_s": _median(t.cpu_s for t in trials if t.place == "elsewhere"),
+        "peak_mb": max(t.peak_mb for t in trials),
+    }
+
+
+def _median(values: Iterable[float]) -> float | None:
+    some = list(values)
+    return median(some) if some else None
+
+
+def compare_peers(
+    recordings: Sequence[Path],
+    out: Path,
+    terminal: Console,
+    *,
+    queries: int,
+    travel: float,
+    mapped: Sequence[str],
+    of_base: bool,
+) -> None:
+    """Ask every program that is installed, and write the table."""
+    seconds = _seconds(mapped, recordings)
+    not_installed = {kind.name: command for kind in PEERS if (command := missing(kind)) is not None}
+    for name, command in not_installed.items():
+        warn(f"{name} is not installed: {command}")
+    work = out / digest_of_sources((FRONT, BACK, LABORATORY))
+    make_folder(out)
+    sites, trials = [], []
+    with terminal.progress("prepare") as advance:
+        for recording in recordings:
+            sites.append(_site(recording, work, queries, travel, seconds.get(recording.stem), of_base))
+            advance(len(sites) / len(recordings))
+    tasks = _tasks(sites, not_installed)
+    with terminal.progress("locate") as advance:
+        for done, (kind, site, map_site) in enumerate(tasks, start=1):
+            asked = site.queries()
+            kept = work / f"{kind.name}.{site.folder.name}.in.{map_site.folder.name}.json"
+            found = answers(kind, map_site.map_stem, [site.stem(one) for one in asked], kept)
+            for query, answer in zip(asked.values(), found, strict=True):
+                trials.append(PeerTrial.of(kind.name, site.name, map_site.name, query, answer))
+            advance(done / len(tasks))
+    cells = counted(trials)
+    setting = {"queries": queries, "travel": travel, "pins": PINS, "not_installed": not_installed, **seconds}
+    document = {"setting": setting, "cells": cells, "trials": list(map(asdict, trials))}
+    write_text(out / "peers.json", json_text(document) + "\n")
+    print_cells("later parts of recordings in a map of an earlier part", 2, cells)
+    print(
+        "uncovered wrong, elsewhere wrong: answers to queries that have no right one. pc2grid decides itself;"
+        " the others have the threshold with the most right answers less wrong ones in this very table"
+    )
+    print(out / "peers.json")
+
+
+def _tasks(sites: Sequence[Site], not_installed: Mapping[str, str]) -> list[tuple[PeerKind, Site, Site]]:
+    """Return what is run: each installed program with the sites of its sensors, in two maps."""
+    tasks = []
+    for kind in PEERS:
+        for sensor in kind.sensors if kind.name not in not_installed else ():
+            of_sensor = [site for site in sites if site.sensor == sensor]
+            for k, site in enumerate(of_sensor):
+                tasks += [(kind, site, other) for other in dict.fromkeys((site, of_sensor[k - 1]))]
+    return tasks
+
+
+def _site(
+    recording: Path, work: Path, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
+) -> Site:
+    """The building of a recording, or of a 3D scan; what was prepared from the same before is used again."""
+    if not recording.exists():
+        raise LogNotFound(f"{recording}: no such file")
+    config, is_building = Config(), is_building_file(recording)
+    truth = b"" if is_building else truth_file(recording).read_bytes()
+    made_of = (digest_of(recording, config), truth, queries, travel_m, mapped_s, of_base)
+    folder = work / f"{recording.stem}.{hashlib.sha256(repr(made_of).encode()).hexdigest()[:12]}"
+    if is_building:
+        return simulated_site(recording, folder, config, queries=queries, travel_m=travel_m)
+    return recorded_site(
+        recording, folder, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s, of_base=of_base
     )
 
 
-def _cpu_s(trials: Sequence[PeerTrial], *, elsewhere: bool) -> float | None:
-    return _median([t.answer.cpu_s for t in trials if (t.place == "elsewhere") is elsewhere])
-
-
-def _median(values: Sequence[float]) -> float | None:
-    return median(values) if values else None
+def _seconds(mapped: Sequence[str], recordings: Sequence[Path]) -> dict[str, float]:
+    """The values of `--mapped`, by name. Raises ConfigError."""
+    names, seconds = [recording.stem for recording in recordings], {}
+    if len(set(names)) != len(names):
+        raise ConfigError(f"two recordings share a name: {', '.join(names)}", hint="rename one of the files")
+    for text in mapped:
+        name, _, value = text.partition("=")
+        try:
+            seconds[name] = float(value)
+        except ValueError:
+            seconds[name] = 0.0
+        if name not in names or seconds[name] <= 0.0:
+            raise ConfigError(
+                f"--mapped {text}: not seconds of one of the recordings", hint=f"for example {names[0]}=600"
+            )
+    return seconds

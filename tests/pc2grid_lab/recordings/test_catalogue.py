@@ -1,0 +1,86 @@
+"""The catalogue of real recordings names what there is."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from pc2grid_lab.recordings.catalogue import KINDS, PAIRS, RECORDINGS, Catalogue, evenly_spaced
+
+DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[4] / ".." / "shared" / "data"))
+needs_data = pytest.mark.skipif(not (DATA / "README.md").is_file(), reason="PC2GRID_DATA is not there")
+_MAPPED = (".mcap", ".bag", ".ply", ".yaml")
+
+
+@needs_data
+def test_every_recording_and_map_of_the_data_is_in_the_catalogue() -> None:
+    there = {str(file.relative_to(DATA)) for file in DATA.rglob("*") if file.suffix in _MAPPED}
+    assert there == {recording.file for recording in RECORDINGS}
+
+
+@needs_data
+def test_the_catalogue_names_only_files_that_the_data_describes() -> None:
+    named = {r.file for r in RECORDINGS} | {f for r in RECORDINGS for f in (r.truth, r.poses) if f}
+    assert all((DATA / file).is_file() for file in named)
+    text = (DATA / "README.md").read_text()
+    for file in sorted(named):
+        folder, stem = Path(file).parent.name, re.sub(r"(_corrected)?\.[a-z_0-9]+$", "", Path(file).name)
+        words = (stem, stem.rstrip("123ab"), f"`_{stem.rpartition('_')[2]}.")  # of several, only how they end
+        assert folder in text and any(word in text for word in words), file
+
+
+def test_names_are_unique_and_pairs_name_recordings() -> None:
+    names = [recording.name for recording in RECORDINGS]
+    assert len(set(names)) == len(names)
+    keys = [(pair.kind, pair.query, pair.map_name) for pair in PAIRS]
+    assert len(set(keys)) == len(keys)
+    known = {recording.name: recording for recording in RECORDINGS}
+    for pair in PAIRS:
+        buildings = {known[name].building for name in (pair.query, pair.map)}
+        assert (len(buildings) == 2) == (pair.kind == "elsewhere"), pair
+        assert (pair.until_s is not None) == (pair.kind == "later part"), pair
+        files = {known[name].file for name in (pair.query, pair.map)}
+        if pair.kind in ("later part", "same recording"):
+            assert len(files) == 1, pair
+        else:
+            assert pair.query != pair.map, pair
+    assert {pair.kind for pair in PAIRS} == set(KINDS)
+
+
+def test_the_quick_form_is_a_part_of_all() -> None:
+    whole, quick = Catalogue.of(), Catalogue.of(quick=True)
+    assert set(quick.pairs) < set(whole.pairs) and set(quick.mapped) < set(whole.mapped)
+    for pair in quick.pairs:
+        few, all_ = quick.windows(pair, 300.0), whole.windows(pair, 300.0)
+        assert set(few) < set(all_)
+    assert {pair.kind for pair in quick.pairs} == set(KINDS)
+
+
+def test_only_names_recordings_buildings_sensors_and_kinds() -> None:
+    assert [r.name for r in Catalogue.of(only="wean ?").mapped] == ["wean 1", "wean 2", "wean 3"]
+    assert {r.sensor for r in Catalogue.of(only="depth").mapped} == {"depth"}
+    assert {p.kind for p in Catalogue.of(only="elsewhere").pairs} == {"elsewhere"}
+    assert not Catalogue.of(only="nothing").mapped
+
+
+def test_windows_begin_where_commands_are_told_to() -> None:
+    catalogue = Catalogue.of()
+    starts = [w.start_s for pair in catalogue.pairs for _, w in catalogue.windows(pair, 1000.0 / 3.0)]
+    assert all(start == float(f"{start:.3f}") for start in starts)
+
+
+def test_windows_are_spread_over_the_time_left() -> None:
+    spans = evenly_spaced(600.0, 1060.0, 10, 40.0)
+    assert [span.start_s for span in spans[:2]] == pytest.approx([600.0, 600.0 + 420.0 / 9])
+    assert {span.duration_s for span in spans} == {40.0} and spans[-1].start_s == pytest.approx(1020.0)
+    assert len({span.start_s for span in evenly_spaced(100.0, 110.0, 3, 40.0)}) == 1
+
+
+def test_windows_of_a_later_part_come_after_the_map() -> None:
+    catalogue = Catalogue.of(only="later part")
+    for pair in catalogue.pairs:
+        assert pair.until_s is not None
+        assert catalogue.windows(pair, pair.until_s + 60.0)[0][1].start_s == pair.until_s

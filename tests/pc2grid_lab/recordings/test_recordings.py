@@ -1,0 +1,199 @@
+"""`pc2grid compare recordings`: a small run over recordings that are good, broken and missing."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import open3d
+import pytest
+from typer.testing import CliRunner
+
+from pc2grid.io.maps import save_map
+from pc2grid.model import OccupancyGrid
+from pc2grid.simulate import SimulationConfig, simulate_session
+from pc2grid.simulate.scene import extrude
+from pc2grid_cli.main import app
+from pc2grid_lab.recordings import catalogue, run
+from pc2grid_lab.recordings.catalogue import Drive, Pair, Recording
+from pc2grid_lab.recordings.run import Followed
+from tests.helpers.rooms import RESOLUTION_M
+from tests.helpers.simulated_drives import plan
+
+RECORDINGS = (
+    Recording(
+        name="a",
+        file="a.mcap",
+        building="office",
+        sensor="laser",
+        truth="a.tum",
+        poses="a.tum",
+        of_base=True,
+    ),
+    Recording(name="b", file="b.mcap", building="office", sensor="laser", same_place=(0, 1)),
+    Recording(
+        name="driven",
+        file="floor.obj",
+        building="office",
+        sensor="lidar",
+        drive=Drive(sensor="lidar", length_m=18.0, seed=2),
+        mapped=False,
+        poses="floor.obj",
+        of_base=True,
+    ),
+    Recording(name="hall.yaml", file="hall.yaml", building="hall", sensor="map", quick=True),
+    Recording(name="broken", file="broken.mcap", building="office", sensor="laser"),
+    Recording(name="gone", file="gone.mcap", building="office", sensor="laser"),
+)
+PAIRS = (
+    Pair(query="a", map="a", kind="later part", window_s=12.0, windows=2, until_s=70.0),
+    Pair(query="b", map="a", kind="other day", window_s=12.0, windows=4),
+    Pair(query="a", map="broken", kind="other day", window_s=8.0, windows=1),
+    Pair(query="broken", map="a", kind="other day", window_s=8.0, windows=1),
+    Pair(query="a", map="gone", kind="other day", window_s=8.0, windows=1),
+    Pair(query="driven", map="a", kind="other sensor", window_s=6.0, windows=4, within_s=(0.0, 32.0)),
+    Pair(query="b", map="hall.yaml", kind="elsewhere", window_s=8.0, windows=1, quick=True),
+)
+
+
+def rooms() -> OccupancyGrid:
+    """14 x 9 m: three rooms at a corridor, no two alike, that a drive of 40 m sees all of."""
+    inner = [(0, 5, 2, 5), (3, 5, 8, 5), (9, 5, 14, 5), (4, 5, 4, 9), (10, 5, 10, 9)]
+    things = [(6, 7, 7, 7), (7, 7, 7, 8), (1, 2, 1, 3), (5, 1.5, 7, 1.5), (11, 2, 12, 3.5), (12, 7, 13, 7)]
+    return plan(14.0, 9.0, [*inner, *things])
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two drives of a laser through an office; its 3D scan; no recording; the map of another building."""
+    folder = tmp_path_factory.mktemp("data")
+    for name, seed, length_m in (("a", 3, 40.0), ("b", 5, 30.0)):
+        slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": length_m, "seed": seed, "clutter": 0}
+        config = SimulationConfig.model_validate(slow)
+        simulate_session(folder / f"{name}.mcap", sensor="laser", grid=rooms(), config=config)
+    walls = extrude(rooms(), 2.2)
+    mesh = open3d.geometry.TriangleMesh(
+        open3d.utility.Vector3dVector(walls.vertices_m.astype(float)),
+        open3d.utility.Vector3iVector(walls.triangles.astype(np.int32)),
+    )
+    open3d.io.write_triangle_mesh(str(folder / "floor.obj"), mesh)
+    (folder / "broken.mcap").write_bytes(b"no recording")
+    save_map(plan(12.0, 9.0, [(0, 4, 7, 4), (7, 6, 7, 9), (3, 6, 3, 9)]), folder / "hall")
+    return folder
+
+
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(catalogue, "RECORDINGS", RECORDINGS)
+    monkeypatch.setattr(catalogue, "PAIRS", PAIRS)
+    followed = (Followed(before="b", map="a"), Followed(before="b", map="a", after="b"))
+    monkeypatch.setattr(run, "FOLLOWED", followed)
+
+
+def compare(data: Path, out: Path, *options: str) -> Any:
+    arguments = ["compare", "recordings", str(data), "--out", str(out), *options]
+    done = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert done.exit_code == 0, done.output
+    return done
+
+
+@pytest.mark.nightly  # the tests below run parts of it
+@pytest.mark.usefixtures("small")
+def test_a_small_run(data: Path, tmp_path: Path) -> None:
+    first = compare(data, tmp_path)
+    document = json.loads((tmp_path / "real.json").read_text())
+    maps = {row["name"]: row for row in document["maps"]}
+    assert maps["a"]["error_m"] < RESOLUTION_M and maps["a"]["compared"] > 0.99 and maps["a"]["parts"] == 1
+    assert maps["a"]["cpu_s"] > 0.5 and 35 < maps["a"]["metres"] < 45
+    assert maps["hall.yaml"]["truth"] == "none" and maps["hall.yaml"]["error_m"] is None
+    # The robot starts between its first two scans, so that they are not quite at one place.
+    assert maps["b"]["truth"] == "loops" and 0.0 < maps["b"]["error_m"] < 0.15 and "driven" not in maps
+    assert "broken.mcap" in maps["broken"]["problem"]
+    assert maps["gone"]["problem"] == "not in the data folder"
+    later, other, no_map, no_query, missing, driven, elsewhere = document["pairs"]
+    assert later["truth"] == "poses"
+    found = [q for q in later["queries"] if q["status"] == "located"]
+    assert found and all(q["right"] and q["error_m"] < 3 * RESOLUTION_M for q in found)
+    assert other["truth"] == "agreement" and other["agreeing"] >= 3
+    found = [q for q in other["queries"] if q["status"] == "located"]
+    assert len(found) >= 3 and all(
+        q["covered"] and q["rank"] == 0 and q["error_m"] < 3 * RESOLUTION_M for q in found
+    )
+    assert "no map" in no_map["problem"] and no_query["problem"]
+    assert missing["problem"] == "gone.mcap: not in the data folder"
+    assert driven["sensors"] == "driven lidar in laser" and driven["agreeing"] >= 3
+    assert [q["start_s"] for q in driven["queries"]] == [0.0, 8.667, 17.333, 26.0]
+    assert all(q["right"] for q in driven["queries"])
+    (drive,) = (tmp_path / "drives").glob("*.mcap")
+    made_ns = drive.stat().st_mtime_ns
+    assert [q["status"] for q in elsewhere["queries"]] == ["not_found"]
+    free, carried = document["followed"]
+    assert free["judged"] == free["located"] > 10 and free["wrong"] == free["alarms"] == 0
+    assert free["noticed_s"] is None and carried["knew"] and carried["shown"]
+    assert 0.0 <= carried["noticed_s"] <= carried["again_s"] < 15.0 and carried["again_m"] < 6.0
+    assert carried["wrong"] == carried["alarms"] == 0
+    assert "nothing to compare with" in first.stdout
+
+    page = (tmp_path / "real.md").read_text()
+    words = " ".join(page.split())
+    assert "| a | office | laser |" in page and "broken.mcap" in page and "No answer is wrong." in page
+    assert "| a | b | b |" in page and "Of 1 kidnaps of a robot that knew where it was, 1 are" in words
+    kept = json.loads((tmp_path / "real.json").read_text())
+
+    # The answers are there: the next run computes nothing, and tells what the table had otherwise.
+    kept["maps"][0] |= {"error_m": 0.9, "parts": 0}
+    for query in kept["pairs"][1]["queries"]:
+        query["error_m"], query["right"] = 9.0, False
+    (tmp_path / "before.json").write_text(json.dumps(kept))
+    again = compare(data, tmp_path, "--table", str(tmp_path / "before.json"))
+    assert "- a: error 0.900 ->" in again.stdout and "- **worse** a: parts 0 -> 1" in again.stdout
+    assert "- b in a: right 0 ->" in again.stdout
+    assert json.loads((tmp_path / "before.json").read_text())["maps"] == document["maps"]
+    assert "Changed since the run before" in (tmp_path / "before.md").read_text()
+    assert drive.stat().st_mtime_ns == made_ns
+
+
+@pytest.mark.usefixtures("small")
+def test_ones_own_recordings_need_no_catalogue(data: Path, tmp_path: Path) -> None:
+    """Later parts of a drive are located in the map of its beginning, and judged by the poses beside it."""
+    own = tmp_path / "own"
+    own.mkdir()
+    for suffix in (".mcap", ".tum"):
+        shutil.copy(data / f"b{suffix}", own / f"mine{suffix}")
+    (own / "torn.mcap").write_bytes(b"no recording")
+    compare(own, tmp_path / "out", "--of-base")
+    document = json.loads((tmp_path / "out" / "real.json").read_text())
+    mine, torn = document["maps"]
+    assert (mine["name"], mine["building"], mine["truth"]) == ("mine.mcap", "own", "poses")
+    assert mine["error_m"] < RESOLUTION_M and "torn.mcap" in torn["problem"]
+    (later,) = document["pairs"]
+    assert (later["kind"], later["truth"]) == ("later part", "poses") and len(later["queries"]) == 4
+    assert any(query["right"] and query["status"] == "located" for query in later["queries"])
+    assert all(query["right"] for query in later["queries"] if query["status"] == "located")
+    (tmp_path / "empty").mkdir()
+    done = CliRunner().invoke(app, ["compare", "recordings", str(tmp_path / "empty")])
+    assert "holds no recording" in str(done.exception)
+
+
+@pytest.mark.usefixtures("small")
+def test_a_part_of_a_run_replaces_no_table(data: Path, tmp_path: Path) -> None:
+    done = compare(data, tmp_path, "--quick", "--page")
+    assert "| hall.yaml | hall | map |" in done.stdout and "| a | office |" not in done.stdout
+    assert "The quick form" in done.stdout and "there is no" in done.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["work"]
+
+
+@pytest.mark.usefixtures("small")
+def test_what_cannot_be_run_is_refused(data: Path, tmp_path: Path) -> None:
+    def refused(*arguments: str) -> str:
+        done = CliRunner().invoke(app, ["compare", "recordings", *arguments])
+        assert done.exit_code != 0
+        return str(done.exception)
+
+    assert "no such folder" in refused(str(tmp_path / "nowhere"))
+    assert "--only moon: no recording" in refused(str(data), "--out", str(tmp_path), "--only", "moon")
+    (tmp_path / "real.json").write_text("{}")
+    assert "not a table" in refused(str(data), "--out", str(tmp_path), "--only", "gone")

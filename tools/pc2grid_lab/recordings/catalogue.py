@@ -1,0 +1,655 @@
+"""Which real recordings are mapped, and which are located in which maps.
+
+The files are those of the data folder that the README there describes. A row here is all that is known of a
+recording: another recording is another row, and no other file changes.
+
+Recordings of a folder that the catalogue does not name: one's own, with true poses beside them.
+
+Later parts of each are located in the map of its beginning, and parts of each in the maps of the others.
+
+Recordings that are made: simulated drives through the real 3D scan of a building, with their true poses.
+
+Nobody has recorded one building with a lidar, a depth camera and a laser. A scan of its walls and furniture
+lets the first two be driven through it; a laser has recorded it in another year.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatch
+from functools import cache
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+
+from pc2grid import simulate
+from pc2grid.errors import ConfigError, MapFileError, Pc2GridError
+from pc2grid.io import open_log
+from pc2grid.model import SensorKind
+from pc2grid.observer import TimeSpan
+from pc2grid.simulate import Building, SimulationConfig, load_building, simulate_session
+from pc2grid_lab.runner import digest_of_sources
+
+Kind = Literal[
+    "later part", "fewer scans", "same recording", "other day", "other sensor", "published map", "elsewhere"
+]
+"""How the query of a pair differs from what its map was made from. "same recording": all of it is the map,
+and the query may lack odometry. "elsewhere": it is of another building."""
+KINDS: tuple[Kind, ...] = get_args(Kind)
+
+Source = Literal["lidar", "depth", "laser", "map", "unknown"]
+"""What a recording is of; "map": it is a map or a 3D scan; "unknown": it cannot be read."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drive:
+    """A simulated drive through the real 3D scan of a building. seed : of its way and of its obstacles."""
+
+    sensor: SensorKind
+    length_m: float
+    seed: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Recording:
+    """A recording, or a map, as one run of `pc2grid convert` takes it.
+
+    file : below the data folder. building : recordings of one building are one group of the statistics.
+    drive : what is recorded in the 3D scan `file`; None: the file is the recording.
+    options : of `convert` and of `relocalize`. every : only every nth of
+        its scans is used. mapped : whether all of it becomes a map, which is a row of the page.
+    truth : what its trajectory is compared with, relations or poses; None: there is none.
+    same_place : numbers of scans between which the sensor came back to where it was.
+    poses : true poses that place its windows, in one frame for all recordings that name the same `poses`.
+        Both of a drive are what the simulation knows, in the frame of the scan.
+    late_s : by how much its stamps are later than those of the true poses: some drivers stamp a scan at its
+        end.
+    of_base : whether these are poses of the base, not of the sensor.
+    quick : whether it belongs to the quick form.
+    """
+
+    name: str
+    file: str
+    building: str
+    sensor: Source
+    drive: Drive | None = None
+    options: tuple[str, ...] = ()
+    every: int = 1
+    mapped: bool = True
+    truth: str | None = None
+    same_place: tuple[int, ...] = ()
+    poses: str | None = None
+    late_s: float = 0.0
+    of_base: bool = False
+    quick: bool = False
+
+    @property
+    def sensor_shown(self) -> str:
+        """The sensor as the page names it."""
+        return self.sensor if self.drive is None else f"driven {self.sensor}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlacedByHand:
+    """Where the base of a recording is in a map, if neither true poses nor answers that agree tell it. It was
+    found by hand, once: the recording's own map was laid over the other one.
+
+    at_s : seconds after its first scan. x_m, y_m, yaw_deg : in the map. within_m : how far off a right answer
+        may be there, as the map is drawn no better.
+    """
+
+    at_s: float
+    x_m: float
+    y_m: float
+    yaw_deg: float
+    within_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pair:
+    """Windows of one recording that are located in the map of another, or of its own beginning.
+
+    query, map : names of recordings. until_s : only so many seconds of `map` become the map; None: all of it.
+    window_s : length of a window. windows : how many, evenly spread over the recording, in the map of its own
+        beginning over what comes after it. within_s : seconds of the recording over which they are spread.
+    by_hand : judges the answers, by the recording's own trajectory from there.
+    """
+
+    query: str
+    map: str
+    kind: Kind
+    window_s: float
+    windows: int
+    until_s: float | None = None
+    within_s: tuple[float, float] | None = None
+    by_hand: PlacedByHand | None = None
+    quick: bool = False
+
+    @property
+    def map_name(self) -> str:
+        """The map, with the part of the recording that it is made from."""
+        return self.map if self.until_s is None else f"{self.map} 0..{self.until_s:g} s"
+
+
+def _laser(name: str, building: str, *, file: str | None = None, **known: object) -> Recording:
+    path = file or f"laser/{name}.mcap"
+    return Recording(name=name, file=path, building=building, sensor="laser", **known)  # type: ignore[arg-type]
+
+
+def _map(name: str, file: str, building: str, *, quick: bool = False) -> Recording:
+    return Recording(name=name, file=file, building=building, sensor="map", quick=quick)
+
+
+def _corrected(name: str, building: str, *, relations: bool = True, quick: bool = False) -> Recording:
+    """A log of the SLAM benchmark, with gmapping's poses of its laser."""
+    poses = f"laser/{name}_corrected.tum"
+    return _laser(
+        name, building, truth=f"laser/{name}.relations" if relations else poses, poses=poses, quick=quick
+    )
+
+
+def _sparse(name: str) -> Recording:
+    poses = f"laser/sparse/{name}.tum"
+    return _laser(name, name, file=f"laser/sparse/{name}.mcap", truth=poses, poses=poses)
+
+
+def _jarvis(lasers: str, *, late_s: float = 0.0, quick: bool = False) -> Recording:
+    poses = "laser/jarvis/circular_path_fast.tum"
+    return _laser(
+        f"jarvis {lasers}",
+        "jarvis",
+        file="laser/jarvis/circular_path_fast.mcap",
+        options=("--topic", f"/{lasers}_scan"),
+        truth=poses,
+        poses=poses,
+        late_s=late_s,
+        of_base=True,
+        quick=quick,
+    )
+
+
+def _phone(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
+    poses = f"depth/room/{name}.tum"
+    return Recording(
+        name=name + ("" if odometry else " without odometry"),
+        file=f"depth/room/{name}.mcap",
+        building="room",
+        sensor="depth",
+        options=() if odometry else ("--odometry", "none"),
+        truth=poses,
+        poses=poses,
+        of_base=True,
+        quick=quick,
+    )
+
+
+def _kidnap(name: str, file: str, *, quick: bool = False) -> Recording:
+    return _laser(name, "kidnap", file=f"laser/kidnap/{file}", quick=quick)
+
+
+def _kitchen(name: str) -> Recording:
+    return Recording(
+        name=name,
+        file="depth/kitchen.mcap",
+        building="kitchen",
+        sensor="depth",
+        truth="depth/kitchen.tum",
+        poses="depth/kitchen.tum",
+    )
+
+
+def _corridor(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
+    poses = "depth/corridor_phone/corridor.tum"
+    return Recording(
+        name=name,
+        file="depth/corridor_phone/corridor.mcap",
+        building="corridor",
+        sensor="depth",
+        options=() if odometry else ("--odometry", "none"),
+        truth=poses,
+        poses=poses,
+        of_base=True,
+        quick=quick,
+    )
+
+
+def _small_room(name: str, file: str) -> Recording:
+    return _laser(name, "small room", file=f"laser/small_room/{file}", same_place=(0, 326, 649))
+
+
+_SCAN = "lidar/fr079_floor.ply"
+
+
+def _driven(name: str, sensor: SensorKind, length_m: float, seed: int, *, mapped: bool = True) -> Recording:
+    """A drive through the 3D scan of fr079's floor."""
+    return Recording(
+        name=name,
+        file=_SCAN,
+        building="fr079",
+        sensor=sensor,
+        drive=Drive(sensor=sensor, length_m=length_m, seed=seed),
+        mapped=mapped,
+        truth=_SCAN,
+        poses=_SCAN,
+        of_base=True,
+    )
+
+
+def _hall(every: int, name: str, *, quick: bool = False) -> Recording:
+    return Recording(
+        name=name,
+        file="lidar/hall.mcap",
+        building="hall",
+        sensor="lidar",
+        every=every,
+        truth="lidar/hall.tum",
+        poses="lidar/hall.tum",
+        quick=quick,
+    )
+
+
+def _with_control(recording: Recording) -> tuple[Recording, Recording]:
+    """A recording whose scans are far apart, and the same without KISS-ICP, which must do worse."""
+    without = ("--set", "registration.icp=none")
+    name = f"{recording.name}, without KISS-ICP"
+    return recording, replace(recording, name=name, options=recording.options + without, quick=False)
+
+
+_E1R = Recording(
+    name="e1r_office_a",
+    file="lidar/e1r_office_a.mcap",
+    building="e1r office",
+    sensor="lidar",
+    truth="lidar/e1r_office_a.tum",
+    poses="lidar/e1r_office_a.tum",
+)
+
+RECORDINGS: tuple[Recording, ...] = (
+    _hall(1, "hall", quick=True),
+    *_with_control(_hall(2, "hall, every 2nd scan", quick=True)),
+    *_with_control(_hall(3, "hall, every 3rd scan", quick=True)),
+    _E1R,
+    *_with_control(replace(_E1R, name="e1r_office_a, every 4th scan", every=4)),
+    _phone("room_a"),
+    _phone("room_a", odometry=False),
+    _phone("room_b", quick=True),
+    _phone("room_b", odometry=False, quick=True),
+    _kitchen("kitchen"),
+    _corridor("corridor", quick=True),
+    _corridor("corridor without odometry", odometry=False),
+    _corrected("fr079", "fr079"),
+    _corrected("intel", "intel"),
+    _corrected("csail", "csail", quick=True),
+    _corrected("killian", "killian", relations=False),
+    _laser(
+        "csail without odometry",
+        "csail",
+        file="laser/csail.mcap",
+        options=("--odometry", "none"),
+        truth="laser/csail.relations",
+        poses="laser/csail_corrected.tum",
+    ),
+    _laser("aces", "aces", file="laser/aces_ros1.bag"),
+    _sparse("acapulco"),
+    _sparse("belgioioso"),
+    _sparse("orebro"),
+    _laser("workshop_1", "workshop", file="laser/workshop/workshop_1.mcap"),
+    _laser("workshop_1_changed", "workshop", file="laser/workshop/workshop_1_changed.mcap"),
+    _laser("wean 1", "wean", file="laser/wean/robotdata1.mcap", quick=True),
+    _laser("wean 2", "wean", file="laser/wean/robotdata2.mcap"),
+    _laser("wean 3", "wean", file="laser/wean/robotdata3.mcap"),
+    _kidnap("kidnap dec13 before", "dec13_before.mcap", quick=True),
+    _kidnap("kidnap dec13 after", "dec13_after.mcap", quick=True),
+    _kidnap("kidnap dec14 before", "dec14_before.mcap"),
+    _kidnap("kidnap may9 before", "may9_before.mcap"),
+    _kidnap("kidnap may9 after", "may9_after.mcap"),
+    _laser("hallway", "hallway", file="laser/hallway/hallway.mcap"),
+    _laser("hallway2", "hallway", file="laser/hallway/hallway2.mcap"),
+    _small_room("small room", "indoor_small_01.mcap"),
+    _small_room("small room, 360 bins", "indoor_small_01_360.mcap"),
+    _laser("birmingham", "birmingham", file="laser/birmingham/lgfloor2.mcap"),
+    # One turn takes 0.125 s. Its headings fit the true ones best 0.12 s before its stamps.
+    _jarvis("nav", late_s=0.12, quick=True),
+    _jarvis("safety", quick=True),
+    _driven("fr079 lidar", "lidar", 150.0, 1000),
+    _driven("fr079 depth", "depth", 150.0, 1000),
+    _driven("fr079 lidar again", "lidar", 70.0, 1, mapped=False),
+    _driven("fr079 depth again", "depth", 70.0, 1, mapped=False),
+    _map("fr079_floor.ply", _SCAN, "fr079"),
+    _map("fr079.yaml", "maps/fr079.yaml", "fr079"),
+    _map("intel.yaml", "maps/intel.yaml", "intel"),
+    _map("csail.yaml", "maps/csail.yaml", "csail"),
+    _map("aces.yaml", "maps/aces.yaml", "aces"),
+    _map("killian.yaml", "maps/killian.yaml", "killian"),
+    _map("workshop_1.yaml", "maps/workshop_1.yaml", "workshop", quick=True),
+    _map("wean.yaml", "laser/wean/wean.yaml", "wean", quick=True),
+    _map("lgfloor.yaml", "laser/birmingham/lgfloor.yaml", "birmingham"),
+)
+"""Everything that becomes a map or is asked in one, in the order of the page."""
+
+
+def _later(name: str, until_s: float, window_s: float, windows: int, *, quick: bool = False) -> Pair:
+    return replace(_pair("later part", name, name, window_s, windows, quick=quick), until_s=until_s)
+
+
+def _pair(kind: Kind, query: str, map_: str, window_s: float, windows: int, *, quick: bool = False) -> Pair:
+    return Pair(query=query, map=map_, kind=kind, window_s=window_s, windows=windows, quick=quick)
+
+
+def _across(query: str, map_: str) -> Pair:
+    """Another sensor on fr079's floor. The log is asked every 50 s, 7 m in the median."""
+    if query == "fr079":
+        return replace(_pair("other sensor", query, map_, 40.0, 21), within_s=(0.0, 1040.0))
+    return _pair("other sensor", query, map_, 14.0, 10)
+
+
+def _in_corridor(query: str, *, quick: bool = False) -> Pair:
+    """Every 8 s in the map of the same walk, made with odometry."""
+    within_s = (4.0, 68.0)
+    return replace(_pair("same recording", query, "corridor", 8.0, 8, quick=quick), within_s=within_s)
+
+
+def _under_nav(query: str, window_s: float) -> Pair:
+    """A laser whose height is not known, or is that of a robot, in the map of another building's at 2.0 m."""
+    return _pair("elsewhere", query, "jarvis nav", window_s, 4)
+
+
+def _in_wean_yaml(query: str, by_hand: PlacedByHand, *, quick: bool = False) -> Pair:
+    """In a drawn map in which no three answers agree."""
+    return replace(_pair("published map", query, "wean.yaml", 20.0, 8, quick=quick), by_hand=by_hand)
+
+
+PAIRS: tuple[Pair, ...] = (
+    # Windows of 3 to 8 m of travel, or 20 s where the robot hardly moves.
+    _later("hall", 10.0, 4.0, 4),
+    _pair("fewer scans", "hall, every 2nd scan", "hall", 6.0, 6, quick=True),
+    _pair("fewer scans", "hall, every 3rd scan", "hall", 9.0, 4),
+    _later("e1r_office_a", 10.0, 4.0, 4),
+    _later("kitchen", 4.0, 2.0, 3),
+    _later("fr079", 600.0, 20.0, 10),
+    _later("intel", 900.0, 25.0, 10),
+    _later("csail", 250.0, 6.0, 10, quick=True),
+    _later("killian", 900.0, 8.0, 10),
+    _later("aces", 700.0, 15.0, 10),
+    _in_corridor("corridor", quick=True),
+    _in_corridor("corridor without odometry"),
+    _pair("other day", "wean 1", "wean 2", 20.0, 8),
+    _pair("other day", "wean 3", "wean 2", 20.0, 8),
+    _pair("other day", "wean 2", "wean 1", 20.0, 8, quick=True),
+    _pair("other day", "kidnap dec13 after", "kidnap dec13 before", 10.0, 8, quick=True),
+    _pair("other day", "kidnap may9 after", "kidnap may9 before", 10.0, 8),
+    _pair("other day", "kidnap may9 before", "kidnap dec13 before", 10.0, 8),
+    _pair("other day", "kidnap dec14 before", "kidnap dec13 before", 10.0, 6),
+    _pair("other day", "kidnap dec13 before", "kidnap may9 before", 10.0, 8),
+    _pair("other day", "workshop_1_changed", "workshop_1", 4.0, 8),
+    _pair("other day", "hallway", "hallway2", 8.0, 8),
+    _pair("other day", "hallway2", "hallway", 6.0, 6),
+    _pair("other day", "room_b", "room_a", 5.0, 4, quick=True),
+    _pair("other day", "room_a", "room_b", 5.0, 8),
+    _pair("other sensor", "jarvis safety", "jarvis nav", 6.0, 6, quick=True),
+    _pair("other sensor", "jarvis nav", "jarvis safety", 6.0, 6, quick=True),
+    # Lidar and depth camera are driven through the real 3D scan of the floor; the laser and its log are real.
+    _across("fr079", "fr079 lidar"),
+    _across("fr079", "fr079 depth"),
+    _across("fr079", "fr079_floor.ply"),
+    _across("fr079 lidar again", "fr079"),
+    _across("fr079 lidar again", "fr079 depth"),
+    _across("fr079 lidar again", "fr079_floor.ply"),
+    _across("fr079 depth again", "fr079"),
+    _across("fr079 depth again", "fr079 lidar"),
+    _across("fr079 depth again", "fr079_floor.ply"),
+    # Along the hall, from a room's door to the end, wean.yaml is some 0.8 m longer than both drives.
+    _in_wean_yaml(
+        "wean 1", PlacedByHand(at_s=30.0, x_m=46.4, y_m=9.2, yaw_deg=-3.6, within_m=1.0), quick=True
+    ),
+    _in_wean_yaml("wean 3", PlacedByHand(at_s=30.0, x_m=43.5, y_m=9.4, yaw_deg=-3.8, within_m=1.0)),
+    _pair("published map", "birmingham", "lgfloor.yaml", 15.0, 10),
+    _pair("published map", "workshop_1", "workshop_1.yaml", 3.0, 10, quick=True),
+    _pair("published map", "workshop_1_changed", "workshop_1.yaml", 3.0, 10),
+    _pair("published map", "fr079", "fr079.yaml", 20.0, 8),
+    _pair("published map", "intel", "intel.yaml", 25.0, 8),
+    _pair("published map", "csail", "csail.yaml", 6.0, 8),
+    _pair("published map", "killian", "killian.yaml", 8.0, 6),
+    _pair("published map", "aces", "aces.yaml", 15.0, 8),
+    _pair("elsewhere", "csail", "fr079", 10.0, 4),
+    _pair("elsewhere", "fr079", "intel", 20.0, 4),
+    _pair("elsewhere", "intel", "aces", 25.0, 4),
+    _pair("elsewhere", "wean 2", "kidnap dec13 before", 20.0, 4, quick=True),
+    _pair("elsewhere", "kidnap dec13 before", "wean 2", 10.0, 4),
+    _pair("elsewhere", "birmingham", "wean 2", 15.0, 4),
+    _pair("elsewhere", "hall", "fr079", 6.0, 2),
+    _pair("elsewhere", "room_b", "kitchen", 5.0, 2),
+    _pair("elsewhere", "room_a", "hall", 5.0, 8),
+    _pair("elsewhere", "e1r_office_a", "room_b", 4.0, 4),
+    _pair("elsewhere", "jarvis nav", "room_a", 6.0, 2),
+    _under_nav("fr079", 20.0),
+    _under_nav("intel", 25.0),
+    _under_nav("csail", 6.0),
+    _under_nav("killian", 8.0),
+    _under_nav("aces", 15.0),
+    _under_nav("acapulco", 15.0),
+    _under_nav("belgioioso", 15.0),
+    _under_nav("orebro", 15.0),
+    _under_nav("workshop_1", 4.0),
+    _under_nav("wean 2", 20.0),
+    _under_nav("kidnap dec13 before", 10.0),
+    _under_nav("kidnap may9 before", 10.0),
+    _under_nav("hallway", 8.0),
+    _under_nav("small room, 360 bins", 10.0),
+    _under_nav("birmingham", 15.0),
+)
+"""All pairs, in the order of the page."""
+
+
+def evenly_spaced(first_s: float, last_s: float, count: int, duration_s: float) -> tuple[TimeSpan, ...]:
+    """`count` parts of `duration_s`, evenly distributed over the time from `first_s` to `last_s`."""
+    starts_s = np.linspace(first_s, max(last_s - duration_s, first_s), count)
+    return tuple(TimeSpan(float(start_s), duration_s) for start_s in starts_s)
+
+
+_QUICK_EVERY = 2
+"""The quick form asks for every second window."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Catalogue:
+    """The recordings and pairs of one run.
+
+    recordings : by name, in the order of the page. mapped : those whose map is a row of the page; the others
+        are only needed for pairs. pairs : in the order of the page. quick : of each pair every second window.
+    """
+
+    recordings: dict[str, Recording]
+    mapped: tuple[Recording, ...]
+    pairs: tuple[Pair, ...]
+    quick: bool = False
+
+    @staticmethod
+    def in_folder(data: Path) -> tuple[tuple[Recording, ...], tuple[Pair, ...]]:
+        """The recordings and pairs of this file, if the folder has one of the recordings; else nothing."""
+        if any((data / recording.file).exists() for recording in RECORDINGS):
+            return RECORDINGS, PAIRS
+        return (), ()
+
+    @staticmethod
+    def of(
+        recordings: Sequence[Recording] | None = None,
+        pairs: Sequence[Pair] | None = None,
+        *,
+        only: str | None = None,
+        quick: bool = False,
+    ) -> Catalogue:
+        """What the quick form holds, or all; of it what `only` names.
+
+        recordings, pairs : of which; None: those of this file. only : a pattern of the shell for names of
+            recordings, buildings or kinds of pairs.
+        """
+        recordings = RECORDINGS if recordings is None else recordings
+        pairs = PAIRS if pairs is None else pairs
+
+        def wanted(*names: str) -> bool:
+            return only is None or any(fnmatch(name, only) for name in names)
+
+        known = {recording.name: recording for recording in recordings}
+        return Catalogue(
+            recordings=known,
+            mapped=tuple(
+                r
+                for r in recordings
+                if r.mapped and (r.quick or not quick) and wanted(r.name, r.building, r.sensor)
+            ),
+            pairs=tuple(
+                p
+                for p in pairs
+                if (p.quick or not quick)
+                and wanted(p.query, p.map, p.kind, known[p.query].building, known[p.map].building)
+            ),
+            quick=quick,
+        )
+
+    def windows(self, pair: Pair, length_s: float) -> list[tuple[int, TimeSpan]]:
+        """The windows of a pair with their numbers, in a recording of `length_s`.
+
+        They begin at whole milliseconds, as commands are told: else the last scan might be another one.
+        """
+        first_s, last_s = pair.within_s or (0.0, length_s)
+        if pair.map == pair.query and pair.until_s is not None:
+            first_s = pair.until_s
+        spans = evenly_spaced(first_s, last_s, pair.windows, pair.window_s)
+        numbered = [(k, replace(span, start_s=round(span.start_s, 3))) for k, span in enumerate(spans)]
+        return numbered[:: _QUICK_EVERY if self.quick else 1]
+
+
+_SUFFIXES = (".mcap", ".bag", ".db3")
+_MAPPED_S, _WINDOW_S, _WINDOWS = 600.0, 20.0, 10
+"""The beginning, and windows: at most so long, and so many. As in the catalogue."""
+
+
+def own_recordings(data: Path, *, without: Path, of_base: bool) -> tuple[list[Recording], list[Pair]]:
+    """Return the recordings of a folder that the catalogue does not name, and which are asked in which maps.
+
+    Each is asked in the map of its own beginning, and in those of the others beside it: Tuesday in Monday's.
+
+    without : a folder that is left out. of_base : whether the poses in `NAME.tum` are of the base, not of the
+        sensor. Raises ConfigError if the folder is not there.
+    """
+    if not data.is_dir():
+        raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
+    named = {recording.file for recording in RECORDINGS}
+    lengths_s: dict[Recording, float | None] = {}
+    for file in _recordings(data, without.resolve()):
+        if file.relative_to(data).as_posix() not in named:
+            recording, length_s = _row(data, file, of_base)
+            lengths_s[recording] = length_s
+    pairs = []
+    for query, length_s in lengths_s.items():
+        if length_s is None:
+            continue
+        until_s = round(min(_MAPPED_S, length_s / 2), 1)
+        later = _asked("later part", query, query, length_s - until_s)
+        pairs += [replace(later, until_s=until_s)]
+        pairs += [
+            _asked("other day", query, other, length_s)
+            for other, other_s in lengths_s.items()
+            if other_s is not None and other != query and other.building == query.building
+        ]
+    return list(lengths_s), pairs
+
+
+def state_of(data: Path, recordings: Sequence[Recording]) -> str:
+    """Digits that change when a file of one of these recordings is written; empty without recordings."""
+    found = hashlib.sha256()
+    for recording in recordings:
+        path = data / recording.file
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            about = file.stat()
+            found.update(f"{file} {about.st_size} {about.st_mtime_ns}\n".encode())
+    return found.hexdigest()[:8] if recordings else ""
+
+
+def _recordings(folder: Path, without: Path) -> Iterator[Path]:
+    """The recordings in a folder and in those below it. One of rosbag2, which is a folder, is one."""
+    for path in sorted(folder.iterdir()):
+        if path.is_dir() and path.resolve() != without:
+            if (path / "metadata.yaml").exists():
+                yield path
+            else:
+                yield from _recordings(path, without)
+        elif path.suffix in _SUFFIXES:
+            yield path
+
+
+def _row(data: Path, file: Path, of_base: bool) -> tuple[Recording, float | None]:
+    """Return a recording, and how long it lasts, seconds; None if it cannot be read."""
+    name = file.relative_to(data)
+    beside = {suffix: name.with_suffix(suffix).as_posix() for suffix in (".tum", ".relations")}
+    there = [beside[suffix] for suffix in beside if file.with_suffix(suffix).exists()]
+    sensor: Source = "unknown"  # if it cannot be read: `convert` says why, in the row of its map
+    length_s = None
+    try:
+        with open_log(file) as log:
+            sensor = log.choose().sensor
+            length_s = (log.info.end_ns - log.info.start_ns) * 1e-9
+    except (Pc2GridError, OSError):
+        pass
+    recording = Recording(
+        name=name.as_posix(),
+        file=name.as_posix(),
+        building=name.parent.as_posix() if name.parent.name else data.resolve().name,
+        sensor=sensor,
+        truth=there[-1] if there else None,
+        poses=beside[".tum"] if beside[".tum"] in there else None,
+        of_base=of_base,
+        quick=True,
+    )
+    return recording, length_s
+
+
+def _asked(kind: Kind, query: Recording, map_: Recording, asked_s: float) -> Pair:
+    """Return windows of the last `asked_s` of a recording, or of all of it."""
+    window_s = round(min(_WINDOW_S, asked_s / 2), 1)
+    windows = min(_WINDOWS, round(2 * asked_s / max(window_s, 0.1)))
+    return _pair(kind, query.name, map_.name, window_s, windows, quick=True)
+
+
+_CLUTTER, _RATE_HZ, _COLUMNS = 15, 5.0, 720
+"""Things that are in the way, others in each drive; scans a second; columns in a turn of the lidar, as one at
+10 Hz sends them: fewer scans save time, not detail. Chosen by hand."""
+
+
+def write_drive(scan: Path, target: Path, drive: Drive) -> None:
+    """Drive through a 3D scan: write the MCAP file `target`, and its true poses beside it as `.tum`.
+
+    Raises MapFileError if the scan cannot be read or is a plan, ConfigError if there is no room in it.
+    """
+    building = load_building(scan)
+    if not isinstance(building, Building):
+        raise MapFileError(f"{scan}: a plan, not a 3D scan", hint="a drive needs a cloud or a mesh")
+    config = drive_config(drive.length_m, drive.seed)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    simulate_session(target, sensor=drive.sensor, grid=building, config=config, overwrite=True)
+
+
+def drive_config(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> SimulationConfig:
+    """Of one drive."""
+    return SimulationConfig.model_validate(
+        {
+            "length_m": length_m,
+            "seed": seed,
+            "clutter": _CLUTTER,
+            "start_m": start_m,
+            "lidar": {"rate_hz": _RATE_HZ, "columns": _COLUMNS},
+            "depth": {"rate_hz": _RATE_HZ},
+        }
+    )
+
+
+@cache
+def digest_of_drive(scan: Path, drive: Drive) -> str:
+    """Twelve hexadecimal digits that change with the scan, the drive and the simulation."""
+    sources = digest_of_sources((Path(simulate.__file__).parent, Path(__file__)))
+    shown = hashlib.sha256(f"{sources} {drive}".encode() + scan.read_bytes())
+    return shown.hexdigest()[:12]

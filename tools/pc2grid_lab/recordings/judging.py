@@ -1,0 +1,859 @@
+"""The one judge: maps by the truth of their trajectories, answers by true poses, by clouds, or by each other.
+
+A recording that is followed as it is, too, says how it lies in the map: its surest looks agree on that. So a
+place after a kidnap is judged by what the robot said there when nobody had carried it away.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+
+from pc2grid.geometry import F64, SE2, invert_pose, leveling
+from pc2grid.io import open_log
+from pc2grid.io.trajectory import read_tum
+from pc2grid.model import OccupancyGrid, Trajectory
+from pc2grid.observer import TimeSpan
+from pc2grid.pipeline import follow
+from pc2grid_cli.options import make_config
+from pc2grid_lab.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
+from pc2grid_lab.recordings.run import Folder, Followed
+from pc2grid_lab.recordings.table import (
+    MISSING,
+    NOT_RUN,
+    FollowedRow,
+    MapRow,
+    PairRow,
+    QueryRow,
+    Table,
+    Truth,
+    Verdict,
+    Warned,
+)
+from pc2grid_lab.runner import Finished, kept
+from pc2grid_lab.truth import (
+    AHEAD_M,
+    JUDGEMENT,
+    SAME_NS,
+    Clue,
+    Frame,
+    Relations,
+    agreed_frame,
+    cloud_along,
+    fit_frame,
+    is_right,
+    nearest,
+    pose_at,
+    read_relations,
+    registered_clouds,
+    relation_error,
+    trajectory_error,
+)
+from signature.config import Config
+from signature.database import open_database
+from signature.localization.map_index import MapIndex
+from signature.localization.pose_check import check_pose
+
+_GAP_NS = 200_000_000
+"""True poses farther apart are not interpolated, as a robot turns between them."""
+_CARRIED_NS = 5_000_000_000
+"""The own trajectory is laid on the true poses of so long before and after."""
+_BEFORE_S = 2.0
+"""A scan is looked for from so long before its stamp on."""
+_KNOWN_M = 0.2
+"""A wall hit lies on known ground if the map knows a cell this near: noise puts hits behind the wall."""
+
+
+def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
+    """The trajectories of the sessions of a map, empty if there is none."""
+    if not folder.map(name).exists():
+        return {}
+    with open_database(folder.map(name)) as database:
+        return {info.name: database.trajectory(info.name) for info in database.sessions()}
+
+
+def mount(folder: Folder, recording: Recording) -> F64:
+    """T_base_sensor (4, 4) of a recording's first scan."""
+    with open_log(folder.source(recording), config_of(recording).read) as log:
+        return next(iter(log.scans())).T_base_sensor
+
+
+@dataclass(frozen=True)
+class RecordedDrive:
+    """A recording as it was driven: its own trajectories, and true poses if there are any.
+
+    parts : the sessions of the map of the whole recording; none for a map that is no recording.
+    truth : poses of the base in the world, whose z is up; None without. late_ns : see `Recording.late_s`.
+    """
+
+    parts: tuple[Trajectory, ...]
+    truth: Trajectory | None
+    late_ns: int = 0
+
+    def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
+        """The part and T_part_base of the scan with that stamp; None if no part has it."""
+        for number, part in enumerate(self.parts):
+            (k,) = nearest(part.stamps_ns, np.array([stamp_ns]))
+            if k >= 0:
+                return number, SE2.from_matrix(part.T_session_base[k])
+        return None
+
+    def where(self, stamp_ns: int) -> tuple[int, SE2] | None:
+        """The same; of a recording with true poses the part is -1, and the pose the true one."""
+        if self.truth is None:
+            return self.own_pose(stamp_ns)
+        true = self.true_pose(stamp_ns)
+        return None if true is None else (-1, true)
+
+    def true_pose(self, stamp_ns: int) -> SE2 | None:
+        """T_world_base by the true poses; where they are far apart, carried on by the own trajectory."""
+        assert self.truth is not None
+        T = pose_at(self.truth, stamp_ns - self.late_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
+        return self._carried(stamp_ns - self.late_ns) if T is None else SE2.from_matrix(T)
+
+    def _carried(self, stamp_ns: int) -> SE2 | None:
+        """The own trajectory around a stamp, laid on the true poses there."""
+        assert self.truth is not None
+        own = self.own_pose(stamp_ns + self.late_ns)
+        near = np.flatnonzero(np.abs(self.truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
+        if own is None or not len(near):
+            return None
+        pairs = [
+            (there[1], SE2.from_matrix(self.truth.T_session_base[k]))
+            for k in near.tolist()
+            if (there := self.own_pose(int(self.truth.stamps_ns[k]) + self.late_ns)) is not None
+            and there[0] == own[0]
+        ]
+        if not pairs:
+            return None
+        return fit_frame(pairs, AHEAD_M) @ own[1]
+
+
+@cache
+def drive_of(recording: Recording, folder: Folder) -> RecordedDrive:
+    """The drive of a recording whose whole map is in the folder."""
+    parts = tuple(sessions(folder, recording.name).values())
+    late_ns = round(recording.late_s * 1e9)
+    poses = folder.true(recording, recording.poses)
+    if poses is None:
+        return RecordedDrive(parts, None, late_ns)
+    truth = read_tum(poses)
+    if not recording.of_base:
+        T_sensor_base = invert_pose(mount(folder, recording))
+        truth = replace(truth, T_session_base=truth.T_session_base @ T_sensor_base)
+    return RecordedDrive(parts, levelled(truth, parts, late_ns), late_ns)
+
+
+@cache
+def grids(folder: Folder, name: str) -> dict[str, OccupancyGrid]:
+    """The sessions of a map by name."""
+    with open_database(folder.map(name)) as database:
+        return {info.name: database.grid(info.name) for info in database.sessions()}
+
+
+def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -> Trajectory:
+    """True poses of the base, turned so that z of the world is up.
+
+    The world of a camera's poses may lie as its first image does. Which way is up in it is told by the own
+    trajectories, which are levelled; without scans that have a true pose it stays as it is.
+    """
+    up = np.zeros(3)
+    for part in parts:
+        at = np.searchsorted(part.stamps_ns, truth.stamps_ns + late_ns).clip(max=len(part) - 1)
+        same = np.abs(part.stamps_ns[at] - truth.stamps_ns - late_ns) <= SAME_NS
+        # The third row of a rotation is the vertical of its frame, as the base sees it.
+        vertical = part.T_session_base[at[same], 2, :3, None]
+        up += (truth.T_session_base[same, :3, :3] @ vertical).sum(axis=(0, 2))
+    if not up.any():
+        return truth
+    return replace(truth, T_session_base=leveling(up / np.linalg.norm(up)) @ truth.T_session_base)
+
+
+def config_of(recording: Recording) -> Config:
+    """The settings that the commands read a recording with."""
+    given = dict(zip(recording.options[::2], recording.options[1::2], strict=True))
+    return make_config(None, None, topic=given.get("--topic"), odometry=given.get("--odometry"))
+
+
+def hits_at(folder: Folder, recording: Recording, stamp_ns: int) -> F64:
+    """(N, 2) walls that the scan with that stamp shows, in the axes of the base."""
+    config = config_of(recording)
+    with open_log(folder.source(recording), config.read) as log:
+        start_s = max((stamp_ns - log.info.start_ns) * 1e-9 - _BEFORE_S, 0.0)
+        last = None
+        for scan in log.scans(start_s, 2.0 * _BEFORE_S):
+            if last is not None and scan.stamp_ns > stamp_ns:
+                break
+            last = scan
+        assert last is not None  # `scans` raises NoScans
+        ((_, planar_scan),) = follow([last], config)
+    return np.asarray(planar_scan.hits_m, np.float64)
+
+
+def known_share(grid: OccupancyGrid, points_m: F64) -> float:
+    """Share 0..1 of points (N, 2) in the map frame that have a known cell within `_KNOWN_M`; 0 without."""
+    if not len(points_m):
+        return 0.0
+    reach = round(_KNOWN_M / grid.resolution_m)
+    known = cv2.dilate((grid.cells >= 0).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
+    cells = grid.to_cell(points_m)
+    inside = ((cells >= 0) & (cells < known.shape)).all(axis=1)
+    return float(known[tuple(cells[inside].T)].sum() / len(points_m))
+
+
+_ABOUT = {
+    "bent": r"contradicts itself",
+    "loose": r"^no loop ties",
+    "height": r"^the height changes by",
+    "parts": r"^the recording falls into \d+ parts",
+    "lost": r"^registration was lost",
+    "weak": r"did not fix the pose in every direction",
+    "no tf": r"^the log has no tf",
+    "gaps": r"gaps of more than",
+    "empty scans": r"hold no returns",
+}
+_SHAPE = ("bent", "loose")
+EXACT_M, WRONG_M = 0.1, 0.25
+"""A map with a smaller error is not bent, one with a larger is. Chosen by hand: what a doubled wall needs."""
+
+
+def map_row(recording: Recording, folder: Folder) -> MapRow:
+    """The row of a recording as a map; what cannot be judged is a row that says why."""
+    row: dict[str, Any] = {
+        "name": recording.name,
+        "building": recording.building,
+        "sensor": recording.sensor_shown,
+    }
+    if folder.missing(recording):
+        return MapRow(**row, problem=MISSING)
+    done = kept(folder.result(recording.name))
+    if done is None:
+        return MapRow(**row, problem=NOT_RUN)
+    if done.failed:
+        return MapRow(**row, problem=done.error, cpu_s=done.cpu_s)
+    try:
+        return MapRow(**row, cpu_s=done.cpu_s, **_figures(recording, folder, done))
+    except Exception as error:
+        return MapRow(**row, problem=said(error))
+
+
+def said(error: Exception) -> str:
+    """What became of a row that cannot be judged."""
+    return f"{type(error).__name__}: {error}"
+
+
+def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, Any]:
+    stored = done.document["sessions"]
+    reports = [session["report"] for session in stored]
+    read = sum(report["scans_read"] for report in reports)
+    skipped = sum(sum(report["scans_skipped"].values()) for report in reports)
+    bare = kept(folder.bare(recording.name))
+    bare_of: dict[str, Any] = {} if bare is None or bare.failed else bare.document
+    error = _error(recording, folder)
+    texts = itertools.chain.from_iterable(report["warnings"] for report in reports)
+    sums = {name: sum(session[name] for session in stored) for name in ("duration_s", "path_m", "area_m2")}
+    return {
+        "minutes": sums["duration_s"] / 60.0,
+        "metres": sums["path_m"],
+        "area_m2": sums["area_m2"],
+        "over_bare": done.cpu_s / bare_of["cpu_s"] if bare_of else None,
+        "parts": len(stored),
+        "lost": skipped / read if read else None,
+        "warnings": warned(texts, error_m=error.get("error_m")),
+        "bare_m": bare_of.get("ate_m"),
+        **error,
+    }
+
+
+def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
+    """The error of a trajectory against its truth; of a recording in parts, that of each part by itself."""
+    parts, truth = list(sessions(folder, recording.name).values()), folder.true(recording, recording.truth)
+    if recording.same_place:
+        return {"truth": "loops", **_relation_error(parts, _loops(recording, folder), SE2())}
+    if truth is None:
+        return {}
+    if truth.suffix == ".relations":
+        T_base_sensor = SE2.from_matrix(mount(folder, recording))
+        return {"truth": "relations", **_relation_error(parts, read_relations(truth), T_base_sensor)}
+    return {"truth": "poses", **_pose_error(parts, truth)}
+
+
+def _loops(recording: Recording, folder: Folder) -> Relations:
+    """From each scan of `Recording.same_place` to the next one the sensor has not moved."""
+    with open_log(folder.source(recording), config_of(recording).read) as log:
+        stamps = {number: scan.stamp_ns for number, scan in enumerate(log.scans())}
+    there = np.array([stamps[number] for number in recording.same_place])
+    return Relations(first_ns=there[:-1], second_ns=there[1:], T_first_second=np.zeros((len(there) - 1, 3)))
+
+
+def _relation_error(
+    parts: Sequence[Trajectory], relations: Relations, T_base_sensor: SE2
+) -> dict[str, float]:
+    """Mean errors over the relations that lie in one part."""
+    offset_m = (T_base_sensor.x, T_base_sensor.y)
+    found = [relation_error(part, relations, base_to_reference_m=offset_m) for part in parts]
+    found = [error for error in found if error.used]
+    if not found:
+        return {"compared": 0.0}
+    used = [error.used for error in found]
+    return {
+        "error_m": float(np.average([error.translation_m for error in found], weights=used)),
+        "error_deg": float(np.average([error.rotation_deg for error in found], weights=used)),
+        "compared": sum(used) / found[0].total,
+    }
+
+
+def _pose_error(parts: Sequence[Trajectory], truth: Path) -> dict[str, float]:
+    """RMS distance from the true poses, each part aligned by itself."""
+    true = read_tum(truth)
+    found = [error for part in parts if (error := trajectory_error(part, true)) is not None]
+    if not found:
+        return {"compared": 0.0}
+    poses = [error.poses for error in found]
+    return {
+        "error_m": float(np.sqrt(np.average([error.ate_m**2 for error in found], weights=poses))),
+        "compared": sum(poses) / max(sum(len(part) for part in parts), 1),
+    }
+
+
+def warned(texts: Iterable[str], *, error_m: float | None) -> tuple[Warned, ...]:
+    """The warnings of `convert`, each with what it is about and whether it is right, where that is known.
+
+    error_m : of the trajectory, None if it is not known.
+    """
+    return tuple(
+        Warned(about=about, verdict=_verdict(about, error_m), text=text)
+        for text in texts
+        for about in [_about(text)]
+    )
+
+
+def _about(text: str) -> str:
+    """What a warning is about; of one that is not known here, its first words."""
+    for about, pattern in _ABOUT.items():
+        if re.search(pattern, text):
+            return about
+    return " ".join(text.split()[:5])
+
+
+def _verdict(about: str, error_m: float | None) -> Verdict:
+    if about == "height":  # each of the recordings is of one floor
+        return "false"
+    if about in _SHAPE and error_m is not None:
+        if error_m < EXACT_M:
+            return "false"
+        if error_m > WRONG_M:
+            return "right"
+    return "unknown"
+
+
+_SESSION = "map"
+"""The first session of a map, see `run`."""
+Frames = dict[tuple[int, str], Frame]
+"""By part of the drive and session of the map."""
+_STEP_M = 0.3
+"""Scans of a map place it in the world once on such a distance."""
+
+
+def judged_table(
+    catalogue: Catalogue,
+    folder: Folder,
+    followed: Sequence[Followed],
+    *,
+    program: str,
+    commit: str,
+    advance: Callable[[float], None],
+) -> Table:
+    """All rows of a run. advance : called with the share that is done."""
+    judge, rows = Judge(catalogue, folder), []
+    maps = tuple(map_row(recording, folder) for recording in catalogue.mapped)
+    for done, pair in enumerate(catalogue.pairs, start=1):
+        rows.append(judge.row(pair))
+        advance(done / len(catalogue.pairs))
+    return Table(
+        program=program,
+        commit=commit,
+        quick=catalogue.quick,
+        cpu_s=folder.cpu_s(),
+        maps=maps,
+        pairs=tuple(rows),
+        followed=tuple(map(judge.followed_row, followed)),
+    )
+
+
+@dataclass(frozen=True)
+class LocatedWindow:
+    """A window, its answer, and what it has last seen.
+
+    answer : the document of `relocalize`; None if it failed. where : the part of the drive, and the pose of
+        the base there at the last scan; of a drive with true poses the part is -1 and the pose the true one.
+    """
+
+    query: str
+    window: int
+    span: TimeSpan
+    done: Finished | None
+    where: tuple[int, SE2] | None = None
+    hits_m: F64 = field(default_factory=lambda: np.empty((0, 2)))
+
+    @property
+    def answer(self) -> dict[str, Any] | None:
+        """The document of `relocalize`."""
+        return None if self.done is None or self.done.failed else self.done.document
+
+    @property
+    def places(self) -> list[tuple[str, SE2, int]]:
+        """Session, pose and number of the place of each hypothesis, best first."""
+        if self.answer is None:
+            return []
+        return [(h["session"], SE2(h["x"], h["y"], h["yaw"]), h["place"]) for h in self.answer["hypotheses"]]
+
+
+class Judge:
+    """Judges the rows of one run; what several of them need is read once."""
+
+    def __init__(self, catalogue: Catalogue, folder: Folder) -> None:
+        self._catalogue, self._folder = catalogue, folder
+        self._windows: dict[Pair, list[LocatedWindow]] = {}
+        self._followed: dict[tuple[str, str], Frame | None] = {}
+
+    def row(self, pair: Pair) -> PairRow:
+        """The row of a pair; what cannot be judged is a row that says why."""
+        query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
+        row: dict[str, Any] = {
+            "query": pair.query,
+            "map": pair.map_name,
+            "kind": pair.kind,
+            "building": map_.building,
+            "sensors": " in ".join(dict.fromkeys((query.sensor_shown, map_.sensor_shown))),
+        }
+        try:
+            return self._judged(pair, query, map_, row)
+        except Exception as error:
+            return PairRow(**row, problem=said(error))
+
+    def truths(self, pair: Pair) -> Iterator[tuple[TimeSpan, dict[str, SE2], bool]]:
+        """The windows of a pair whose place is known: the window, the base at its end in each session of the
+        map that shows it, and whether the map knows what is seen there.
+
+        Of a pair with another building, every window, and no place.
+        """
+        query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
+        if pair.kind == "elsewhere":
+            yield from ((one.span, {}, False) for one in self._located_windows(pair))
+            return
+        _, windows, frames = self._frames(pair, query, map_)
+        known = grids(self._folder, pair.map_name)
+        for one in windows:
+            expected = _expected(one, frames)
+            if expected:
+                poses = {session: pose for session, (pose, _) in expected.items()}
+                yield one.span, poses, _covered(one, expected, known)
+
+    def _judged(self, pair: Pair, query: Recording, map_: Recording, row: dict[str, Any]) -> PairRow:
+        problem = self._problem(pair)
+        if problem:
+            return PairRow(**row, problem=problem)
+        if pair.kind == "elsewhere":
+            queries = tuple(
+                QueryRow(**_answered(one), right=None if one.answer is None else False, covered=False)
+                for one in self._located_windows(pair)
+            )
+            return PairRow(**row, truth="elsewhere", queries=queries)
+        truth, windows, frames = self._frames(pair, query, map_)
+        known = grids(self._folder, pair.map_name)
+        return PairRow(
+            **row,
+            truth=truth,
+            agreeing=sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None,
+            queries=tuple(self._row_of(pair, one, frames, known) for one in windows),
+        )
+
+    def _row_of(
+        self, pair: Pair, one: LocatedWindow, frames: Frames, known: Mapping[str, OccupancyGrid]
+    ) -> QueryRow:
+        """The row of a window; where it is missed, with what `--check` says of its true pose."""
+        row = _judged(one, frames, known)
+        if not row.missed:
+            return row
+        query = self._catalogue.recordings[pair.query]
+        return replace(row, fine=self._fine(pair, query, one, _expected(one, frames)))
+
+    def _fine(
+        self, pair: Pair, query: Recording, one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]]
+    ) -> float | None:
+        """Probability of the true pose of a window by `check_pose`; None if that does not call it fine."""
+        config, folder, found = config_of(query), self._folder, []
+        for session, (T_map_base, _) in expected.items():
+            with (
+                open_database(folder.map(pair.map_name)) as database,
+                open_log(folder.source(query), config.read) as log,
+            ):
+                scans = follow(log.scans(one.span.start_s, one.span.duration_s), config)
+                checked = check_pose(scans, MapIndex.of(database, config), T_map_base, session=session)
+            found += [checked.probability] if checked.status == "fine" else []
+        return max(found, default=None)
+
+    def followed_row(self, one: Followed) -> FollowedRow:
+        """Return the row of a recording that was followed; where there is no result, one that says why."""
+        building = self._catalogue.recordings[one.map].building
+        row = FollowedRow(before=one.before, after=one.after, map=one.map, building=building)
+        done = kept(self._folder.followed(one))
+        if done is None or done.failed:
+            return replace(row, problem=NOT_RUN if done is None else done.error or MISSING)
+        if one.after is not None:
+            begin_ns = done.document["put_down_ns"] - done.document["shift_ns"]
+            shown = self._shows(
+                one.after, self._followed_place(one.after, one.map, begin_ns), one.map, begin_ns
+            )
+            row = replace(row, shown=shown is True)
+        return followed_row(row, self._looks(one, done))
+
+    def _looks(self, one: Followed, done: Finished) -> list[Look]:
+        """Return the looks, each with whether its place is right."""
+        put_down_ns, shift_ns = done.document["put_down_ns"], done.document["shift_ns"]
+        looks: list[Look] = []
+        for said in done.document["looks"]:
+            carried = put_down_ns is not None and said["stamp_ns"] >= put_down_ns
+            name = one.after if carried and one.after is not None else one.before
+            own_ns = said["stamp_ns"] - (shift_ns if carried else 0)
+            place, right = self._followed_place(name, one.map, own_ns), None
+            if said["pose"] is not None and place is not None:
+                right = is_right(_pose(said), *place)[0]
+            since_s = since_m = None
+            if carried:
+                begin_ns = put_down_ns - shift_ns
+                parts = drive_of(self._catalogue.recordings[name], self._folder).parts
+                ways = [np.interp((begin_ns, own_ns), part.stamps_ns, part.path_m()) for part in parts]
+                since_s, since_m = (own_ns - begin_ns) * 1e-9, float(sum(np.ptp(way) for way in ways))
+            given_up = said["state"] in NOTICED and _was_right(looks)
+            alarm = given_up and self._shows(name, place, one.map, own_ns) is not False
+            looks.append(Look(said["state"], right, since_s, since_m, alarm))
+        return looks
+
+    def _shows(self, name: str, place: tuple[SE2, float] | None, map_: str, stamp_ns: int) -> bool | None:
+        """Return whether the map knows what the robot sees; None if nobody knows where that is."""
+        if place is None:
+            return None
+        hits_m = hits_at(self._folder, self._catalogue.recordings[name], stamp_ns)
+        return known_share(grids(self._folder, map_)[_SESSION], place[0].apply(hits_m)) >= JUDGEMENT.mapped
+
+    def _followed_place(self, name: str, map_: str, stamp_ns: int) -> tuple[SE2, float] | None:
+        """Return T_map_base at a scan of a recording, and how far a right answer may be from there, metres.
+
+        By the looks at the recording as it is; None if they do not tell how it lies in the map.
+        """
+        drive = drive_of(self._catalogue.recordings[name], self._folder)
+        if (name, map_) not in self._followed:
+            done = kept(self._folder.followed(Followed(before=name, map=map_)))
+            looks = [] if done is None or done.failed else done.document["looks"]
+            clues = [
+                Clue(own[1], _pose(said), (name, number), said["confidence"])
+                for number, said in enumerate(looks)
+                if said["pose"] is not None and (own := drive.own_pose(said["stamp_ns"])) is not None
+            ]
+            self._followed[name, map_] = agreed_frame(clues) if clues else None
+        frame, at = self._followed[name, map_], drive.own_pose(stamp_ns)
+        return None if frame is None or at is None else frame.place(at[1])
+
+    def _problem(self, pair: Pair) -> str:
+        if gaps := self._folder.gaps(self._catalogue, pair):
+            return f"{gaps[0]}: {MISSING}"
+        done = kept(self._folder.result(pair.map_name))
+        if done is None:
+            return f"{pair.map_name}: {NOT_RUN}"
+        return f"no map: {done.error}" if done.failed else ""
+
+    def _located_windows(self, pair: Pair) -> list[LocatedWindow]:
+        """The windows of a pair with their answers."""
+        if pair not in self._windows:
+            query = self._catalogue.recordings[pair.query]
+            windows = self._catalogue.windows(pair, self._folder.length_s(query))
+            self._windows[pair] = [self._one(pair, query, number, span) for number, span in windows]
+        return self._windows[pair]
+
+    def _one(self, pair: Pair, query: Recording, number: int, span: TimeSpan) -> LocatedWindow:
+        one = LocatedWindow(pair.query, number, span, kept(self._folder.answer(pair, span)))
+        if one.answer is None or pair.kind == "elsewhere":
+            return one
+        stamp_ns = int(one.answer["query"]["stamp_ns"])
+        where = drive_of(query, self._folder).where(stamp_ns)
+        return replace(one, where=where, hits_m=hits_at(self._folder, query, stamp_ns))
+
+    def _frames(
+        self, pair: Pair, query: Recording, map_: Recording
+    ) -> tuple[Truth | None, list[LocatedWindow], Frames]:
+        """The windows, and how the parts of the drive lie in the sessions of the map: by true poses, by the
+        trajectory of the whole recording, by hand, by the clouds of both, or else by the answers.
+        """
+        windows = self._located_windows(pair)
+        if query.poses is not None and query.poses == map_.poses:
+            return "poses", windows, self._by_scans(pair, map_)
+        if pair.query == pair.map:
+            return "trajectory", windows, self._by_scans(pair, map_)
+        if pair.by_hand is not None:
+            return "hand", windows, self._by_hand(query, pair.by_hand)
+        if pair.until_s is None and (by_clouds := self._by_clouds(query, map_)) is not None:
+            drive = drive_of(query, self._folder)
+            own = [
+                replace(
+                    one, where=drive.own_pose(int(one.answer["query"]["stamp_ns"])) if one.answer else None
+                )
+                for one in windows
+            ]
+            return "clouds", own, {(0, _SESSION): by_clouds}
+        shared = self._shared(pair) if map_.sensor == "map" else None
+        windows, frames = shared or (windows, _agreed([*_said(windows), *self._said_back(pair)]))
+        return ("agreement" if frames else None), windows, frames
+
+    def _said_back(self, pair: Pair) -> Iterator[tuple[tuple[int, str], Clue]]:
+        """What the drive of the map says, asked in the map of this query: it is of the same two trajectories.
+
+        Nothing where true poses place one of them, or where it was not asked.
+        """
+        wanted = (pair.map, pair.query, pair.until_s)
+        back = next((p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == wanted), None)
+        recordings = [self._catalogue.recordings[name] for name in (pair.query, pair.map)]
+        if (
+            pair.until_s is not None
+            or back is None
+            or any(r.poses for r in recordings)
+            or self._problem(back)
+        ):
+            return
+        parts, names = (list(sessions(self._folder, r.name)) for r in recordings)
+        for (number, session), clue in _said(self._located_windows(back)):
+            turned = Clue(clue.T_map_base, clue.T_drive_base, clue.query, clue.weight)
+            yield (parts.index(session), names[number]), turned
+
+    def _by_clouds(self, query: Recording, map_: Recording) -> Frame | None:
+        """The frame of a recording in the map of another one, by the clouds of both; None if they have none,
+        or do not tell."""
+        parts = [drive_of(one, self._folder).parts for one in (query, map_)]
+        if any(r.sensor not in ("lidar", "depth") for r in (query, map_)) or not all(parts):
+            return None
+        drives, clouds = [of_one[0] for of_one in parts], []
+        for recording, drive in zip((query, map_), drives, strict=True):
+            with open_log(self._folder.source(recording), config_of(recording).read) as log:
+                clouds.append(cloud_along(log, drive))
+        T_map_query = registered_clouds(clouds[0], clouds[1])
+        if T_map_query is None:
+            return None
+        ways = [SE2.from_matrix(drives[0].T_session_base[k]) for k in _steps(drives[0])]
+        return Frame(tuple(Clue(pose, T_map_query @ pose) for pose in ways))
+
+    def _shared(self, pair: Pair) -> tuple[list[LocatedWindow], Frames] | None:
+        """The same of several drives in one map, whose answers judge each other: those that are known to lie
+        in the trajectory of one of them, or of another recording of the building.
+
+        None if there are not several.
+        """
+        building = self._catalogue.recordings[pair.map].building
+        in_map = [p for p in self._catalogue.pairs if p.map_name == pair.map_name and p.kind != "elsewhere"]
+        for root in self._catalogue.recordings.values():
+            if root.building != building or len(in_map) < 2:
+                continue
+            drives = {p.query: moved for p in in_map if (moved := self._in_root(p, root.name)) is not None}
+            if pair.query in drives and len(drives) > 1:
+                return drives[pair.query], _agreed(_said(one for found in drives.values() for one in found))
+        return None
+
+    def _in_root(self, pair: Pair, root: str) -> list[LocatedWindow] | None:
+        """The windows of a pair, in the trajectory of the recording `root`; None if not located there."""
+        if pair.query == root:
+            return self._located_windows(pair)
+        wanted = (pair.query, root, None)
+        link = next((p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == wanted), None)
+        if link is None or self._problem(link):
+            return None
+        frame = _agreed(_said(self._located_windows(link))).get((0, _SESSION))
+        if frame is None:
+            return None
+        return [
+            replace(one, where=(0, frame.place(one.where[1])[0]) if one.where and one.where[0] == 0 else None)
+            for one in self._located_windows(pair)
+        ]
+
+    def _by_scans(self, pair: Pair, map_: Recording) -> Frames:
+        """How the sessions of the map lie in the world, or in the whole drive that they are a part of: by
+        their own scans, one on each `_STEP_M`."""
+        drive = drive_of(map_, self._folder)
+        clues: dict[tuple[int, str], list[Clue]] = {}
+        for session, trajectory in sessions(self._folder, pair.map_name).items():
+            for k in _steps(trajectory):
+                where = drive.where(int(trajectory.stamps_ns[k]))
+                if where is not None:
+                    clue = Clue(where[1], SE2.from_matrix(trajectory.T_session_base[k]))
+                    clues.setdefault((where[0], session), []).append(clue)
+        return {key: Frame(tuple(found)) for key, found in clues.items() if len(found) >= 2}
+
+    def _by_hand(self, query: Recording, known: PlacedByHand) -> Frames:
+        """The frame of the recording's first part in the map, by one pose."""
+        drive = drive_of(query, self._folder).parts[0]
+        at_ns = drive.stamps_ns[0] + round(known.at_s * 1e9)
+        (k,) = nearest(drive.stamps_ns, np.array([at_ns]), math.inf)
+        T_map_base = SE2(known.x_m, known.y_m, math.radians(known.yaw_deg))
+        clue = Clue(SE2.from_matrix(drive.T_session_base[k]), T_map_base)
+        return {(0, _SESSION): Frame((clue,), known.within_m)}
+
+
+def _steps(trajectory: Trajectory) -> list[int]:
+    """Numbers of its scans, one on each `_STEP_M`."""
+    first: list[int] = np.unique((trajectory.path_m() / _STEP_M).astype(int), return_index=True)[1].tolist()
+    return first
+
+
+def _said(windows: Iterable[LocatedWindow]) -> Iterator[tuple[tuple[int, str], Clue]]:
+    """The part of the drive, the session of the map, and the best place of every answer."""
+    for one in windows:
+        if one.where is not None and one.places and one.answer is not None:
+            session, T_map_base, _ = one.places[0]
+            clue = Clue(one.where[1], T_map_base, (one.query, one.window), float(one.answer["confidence"]))
+            yield (one.where[0], session), clue
+
+
+def _agreed(said: Iterable[tuple[tuple[int, str], Clue]]) -> Frames:
+    """How the parts of drives lie in the sessions of a map, by what answers have said."""
+    groups: dict[tuple[int, str], list[Clue]] = {}
+    for key, clue in said:
+        groups.setdefault(key, []).append(clue)
+    found = ((key, agreed_frame(clues)) for key, clues in groups.items())
+    return {key: frame for key, frame in found if frame is not None}
+
+
+def _answered(one: LocatedWindow) -> dict[str, Any]:
+    """What a row says of an answer before it is judged."""
+    row: dict[str, Any] = {"window": one.window, "start_s": one.span.start_s}
+    if one.done is None:
+        return {**row, "problem": NOT_RUN}
+    if one.answer is None:
+        return {**row, "problem": one.done.error, "cpu_s": one.done.cpu_s}
+    space = one.answer.get("in_space")
+    return {
+        **row,
+        "status": one.answer["status"],
+        "confidence": one.answer["confidence"],
+        "travel_m": one.answer["query"]["path_m"],
+        "in_space": None if space is None else space["status"],
+        "cpu_s": one.done.cpu_s,
+    }
+
+
+def _judged(one: LocatedWindow, frames: Frames, grids: Mapping[str, OccupancyGrid]) -> QueryRow:
+    """An answer judged by where the query is in the sessions of the map."""
+    row = _answered(one)
+    if one.answer is None or one.where is None:
+        return QueryRow(**row)
+    expected = _expected(one, frames)
+    if not expected:
+        return QueryRow(**row)
+    return QueryRow(**row, covered=_covered(one, expected, grids), **_best(one.places, expected))
+
+
+def _expected(one: LocatedWindow, frames: Frames) -> dict[str, tuple[SE2, float]]:
+    """Where the base is at the end of a window, by session of the map, and how far a right answer may be."""
+    if one.where is None:
+        return {}
+    part, T_drive_base = one.where
+    return {
+        session: frame.place(T_drive_base, without=(one.query, one.window))
+        for (of_part, session), frame in frames.items()
+        if of_part == part
+    }
+
+
+def _covered(
+    one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]], grids: Mapping[str, OccupancyGrid]
+) -> bool:
+    return any(
+        known_share(grids[session], T_map_base.apply(one.hits_m)) >= JUDGEMENT.mapped
+        for session, (T_map_base, _) in expected.items()
+    )
+
+
+def _best(
+    places: Sequence[tuple[str, SE2, int]], expected: Mapping[str, tuple[SE2, float]]
+) -> dict[str, Any]:
+    """`right` and `error_m` of the first hypothesis, and `rank` of the first right one, by its place."""
+    if not places:
+        return {"right": False}
+    judged = [
+        is_right(pose, *expected[session]) if session in expected else (None, None)
+        for session, pose, _ in places
+    ]
+    order = list(dict.fromkeys(place for _, _, place in places))
+    ranks = (order.index(place) for (_, _, place), (right, _) in zip(places, judged, strict=True) if right)
+    right, error_m = judged[0]
+    return {"right": right, "error_m": error_m, "rank": next(ranks, None)}
+
+
+NOTICED = ("lost", "recovered")
+"""States that say that the robot is not where it was located last."""
+
+
+@dataclass(frozen=True, slots=True)
+class Look:
+    """What `watch` said after a scan.
+
+    right : None if no place was told, or it cannot be judged. since_s, since_m : time and travel since the
+        robot was put down; None before. alarm : whether the robot is given up where it was located, though
+        that was not wrong, and the map shows what it sees.
+    """
+
+    state: str
+    right: bool | None
+    since_s: float | None = None
+    since_m: float | None = None
+    alarm: bool = False
+
+    @property
+    def tells(self) -> bool:
+        """Whether it tells a place."""
+        return self.state in ("located", "recovered")
+
+
+def _was_right(looks: Sequence[Look]) -> bool:
+    """Whether the robot was located, and the last place that was told is not known to be wrong."""
+    told = [look for look in looks if look.tells]
+    return bool(told) and looks[-1].state != "lost" and told[-1].right is not False
+
+
+def _pose(said: dict[str, Any]) -> SE2:
+    return SE2(said["pose"]["x"], said["pose"]["y"], said["pose"]["yaw"])
+
+
+def followed_row(row: FollowedRow, looks: Sequence[Look]) -> FollowedRow:
+    """What a row says of its looks."""
+    before = [look for look in looks if look.since_s is None]
+    after = looks[len(before) :]
+    knew = bool(before) and before[-1].state in ("located", "recovered", "off_map", "doubtful")
+    if knew:  # until it is noticed, the old place is told
+        noticed = (k for k, look in enumerate(after) if look.state in NOTICED)
+        after = after[next(noticed, len(after)) :]
+    told = [look for look in (*before, *after) if look.tells]
+    rights = [look.right for look in told]
+    row = replace(
+        row,
+        located=len(told),
+        judged=len(told) - rights.count(None),
+        wrong=rights.count(False),
+        alarms=sum(look.alarm for look in before),
+        knew=knew,
+    )
+    return _with_times(row, after) if knew and after else row
+
+
+def _with_times(row: FollowedRow, after: Sequence[Look]) -> FollowedRow:
+    """The row with when the robot noticed that it had been carried away, and was located again."""
+    row = replace(row, noticed_s=after[0].since_s, noticed_m=after[0].since_m)
+    again = next((look for look in after if look.tells and look.right is not False), None)
+    return row if again is None else replace(row, again_s=again.since_s, again_m=again.since_m)

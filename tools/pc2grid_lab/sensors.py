@@ -1,0 +1,414 @@
+"""`pc2grid compare sensors`: maps made by one sensor, queries by another, in simulated buildings.
+
+The experiment is the same for all nine pairs of sensors: a session of each sensor maps the building; other
+sessions of each sensor, with other clutter, start and direction, are located in each of the maps after some
+metres of travel. The sessions are registered as a user would do it; true poses are only used to judge.
+
+Registering a session takes far longer than locating it. It is registered once and kept, however many maps it
+is located in and however many programs are compared on it.
+"""
+
+from __future__ import annotations
+
+import math
+import pickle
+import time
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.errors import ConfigError
+from pc2grid.geometry import F64, SE2
+from pc2grid.io.maps import load_map
+from pc2grid.matching.score import score_fit
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SensorKind
+from pc2grid.pipeline import follow, map_scans
+from pc2grid.simulate import SimulationConfig, prepare_session
+from pc2grid.simulate.drive import Drive
+from pc2grid.submaps.submaps import partition
+from pc2grid_cli.console import Console, json_text
+from pc2grid_cli.output import make_folder
+from pc2grid_lab.pages import print_cells
+from pc2grid_lab.recordings.table import Counts, QueryRow
+from pc2grid_lab.runner import in_processes, once, write_text
+from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, fit_frame, is_right
+from signature.config import Config
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
+from signature.localization.query import QueryMap
+from signature.paper import SignatureTable, describe
+
+SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
+TRAVELS_M = (1.0, 3.0, 5.0, 8.0, 10.0, 15.0)
+"""Metres of travel after which a query is answered."""
+RECALL_AT = (1, 5, 20)
+"""Numbers of retrieved places for which the recall is given."""
+RETRIEVED_M = 1.0
+"""A retrieved place is right within this of the true position of the view that retrieved it; by hand."""
+MAP_SEED = 1000
+"""Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RegisteredSession:
+    """N scans of one session.
+
+    planar_scans : one for each scan, with its stamp.
+    T_odom_base : (N, 3) registered x, y, yaw, in the frame of the session.
+    lost : (N,) whether registration was lost.
+    T_world_base : (N, 3) true x, y, yaw, in the frame of the floor plan or of the ground truth; NaN where the
+    truth is not known.
+    """
+
+    sensor: SensorKind
+    planar_scans: tuple[PlanarScan, ...]
+    T_odom_base: F64
+    lost: NDArray[np.bool_]
+    T_world_base: F64
+
+    def __len__(self) -> int:
+        return len(self.planar_scans)
+
+    def path_m(self) -> F64:
+        """Return (N,) metres travelled up to each scan, by the registered poses."""
+        steps = np.hypot(*np.diff(self.T_odom_base[:, :2], axis=0).T)
+        return np.concatenate(([0.0], np.cumsum(steps)))[: len(self)]
+
+    def T_world_odom(self) -> SE2:
+        """Return the true pose of the session's frame, by the end of the session.
+
+        It is fitted over the scans of the last `AHEAD_M` whose true pose is known, because the heading of a
+        single scan, taken while the robot turns, may be wrong by some degrees. Scans from before registration
+        was lost are left out: the motion since is not known. (Unless no other pose is known.)
+        """
+        path_m = self.path_m()
+        known = np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))
+        lost = np.flatnonzero(self.lost)
+        first = min(lost[-1] + 1, len(self) - 1) if len(lost) else 0  # a lost last scan is a query of its own
+        if known[-1] >= first:
+            known = known[known >= first]
+        known = known[path_m[known] >= path_m[known[-1]] - AHEAD_M]
+        pairs = [(SE2(*self.T_odom_base[k].tolist()), SE2(*self.T_world_base[k].tolist())) for k in known]
+        return fit_frame(pairs, AHEAD_M)
+
+    def first(self, count: int) -> RegisteredSession:
+        """Return the session until so many scans were taken."""
+        names = ("planar_scans", "T_odom_base", "lost", "T_world_base")
+        return replace(self, **{name: getattr(self, name)[:count] for name in names})
+
+    def scans(self) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
+        """Return each scan (without its points) and its planar scan, in order of time."""
+        no_points = np.empty((0, 3), np.float32)
+        for planar_scan, pose, lost in zip(self.planar_scans, self.T_odom_base, self.lost, strict=True):
+            scan = Scan(
+                stamp_ns=planar_scan.stamp_ns, points_m=no_points, T_base_sensor=np.eye(4), sensor=self.sensor
+            )
+            health = Health.LOST if lost else Health.FINE
+            T = SE2(*pose.tolist()).lift()
+            yield RegisteredScan(scan=scan, T_session_base=T, health=health), planar_scan
+
+    @staticmethod
+    def load(path: Path) -> RegisteredSession:
+        """Read a file that `once` has written."""
+        session: RegisteredSession = pickle.loads(path.read_bytes())
+        return session
+
+
+def register(
+    scans: Iterable[tuple[Scan, SE2 | None]],
+    config: Config,
+    *,
+    sensor: SensorKind,
+    until_m: float = math.inf,
+    see: Callable[[RegisteredScan], object] = lambda registered: None,
+) -> RegisteredSession:
+    """Register scans with the settings of a user, and stop after `until_m` of travel.
+
+    scans : each with its true pose, None where it is not known; registration does not get it.
+    see : called with each scan, whose points are not kept here.
+    """
+    truths: list[tuple[float, float, float]] = []
+
+    def without_truth() -> Iterator[Scan]:
+        for scan, truth in scans:
+            truths.append((truth.x, truth.y, truth.yaw) if truth else (math.nan,) * 3)
+            yield scan
+
+    planar_scans: list[PlanarScan] = []
+    poses: list[tuple[float, float, float]] = []
+    lost: list[bool] = []
+    travel_m = 0.0
+    for registered, planar_scan in follow(without_truth(), config):
+        pose = SE2.from_matrix(registered.T_session_base)
+        if poses:
+            travel_m += math.hypot(pose.x - poses[-1][0], pose.y - poses[-1][1])
+        see(registered)
+        planar_scans.append(planar_scan)
+        poses.append((pose.x, pose.y, pose.yaw))
+        lost.append(registered.health is Health.LOST)
+        if travel_m >= until_m:
+            break
+    return RegisteredSession(
+        sensor=sensor,
+        planar_scans=tuple(planar_scans),
+        T_odom_base=np.array(poses, np.float64).reshape(-1, 3),
+        lost=np.array(lost, bool),
+        T_world_base=np.array(truths[: len(poses)], np.float64).reshape(-1, 3),
+    )
+
+
+def index_of(name: str, grid: OccupancyGrid, config: Config) -> MapIndex:
+    """Return a database of one map."""
+    submaps = partition(grid, config.partition)
+    signatures = [describe(submap, config.signature) for submap in submaps]
+    centers_m = [submap.center_m for submap in submaps]
+    return MapIndex({name: grid}, SignatureTable.of(signatures, centers_m), config, config)
+
+
+PlanMap = tuple[OccupancyGrid, SE2]
+"""A map, and T_plan_map: its frame in the floor plan."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanDrives:
+    """Maps and drives in floor plans that are made unless they exist.
+
+    setting : what their files are named after: map_length (metres driven to make a map), clutter, rate (scans
+        a second), travel (metres that a query is registered at most).
+    """
+
+    out: Path
+    setting: tuple[tuple[str, float], ...]
+
+    def file(self, kind: str, *names: object) -> Path:
+        """Return a file of the folder `kind`, named after its building, sensor and so on, and the setting."""
+        tag = (f"{key}{value:g}" for key, value in sorted(self.setting))
+        return self.out / kind / ".".join([*map(str, names), *tag, "pickle"])
+
+    def simulation(
+        self, length_m: float, seed: int, start_m: tuple[float, float] | None = None
+    ) -> SimulationConfig:
+        """Return the configuration of one drive."""
+        setting = dict(self.setting)
+        rates = {sensor: {"rate_hz": setting["rate"]} for sensor in SENSORS}
+        one = {"length_m": length_m, "seed": seed, "clutter": int(setting["clutter"]), "start_m": start_m}
+        return SimulationConfig.model_validate({**one, **rates})
+
+    @property
+    def mapping(self) -> SimulationConfig:
+        """The configuration of the drive that makes a map."""
+        return self.simulation(dict(self.setting)["map_length"], MAP_SEED)
+
+    def map(self, plan: Path, sensor: SensorKind) -> PlanMap:
+        """Return the map of a plan by one sensor."""
+        file = self.file("maps", plan.stem, sensor)
+        return once(file, lambda: map_building(load_map(plan), sensor, self.mapping))
+
+    def drive(self, plan: Path, sensor: SensorKind, seed: int) -> RegisteredSession:
+        """Return a registered query session, which starts somewhere on the path of the mapping one: a query
+        from where the mapping robot has never been has no right answer."""
+
+        def registered() -> RegisteredSession:
+            grid, travel_m = load_map(plan), dict(self.setting)["travel"]
+            way = prepare_session(sensor="laser", grid=grid, config=self.mapping).drive
+            config = self.simulation(travel_m + 3.0, seed, start_on(way, seed))
+            scans = prepare_session(sensor=sensor, grid=grid, config=config).scans()
+            return register(scans, Config(), sensor=sensor, until_m=travel_m)
+
+        return once(self.file("drives", plan.stem, sensor, seed), registered)
+
+
+def start_on(way: Drive, seed: int) -> tuple[float, float]:
+    """Return a random place on a drive, x and y in metres."""
+    at_s = np.random.default_rng([seed, MAP_SEED]).uniform(0.0, way.duration_s)
+    x, y, _ = way.at(np.array([at_s]))[0].tolist()
+    return x, y
+
+
+def map_building(plan: OccupancyGrid, sensor: SensorKind, simulation: SimulationConfig) -> PlanMap:
+    """Return the map of a simulated session in a floor plan.
+
+    Its frame is fitted over the whole trajectory, as for an absolute trajectory error: if it rested on the
+    heading of the first scan alone, an error of that heading would move distant places by much.
+    """
+    true_m: list[tuple[float, float]] = []
+
+    def scans() -> Iterator[Scan]:
+        for scan, truth in prepare_session(sensor=sensor, grid=plan, config=simulation).scans():
+            true_m.append((truth.x, truth.y))
+            yield scan
+
+    grid, trajectory, _ = map_scans(scans(), Config())
+    return grid, SE2.fit(trajectory.planar()[:, :2], np.array(true_m))
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """The judged answer to a query of one sensor in the map of another, or in that of another plan.
+
+    row.rank is that of the first right place among those that the signatures retrieve.
+    """
+
+    map_sensor: SensorKind
+    query_sensor: SensorKind
+    in_building: bool
+    row: QueryRow
+
+
+@cache
+def _mapped(drives: PlanDrives, plan: Path, sensor: SensorKind) -> tuple[MapIndex, SE2]:
+    """Return the map of a plan as a database, and T_plan_map."""
+    grid, T_plan_map = drives.map(plan, sensor)
+    return index_of(f"{plan.stem}-{sensor}", grid, Config()), T_plan_map
+
+
+def _locate(
+    drives: PlanDrives, seed: int, plan: Path, sensor: SensorKind, plans: Sequence[Path]
+) -> list[Trial]:
+    """Locate one query session in the maps of its own plan, and at its end in those of one other."""
+
+    def located() -> list[Trial]:
+        others = [p for p in plans if p != plan]
+        session = drives.drive(plan, sensor, seed)
+        asked = [(plan, True), *((p, False) for p in others[seed % max(len(others), 1) :][:1])]
+        return [
+            Trial(map_sensor, sensor, own, row)
+            for where, own in asked
+            for map_sensor in SENSORS
+            for row in located_rows(session, *_mapped(drives, where, map_sensor), own)
+        ]
+
+    return once(drives.file("trials", plan.stem, sensor, seed), located)
+
+
+def located_rows(
+    session: RegisteredSession, index: MapIndex, T_plan_map: SE2, own: bool
+) -> Iterator[QueryRow]:
+    """Locate a session after each of `TRAVELS_M` that it has travelled, in another plan after the last one,
+    and judge the answers. own : whether the map is of its plan; if not, no answer is right."""
+    path_m = session.path_m()
+    travels_m = [d for d in TRAVELS_M if d <= path_m[-1]]
+    # The number of scans after which each distance is reached, made distinct.
+    after = np.searchsorted(path_m, travels_m) + 1 - np.arange(len(travels_m))
+    after = np.maximum.accumulate(after) + np.arange(len(travels_m))
+    due = dict(zip(after.tolist(), travels_m, strict=True))
+    localizer = Localizer(index)
+    for count, scan in enumerate(session.scans(), start=1):
+        begin = time.perf_counter()
+        localizer.add(*scan)  # after every metre this is a search, which is then the answer
+        if count not in due or not (own or count == after[-1]):
+            continue
+        answer, query = localizer.answer(), localizer.query.map()
+        seconds = time.perf_counter() - begin
+        row = QueryRow(
+            window=count,
+            start_s=0.0,
+            status=answer.status,
+            confidence=answer.confidence,
+            travel_m=due[count],
+            cpu_s=seconds,
+        )
+        T_map_base = T_plan_map.inverse() @ SE2(*session.T_world_base[count - 1].tolist())
+        T_map_query = T_map_base @ answer.T_odom_base.inverse()
+        right, error_m = False, None
+        if answer.hypotheses:
+            pose = answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
+            right, error_m = is_right(pose, T_map_base, JUDGEMENT.right_m)
+        mapped = own and score_fit(index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
+        yield replace(
+            row,
+            covered=mapped >= JUDGEMENT.mapped,
+            right=own and right,
+            error_m=error_m,
+            rank=_retrieved_rank(index, query, T_map_query) if own else None,
+        )
+
+
+def _retrieved_rank(index: MapIndex, query: QueryMap, T_map_query: SE2) -> int | None:
+    """Return the rank of the first place, selected by the signatures, that the robot truly stood next to."""
+    rows = index.places.order(query.views, query.center_m, index.config).rows
+    off_m = index.places.table.center_m[rows] - T_map_query.apply(np.array([query.center_m]))
+    right = np.flatnonzero(np.hypot(*off_m.T) <= RETRIEVED_M)
+    return int(right[0]) if len(right) else None
+
+
+Cell = dict[str, Any]
+
+
+def matrix(trials: Sequence[Trial]) -> list[Cell]:
+    """Return the figures of the trials that lie in the map of their own building, by map sensor, query sensor
+    and travel: shares of all, of the located ones (wrong), of the first right place among the first
+    `RECALL_AT` retrieved ones; errors of those that are located and right, metres."""
+    groups: dict[tuple[str, str, float], list[QueryRow]] = {}
+    for trial in trials:
+        if trial.in_building and trial.row.covered and trial.row.travel_m is not None:
+            key = (trial.map_sensor, trial.query_sensor, trial.row.travel_m)
+            groups.setdefault(key, []).append(trial.row)
+    names = ("map_sensor", "query_sensor", "travel_m")
+    return [{**dict(zip(names, key, strict=True)), **_figures(groups[key])} for key in sorted(groups)]
+
+
+def _figures(rows: Sequence[QueryRow]) -> Cell:
+    counts, statuses, count = Counts.of(rows), Counter(row.status for row in rows), len(rows)
+    errors_m = [r.error_m for r in rows if r.located and r.right and r.error_m is not None]
+    median_m, p95_m = np.percentile(errors_m, (50, 95)).tolist() if errors_m else (None, None)
+    ranks = [math.inf if row.rank is None else row.rank for row in rows]
+    return {
+        "trials": count,
+        "located_right": counts.right / count,
+        "wrong": counts.wrong / max(counts.located, 1),
+        "ambiguous": statuses["ambiguous"] / count,
+        "not_found": statuses["not_found"] / count,
+        "recall": [sum(rank < k for rank in ranks) / count for k in RECALL_AT],
+        "median_error_m": median_m,
+        "p95_error_m": p95_m,
+        "look_up_ms": 1000.0 * float(np.median([row.cpu_s for row in rows])),
+    }
+
+
+def compare_sensors(
+    plans: Sequence[Path],
+    out: Path,
+    terminal: Console,
+    *,
+    queries: int,
+    seed: int,
+    jobs: int | None,
+    **setting: float,
+) -> None:
+    """Map the plans, locate the sessions, and write the table. setting : as of `PlanDrives`."""
+    names = [plan.stem for plan in plans]
+    if len(set(names)) != len(names):
+        raise ConfigError(f"two plans share a name: {', '.join(names)}", hint="rename one of the files")
+    make_folder(out)
+    drives = PlanDrives(out=out, setting=tuple(setting.items()))
+    with terminal.progress("map") as advance:
+        mapped = [(drives, *one) for one in product(plans, SENSORS)]
+        in_processes(PlanDrives.map, mapped, jobs=jobs, advance=advance)
+    with terminal.progress("locate") as advance:
+        asked = [(drives, *one, plans) for one in product(range(seed, seed + queries), plans, SENSORS)]
+        found = in_processes(_locate, asked, jobs=jobs, advance=advance)
+    trials = [trial for some in found for trial in some]
+    cells, elsewhere = matrix(trials), Counter(t.row.status for t in trials if not t.in_building)
+    document = {
+        "plans": names,
+        "queries": queries,
+        "setting": {**setting, "seed": seed},
+        "cells": cells,
+        "outside_the_map": sum(t.in_building and not t.row.covered for t in trials),
+        "elsewhere": dict(sorted(elsewhere.items())),
+    }
+    write_text(out / "matrix.json", json_text(document) + "\n")
+    print_cells("queries that lie in the map, by metres driven", 2, cells)
+    if elsewhere:
+        refused = elsewhere["not_found"]
+        print(f"queries from another building: {refused} of {elsewhere.total()} answered not_found")
+    print(out / "matrix.json")
