@@ -321,13 +321,15 @@ def in_logs(logs: Mapping[str, Drawn], config: Config) -> Iterator[Asked]:
                 yield query, T_map_query, [(grid, SE2())]
 
 
-def in_maps(known: Sequence[Window], folder: Folder) -> Iterator[Asked]:
-    """Windows of recordings, each in the session of its map that shows its place."""
+def in_maps(known: Iterable[Window], folder: Folder) -> Iterator[Asked]:
+    """Windows of recordings, each in the session of its map that shows its place; one is in memory at a time,
+    as those of a lidar hold its points."""
     for window in known:
-        index = index_of(folder.map(window.pair.map_name))
-        session, T_map_base = next(iter(window.truth.items()))
-        grid = index.grids[index.sessions.index(session)]
-        yield window.whole, T_map_base @ window.whole.T_odom_base.inverse(), [(grid, SE2())]
+        if window.covered:
+            index = index_of(folder.map(window.pair.map_name))
+            session, T_map_base = next(iter(window.truth.items()))
+            grid = index.grids[index.sessions.index(session)]
+            yield window.whole, T_map_base @ window.whole.T_odom_base.inverse(), [(grid, SE2())]
 
 
 app = typer.Typer(add_completion=False)
@@ -370,17 +372,23 @@ def weights(
     queries: int = 24,
 ) -> None:
     """Learn and store the statistics."""
-    config, kept = Config(), out.parent / "drives"
-    kept.mkdir(parents=True, exist_ok=True)
-    catalogue, folder = Catalogue.of(), Folder(data.resolve(), work.resolve())
+    config, catalogue, folder = Config(), Catalogue.of(), Folder(data.resolve(), work.resolve())
+    # Beside what this version of the program has made: another one would not read it.
+    kept = folder.work / "logs"
+    kept.mkdir(exist_ok=True)
     building = {name: recording.building for name, recording in catalogue.recordings.items()}
     drawn = {name: read(data, name, queries, kept, config) for name in logs.split(",") if name != without}
-    known = [w for w in windows(catalogue, folder) if w.covered and building[w.pair.map] != without]
+    asked = [
+        pair
+        for pair in catalogue.pairs
+        if pair.kind != "elsewhere" and building[pair.map] != without and folder.map(pair.map_name).exists()
+    ]
     names = [name for name in maps.split(",") if building[f"{name}.yaml"] != without]
     floors = [load_map(data / "maps" / f"{name}.yaml") for name in names]
     floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
     floors += [grid for grid, _ in drawn.values()]
-    floors += [index_of(folder.map(name)).grids[0] for name in sorted({w.pair.map_name for w in known})]
+    floors += [index_of(folder.map(name)).grids[0] for name in sorted({pair.map_name for pair in asked})]
+    known = windows(replace(catalogue, pairs=tuple(asked)), folder)
     pairs = pairs_of(chain(in_logs(drawn, config), in_maps(known, folder)), floors, config)
     SeenStatistics.of(pairs).save(out)
     print(f"{out}: learned from {len(pairs.queries):,} pairs and {len(pairs.other):,} other places")
