@@ -204,7 +204,7 @@ def test_wrong_answers_are_counted_by_confidence_and_by_drive() -> None:
 @pytest.mark.parametrize(
     ("queries", "words"),
     [
-        ((), "Nothing is located."),
+        ((), "Nothing is asked."),
         ((query(0, "refused"),), "Nothing is located."),
         ((query(0, "right"),), "No answer is wrong."),
         ((replace(query(0, "right"), right=None),), "Whether the 1 located answers are right is not known."),

@@ -682,7 +682,7 @@ def _none_wrong(table: Table) -> str:
     """Return what can be said where no answer is known to be wrong."""
     counts = _total(table.pairs)
     if not counts.located:
-        return "Nothing is located."
+        return "Nothing is located." if counts.queries else "Nothing is asked."
     if counts.unjudged == counts.located:
         return f"Whether the {counts.located} located answers are right is not known."
     return "No answer that is judged is wrong." if counts.unjudged else "No answer is wrong."
