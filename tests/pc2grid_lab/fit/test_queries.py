@@ -2,10 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import numpy as np
+import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid_lab.fit.queries import office_floor, pairs_of
+from pc2grid.observer import TimeSpan
+from pc2grid_lab.fit import queries
+from pc2grid_lab.fit.queries import Window, office_floor, pairs_of
+from pc2grid_lab.recordings.catalogue import Catalogue
+from pc2grid_lab.recordings.run import Folder
 from signature.config import Config
 from signature.localization.query import Query
 from tests.helpers.simulated_drives import building, drive, office
@@ -25,3 +33,23 @@ def test_a_view_of_a_query_is_like_what_the_map_shows_there() -> None:
     one = np.linalg.norm(pairs.queries - pairs.same, axis=1)
     two = np.linalg.norm(pairs.queries[:, None] - pairs.other[None], axis=2)
     assert np.median(one) < np.percentile(two, 25)
+
+
+def test_windows_are_taken_one_at_a_time_where_the_map_knows_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    window, taken = Query(OFFICE.made_with, OFFICE.config), []
+    for registered, planar_scan, truth in drive(office(), [(1.5, 7.0), (4.5, 7.0)]):
+        window.add(registered, planar_scan)
+        end = truth
+    query, pair = window.map(), Catalogue.of().pairs[0]
+
+    def known() -> Iterator[Window]:
+        for covered in (False, True, True):
+            taken.append(covered)
+            yield Window(pair, TimeSpan(0.0, 3.0), query, None, query, {"office": end}, covered)
+
+    monkeypatch.setattr(queries, "index_of", lambda _: OFFICE)
+    asked = queries.in_maps(known(), Folder(Path("data"), Path("work")))
+    _, T_map_query, ((grid, _),) = next(asked)
+    assert taken == [False, True] and grid is OFFICE.grids[0]
+    assert T_map_query.apply(np.array([query.center_m]))[0] == pytest.approx((end.x, end.y))
+    assert len(list(asked)) == 1
