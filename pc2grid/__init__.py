@@ -13,7 +13,7 @@ loads its module when it is first used. `help(pc2grid.convert)` and so on explai
 
 From file to file
     convert             a recording or nav2 map becomes a session in a database
-    relocalize          where in a database a recording was made
+    relocalize          where in a database a recording was made: a Found, an Answer that can be drawn
 
 Recordings to maps
     open_log, Log       a recording as a stream of scans
@@ -83,6 +83,7 @@ if TYPE_CHECKING:
     from signature.localization.localizer import Localizer as Localizer
     from signature.localization.map_index import MapIndex as MapIndex
     from signature.localization.posterior import Prior as Prior
+    from signature.localization.shown.page import Found as Found
     from signature.sessions import convert as convert
     from signature.sessions import relocalize as relocalize
 
@@ -121,6 +122,7 @@ _HOMES = {
     "convert": "signature.sessions",
     "relocalize": "signature.sessions",
     "Answer": "signature.localization.answer",
+    "Found": "signature.localization.shown.page",
     "MapIndex": "signature.localization.map_index",
     "Prior": "signature.localization.posterior",
     "Localizer": "signature.localization.localizer",

@@ -26,7 +26,7 @@ Databases
     create_database, open_database, SubmapDatabase, Label
 
 Answers
-    relocalize          where in a database a recording was made: an Answer
+    relocalize          where in a database a recording was made: a Found, an Answer that can be drawn
     Localizer           where registered scans were taken, in a MapIndex: an Estimate after every metre
     locate_map          where a drawn map lies
     Prior               where the robot is known to be, roughly
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from signature.localization.pose_check import PoseCheck as PoseCheck
     from signature.localization.pose_check import check_pose as check_pose
     from signature.localization.posterior import Prior as Prior
+    from signature.localization.shown.page import Found as Found
     from signature.paper import Signature as Signature
     from signature.paper import SignatureTable as SignatureTable
     from signature.paper import describe as signature_of  # noqa: F401
@@ -76,6 +77,7 @@ _HOMES = {
     "convert": "signature.sessions",
     "relocalize": "signature.sessions",
     "Answer": "signature.localization.answer",
+    "Found": "signature.localization.shown.page",
     "MapIndex": "signature.localization.map_index",
     "PoseCheck": "signature.localization.pose_check",
     "check_pose": "signature.localization.pose_check",

@@ -33,7 +33,7 @@ from signature.config import Config
 from signature.database import Label, Provenance, open_database
 from signature.database.maintenance import exists, store
 from signature.database.postgres import is_url
-from signature.localization.answer import NO_POSES, Asked, followed
+from signature.localization.answer import Answer, followed
 from signature.localization.localizer import Estimate, Localizer, locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from pc2grid.mapping.drawn import DrawnMap
     from pc2grid.model import RegisteredScan
     from signature.database import SubmapDatabase
-    from signature.localization.answer import Answer
     from signature.localization.answer_json import QueryRecording
     from signature.localization.pose_check import PoseCheck
     from signature.localization.posterior import Prior
@@ -116,7 +115,7 @@ def relocalize(
     until_located: bool = False,
     recover: bool = False,
     observer: Observer | None = None,
-) -> Answer:
+) -> Found:
     """Find where a recording was made, or where a map lies.
 
     query : a recording, or a map as in `convert`.
@@ -130,7 +129,7 @@ def relocalize(
         or in a notebook.
 
     Raises the errors of `pc2grid.open_log` and `signature.open_database`, MapFileError for a map, and NoScans
-    if no scan can be used. `Answer.plot`, `report` and `save` show the answer.
+    if no scan can be used. `plot`, `report` and `save` show the answer.
 
     >>> import pc2grid
     >>> answer = pc2grid.relocalize("tuesday.mcap", "building.submaps", until_located=True)
@@ -154,9 +153,8 @@ def relocalize(
             until_located=until_located,
             observer=observer,
         )
-    accept = config.relocalize.accept
-    asked = Asked(poses=found.poses, about=found.about, database=str(database), accept=accept)
-    return replace(found.answer, asked=asked)
+    # The name of a server's database in `found` has no password.
+    return replace(found, database=str(database))
 
 
 @contextlib.contextmanager
@@ -207,11 +205,12 @@ def find(
     Raises the errors of `pc2grid.open_log`, MapFileError, NoScans, and what `prior` raises.
     """
     config = query_config(database, config)
+    asked = {"database": database.location, "accept": config.relocalize.accept}
     if is_drawn_map(path):
         drawn = load_drawn_map(path, config)
         answer = locate_map(drawn.grid, index or MapIndex.of(database, config, observer))
         about = about_map(path, drawn, answer)
-        return Found(answer=answer, poses=NO_POSES, about=about, drawn=drawn.grid)
+        return Found.of(answer, about=about, drawn=drawn.grid, **asked)
     with open_log(path, config.read, recover=recover) as log:
         known = prior(log, span)
         index = index or MapIndex.of(database, config, observer)
@@ -228,7 +227,7 @@ def find(
         stamps_ns, poses, health = zip(*seen, strict=True)
         way = Trajectory(stamps_ns=np.array(stamps_ns), T_session_base=np.array(poses), health=health)
         about = about_log(path, log, answer, span, health)
-        return Found(answer=answer, poses=followed(way, answer), about=about, report=log.report())
+        return Found.of(answer, about=about, poses=followed(way, answer), read=log.report(), **asked)
 
 
 def tracked(

@@ -1,48 +1,34 @@
-"""The answer to "where was this?", and how it reads as a document.
+"""The answer to "where was this?": places with their probabilities, and the pose if one of them is certain.
 
-The line on which the likely places of an ambiguous answer lie.
+Three things are made of it. A line, on which the likely places of an ambiguous answer lie: the walls of a
+corridor hold a query across it and with its heading, and along it the query fits again and again, so that
+there are many places and yet much is known. The same answer in the frame of a building, where its session was
+joined with others. The path of the query, corrected by where it was located on the way.
 
-The walls of a corridor hold a query across it, and with its heading; along it the query fits again and again.
-Then there are many places, and yet much is known: a line, and a heading.
-
-Answers in the frame of a building: poses in the maps of joined sessions, moved into one frame.
-
-The path of a query, corrected by where it was located on the way.
+`signature.localization.shown` draws answers.
 """
 
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import compress
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
 from pc2grid.display import html_picture, html_table, map_png, probability, short
-from pc2grid.errors import ConfigError, OutputError
 from pc2grid.geometry import F64, I64, SE2, freeze, wrap_angle
-from pc2grid.io.atomic import replace_file, require_writable
 from pc2grid.model import Health, OccupancyGrid, Trajectory
-from signature.database import open_database
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.answer_json import AnswerDocument, document
+from signature.localization import answer_json as form
+from signature.localization.answer_json import AmbiguousLine, Point
+from signature.localization.answer_json import SpaceStatus as SpaceStatus
 from signature.localization.answer_json import Status as Status
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.posterior import POSTERIOR, PRIOR, Evidence
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
-    from signature.localization.answer_json import QueryRecording
-
-
-SpaceStatus = Literal["agrees", "unsure", "contradicts"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,6 +60,26 @@ class PoseInSpace:
         R = self.T_map_base[:3, :3]
         pitch = math.asin(float(np.clip(-R[2, 0], -1.0, 1.0)))
         return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
+
+    def to_json(self) -> form.PoseInSpace:
+        """Return the pose as plain types."""
+        x, y, z = self.T_map_base[:3, 3].tolist()
+        roll, pitch, yaw = self.rpy_rad
+        return {
+            "status": self.status,
+            "x": x,
+            "y": y,
+            "z": z,
+            "roll": roll,
+            "pitch": pitch,
+            "yaw": yaw,
+            "covariance": self.covariance.tolist(),
+            "rmse_m": self.rmse_m,
+            "rays": self.rays,
+            "on": self.on,
+            "through": self.through,
+            "before": self.before,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -128,23 +134,20 @@ class Moment:
     pose: SE2 | None
     confidence: float
 
-
-NO_POSES = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
-"""Of a query that is a map."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
-    """What an answer of `pc2grid.relocalize` is about, for its picture and its page.
-
-    poses : the query in its own frame, empty for a map. about : the description of the query in the JSON
-    document. database : where was looked. accept : the confidence that `located` needed.
-    """
-
-    poses: Trajectory
-    about: QueryRecording
-    database: str
-    accept: float
+    def to_json(self) -> form.Moment:
+        """Return the moment as plain types."""
+        at = self.pose
+        x, y, yaw = (None, None, None) if at is None else (at.x, at.y, at.yaw)
+        return {
+            "stamp_ns": self.stamp_ns,
+            "path_m": self.path_m,
+            "status": self.status,
+            "session": self.session,
+            "x": x,
+            "y": y,
+            "yaw": yaw,
+            "confidence": self.confidence,
+        }
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -170,7 +173,8 @@ class Answer:
     in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
     none. Of a place that was turned down because they contradict it, the pose there.
     off_map : places beside the map, the likeliest first, see `Verdict`.
-    asked : the question; None unless `pc2grid.relocalize` has answered.
+
+    `pc2grid.relocalize` returns a `Found`, which can be drawn, too.
 
     >>> import pc2grid
     >>> answer = pc2grid.relocalize("tuesday.mcap", "building.submaps")
@@ -207,7 +211,6 @@ class Answer:
     map: OccupancyGrid | None = None
     frames: tuple[str | None, ...] = ()
     off_map: tuple[OffMap, ...] = ()
-    asked: Asked | None = None
 
     def __repr__(self) -> str:
         sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
@@ -241,55 +244,6 @@ class Answer:
         walls_m = self.local_map.to_point(np.argwhere(self.local_map.occupied))
         there_m = self.hypotheses[0].fit.T_map_query.apply(walls_m)
         return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
-
-    def plot(self) -> Figure:
-        """The map with the best hypothesis, and what supports and contradicts it, as a figure of matplotlib.
-
-        A notebook shows it; `figure.savefig` and `save` write it.
-        """
-        # What draws answers knows them.
-        from signature.localization.shown.picture import answer_figure, figure_png
-
-        poses = NO_POSES if self.asked is None else self.asked.poses
-        figure = answer_figure(self, self.map or self.local_map, poses)
-        figure._repr_png_ = partial(figure_png, figure)  # type: ignore[attr-defined]
-        return figure
-
-    def report(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the page of `pc2grid relocalize --report`, which needs no network.
-
-        The database is read again: it must be there still, and be no map.
-
-        Raises ConfigError unless `pc2grid.relocalize` has answered, OutputError if the page cannot be
-        written, and the errors of `pc2grid.open_database`.
-        """
-        from signature.localization.shown.page import Found, write_report
-
-        if self.asked is None:
-            raise ConfigError(
-                "report: the answer does not know its recording", hint="pc2grid.relocalize's does"
-            )
-        require_writable(path, overwrite)
-        with open_database(self.asked.database) as database:
-            found = Found(answer=self, poses=self.asked.poses, about=self.asked.about)
-            write_report(Path(path), database, found=found, accept=self.asked.accept)
-
-    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
-        """Write the answer: as the document of `to_json` to a .json, as the picture of `plot` to a .png.
-
-        Raises OutputError for another suffix, and for a file that exists without `overwrite`.
-        """
-        from signature.localization.shown.picture import write_figure
-
-        path = Path(path)
-        if path.suffix not in (".json", ".png"):
-            raise OutputError(f"{path}: an answer is saved as .json or .png", hint="end its name so")
-        require_writable(path, overwrite)
-        if path.suffix == ".png":
-            write_figure(self.plot(), path)
-            return
-        with replace_file(path) as temporary:
-            temporary.write_text(json.dumps(self.to_json(), indent=1), encoding="utf-8")
 
     @property
     def slipped(self) -> float:
@@ -325,10 +279,69 @@ class Answer:
         """The frame of the building that the pose is in; None: the map frame of the session."""
         return self.frame_of(self.hypotheses[0]) if self.status == "located" else None
 
-    def to_json(self) -> AnswerDocument:
-        """The answer as plain types: most of what `pc2grid relocalize --json` prints."""
-        return document(self)
+    @property
+    def stamped_pose(self) -> form.StampedPose | None:
+        """The pose of the base as plain types; None unless it is located."""
+        if self.T_map_base is None or self.covariance is None:
+            return None
+        pose = _planar(self.T_map_base)
+        return {"stamp_ns": self.stamp_ns, **pose, "covariance": self.covariance.tolist()}
 
+    @property
+    def off_map_pose(self) -> form.OffMap | None:
+        """Where the base is beside the map, as plain types; None if it is not most likely there."""
+        away = self.beside_map
+        if away is None:
+            return None
+        h = away.hypothesis
+        return {
+            "session": self.sessions[h.session_index],
+            "frame": self.frame_of(h),
+            **_planar(h.fit.T_map_query @ self.T_odom_base),
+            "covariance": h.fit.covariance.tolist(),
+            "probability": away.mass,
+        }
+
+    def to_json(self) -> form.AnswerDocument:
+        """Return the answer as plain types: most of what `pc2grid relocalize --json` prints."""
+        excluded = None if self.excluded is None else self.excluded.to_json()
+        about: form.AnswerDocument = {
+            "status": self.status,
+            "session": self.session,
+            "frame": self.frame,
+            "building": self.label.building,
+            "floor": self.label.floor,
+            "pose": self.stamped_pose,
+            "T_map_odom": self.T_map_odom,
+            "confidence": self.confidence,
+            "hypotheses": [
+                {
+                    "session": self.sessions[h.session_index],
+                    "frame": self.frame_of(h),
+                    "building": self.labels[h.session_index].building,
+                    "floor": self.labels[h.session_index].floor,
+                    "submap_id": submap_id if submap_id >= 0 else None,
+                    "place": place,
+                    **_planar(h.fit.T_map_query @ self.T_odom_base),
+                    "score": h.fit.score,
+                    "overlap": h.fit.overlap,
+                }
+                for h, submap_id, place in zip(self.hypotheses, self.submap_ids, self.places, strict=True)
+            ],
+            "history": [moment.to_json() for moment in self.history],
+            "line": self.line,
+            "off_map": self.off_map_pose,
+            "prior": None if self.prior is None else {"status": self.prior, "excluded": excluded},
+            "in_space": None if self.in_space is None else self.in_space.to_json(),
+            "query": {"path_m": self.path_m, "stamp_ns": self.stamp_ns},
+            "database": {"sessions": list(self.sessions)},
+            "timing_ms": self.timing_ms,
+        }
+        made: form.AnswerDocument = form.plain(form.AnswerDocument, about)
+        return made
+
+
+AnswerT = TypeVar("AnswerT", bound=Answer)
 
 _SHOWN = 6
 """Hypotheses in the table of a notebook, as many as in the picture of the command line."""
@@ -338,27 +351,12 @@ def _pose(pose: SE2) -> str:
     return f"x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class AmbiguousLine:
-    """A line on which likely places lie, all with one heading.
-
-    begin_m, end_m : (x, y) of its ends, in the frame of the best hypothesis. yaw_rad : the heading there.
-    probability : that the base is at one of these places.
-    """
-
-    begin_m: tuple[float, float]
-    end_m: tuple[float, float]
-    yaw_rad: float
-    probability: float
-
-    @property
-    def length_m(self) -> float:
-        """From one end to the other."""
-        return math.dist(self.begin_m, self.end_m)
+def _planar(pose: SE2) -> form.Pose:
+    return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
 
 
 def ambiguous_line(bases: Sequence[SE2], masses: Sequence[float]) -> AmbiguousLine | None:
-    """The line through the best place that most of the mass lies on, with the heading of that place.
+    """Return the line through the best place that most of the mass lies on, with the heading of that place.
 
     bases : the base at each place of one frame, best first. masses : of each. None if no other place has this
     heading, or if it is not likely that the base is at one of them.
@@ -369,7 +367,7 @@ def ambiguous_line(bases: Sequence[SE2], masses: Sequence[float]) -> AmbiguousLi
 
 
 def _through(bases: Sequence[SE2], masses: Sequence[float], other: int) -> AmbiguousLine | None:
-    """The line through the best place and another one; None if their headings differ."""
+    """Return the line through the best place and another one; None if their headings differ."""
     poses = np.array([(base.x, base.y, base.yaw) for base in bases])
     away_m, turned = poses[:, :2] - poses[0, :2], np.abs(wrap_angle(poses[:, 2] - poses[0, 2]))
     length_m = math.hypot(*away_m[other])
@@ -380,17 +378,22 @@ def _through(bases: Sequence[SE2], masses: Sequence[float], other: int) -> Ambig
     on_line = np.flatnonzero((turned < HYPOTHESES.same_rad) & (across_m < HYPOTHESES.same_m))
     at_m = away_m[on_line] @ along
     ends = on_line[[at_m.argmin(), at_m.argmax()]]
-    (x, y), (to_x, to_y) = poses[ends, :2].tolist()
-    mass = float(np.asarray(masses)[on_line].sum())
-    return AmbiguousLine(begin_m=(x, y), end_m=(to_x, to_y), yaw_rad=bases[0].yaw, probability=mass)
+    begin, end = (Point(*xy) for xy in poses[ends, :2].tolist())
+    return AmbiguousLine(
+        begin=begin,
+        end=end,
+        yaw_rad=bases[0].yaw,
+        length_m=math.dist(poses[ends[0], :2], poses[ends[1], :2]),
+        probability=float(np.asarray(masses)[on_line].sum()),
+    )
 
 
 _APART = BuildingFrame(name="", T_building_session=SE2(), covariance=((0.0,) * 3,) * 3)
 """Of a session that is not joined: its poses stay as they are."""
 
 
-def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> Answer:
-    """An answer with all poses in the frames of the buildings, where their sessions have one.
+def answer_in_building(answer: AnswerT, frames: Mapping[str, BuildingFrame]) -> AnswerT:
+    """Return an answer with all poses in the frames of the buildings, where their sessions have one.
 
     frames : of sessions that were joined, by name (`SubmapDatabase.frames`). Covariances contain how exactly
     the session is known to lie in its building.
@@ -428,8 +431,11 @@ def answer_in_building(answer: Answer, frames: Mapping[str, BuildingFrame]) -> A
 
 
 def covariance_in_building(covariance: F64, T_session_base: SE2, frame: BuildingFrame) -> F64:
-    """The covariance (3, 3) of a pose in a session's map as one in its building: turned, and with that of the
-    session's own place, whose heading moves the pose the more the farther it is from the session's origin."""
+    """Return the covariance (3, 3) of a pose in a session's map as one in its building.
+
+    It is turned, and contains that of the session's own place, whose heading moves the pose the more the
+    farther it is from the session's origin.
+    """
     T = frame.T_building_session
     there = frame.placed(T_session_base)
     turn = SE2(0.0, 0.0, there.yaw - T_session_base.yaw).matrix()
@@ -463,7 +469,7 @@ def _in_space(pose: PoseInSpace, frame: BuildingFrame) -> PoseInSpace:
 
 
 def followed(poses: Trajectory, answer: Answer) -> Trajectory:
-    """The query's poses (odometry frame of its last scan), corrected by where it was located on the way.
+    """Return the query's poses (odometry frame of its last scan), corrected where it was located on the way.
 
     Between two located moments the correction is interpolated along the travel, in position and heading of
     the base; before the first one it is that of the first. Where registration was lost the motion is not
@@ -472,7 +478,6 @@ def followed(poses: Trajectory, answer: Answer) -> Trajectory:
 
     Without an answer: as they are.
     """
-
     if answer.T_map_odom is None:
         return poses
     planar = poses.planar()
@@ -502,8 +507,7 @@ def followed(poses: Trajectory, answer: Answer) -> Trajectory:
 
 
 def _located_moments(poses: Trajectory, travel_m: F64, part: I64, answer: Answer) -> tuple[I64, list[SE2]]:
-    """The scans at which the query was located in the session of the answer, and the base in its map."""
-
+    """Return the scans at which the query was located in the session of the answer, and the bases there."""
     planar = poses.planar()
     found = [
         (int(np.searchsorted(poses.stamps_ns, moment.stamp_ns)), moment.pose)

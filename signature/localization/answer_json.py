@@ -1,26 +1,25 @@
-"""The JSON document of an answer: its type, of which JSON and JSON Schema are made, and what fills it.
+"""The types of the JSON documents about answers, of which JSON and JSON Schema are made.
 
-Metres, radians, int64 nanoseconds.
+Metres, radians, int64 nanoseconds. `signature.localization.answer` fills them.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import TypeAdapter
+from pydantic import Field, TypeAdapter
 
 # Before Python 3.12 pydantic does not take the TypedDict of typing. All documents take it from here.
 from typing_extensions import TypedDict as TypedDict
 
 from pc2grid.geometry import SE2
 
-if TYPE_CHECKING:
-    from signature.localization import answer
-
 SCHEMA_VERSION = 1
 """Of all documents. Within a version they only gain keys: a reader must ignore keys that it does not know."""
 Status = Literal["located", "ambiguous", "not_found"]
+SpaceStatus = Literal["agrees", "unsure", "contradicts"]
 
 
 class Pose(TypedDict):
@@ -113,7 +112,7 @@ class PoseInSpace(TypedDict):
     the points agree with the map. rays were compared; on, through, before: shares of them that end on a
     surface of the map, behind one, and before one where the map has none."""
 
-    status: Literal["agrees", "unsure", "contradicts"]
+    status: SpaceStatus
     x: float
     y: float
     z: float
@@ -128,20 +127,22 @@ class PoseInSpace(TypedDict):
     before: float
 
 
-class Point(TypedDict):
+@dataclass(frozen=True, slots=True)
+class Point:
     """A point of a map, metres."""
 
     x: float
     y: float
 
 
-class AmbiguousLine(TypedDict):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AmbiguousLine:
     """Likely places that lie on one line, all with the heading `yaw`. begin, end: the places at its ends, in
     the frame of the best hypothesis. probability: that the base is at one of these places."""
 
     begin: Point
     end: Point
-    yaw: float
+    yaw_rad: Annotated[float, Field(serialization_alias="yaw")]
     length_m: float
     probability: float
 
@@ -192,131 +193,8 @@ adapter = cache(TypeAdapter)
 
 
 def plain(kind: type, document: Any) -> Any:
-    """A document of plain types: the frozen types in it become objects, with the digits that they declare."""
+    """Return a document of plain types: frozen types in it become objects, with the digits they declare."""
     return {
         "schema_version": SCHEMA_VERSION,
         **adapter(kind).dump_python(document, mode="json", by_alias=True),
     }
-
-
-def document(answer: answer.Answer) -> AnswerDocument:
-    """An answer as plain types."""
-    excluded = None if answer.excluded is None else _moment(answer.excluded)
-    about: AnswerDocument = {
-        "status": answer.status,
-        "session": answer.session,
-        "frame": answer.frame,
-        "building": answer.label.building,
-        "floor": answer.label.floor,
-        "pose": stamped_pose(answer),
-        "T_map_odom": answer.T_map_odom,
-        "confidence": answer.confidence,
-        "hypotheses": [
-            {
-                "session": answer.sessions[h.session_index],
-                "frame": answer.frame_of(h),
-                "building": answer.labels[h.session_index].building,
-                "floor": answer.labels[h.session_index].floor,
-                "submap_id": submap_id if submap_id >= 0 else None,
-                "place": place,
-                **_pose(h.fit.T_map_query @ answer.T_odom_base),
-                "score": h.fit.score,
-                "overlap": h.fit.overlap,
-            }
-            for h, submap_id, place in zip(answer.hypotheses, answer.submap_ids, answer.places, strict=True)
-        ],
-        "history": [_moment(moment) for moment in answer.history],
-        "line": _line(answer),
-        "off_map": off_map_document(answer),
-        "prior": None if answer.prior is None else {"status": answer.prior, "excluded": excluded},
-        "in_space": in_space_document(answer),
-        "query": {"path_m": answer.path_m, "stamp_ns": answer.stamp_ns},
-        "database": {"sessions": list(answer.sessions)},
-        "timing_ms": answer.timing_ms,
-    }
-    made: AnswerDocument = plain(AnswerDocument, about)
-    return made
-
-
-def _line(answer: answer.Answer) -> AmbiguousLine | None:
-    """The line of an ambiguous answer."""
-    line = answer.line
-    if line is None:
-        return None
-    (x, y), (to_x, to_y) = line.begin_m, line.end_m
-    return {
-        "begin": {"x": x, "y": y},
-        "end": {"x": to_x, "y": to_y},
-        "yaw": line.yaw_rad,
-        "length_m": line.length_m,
-        "probability": line.probability,
-    }
-
-
-def off_map_document(answer: answer.Answer) -> OffMap | None:
-    """Where the base is beside the map; None if it is not most likely there."""
-    away = answer.beside_map
-    if away is None:
-        return None
-    h = away.hypothesis
-    return {
-        "session": answer.sessions[h.session_index],
-        "frame": answer.frame_of(h),
-        **_pose(h.fit.T_map_query @ answer.T_odom_base),
-        "covariance": h.fit.covariance.tolist(),
-        "probability": away.mass,
-    }
-
-
-def stamped_pose(answer: answer.Answer) -> StampedPose | None:
-    """The pose of the base; None unless it is located."""
-    if answer.T_map_base is None or answer.covariance is None:
-        return None
-    return {
-        "stamp_ns": answer.stamp_ns,
-        **_pose(answer.T_map_base),
-        "covariance": answer.covariance.tolist(),
-    }
-
-
-def in_space_document(answer: answer.Answer) -> PoseInSpace | None:
-    """The pose with six degrees of freedom; None if the map or the query has no points."""
-    pose = answer.in_space
-    if pose is None:
-        return None
-    x, y, z = pose.T_map_base[:3, 3].tolist()
-    roll, pitch, yaw = pose.rpy_rad
-    return {
-        "status": pose.status,
-        "x": x,
-        "y": y,
-        "z": z,
-        "roll": roll,
-        "pitch": pitch,
-        "yaw": yaw,
-        "covariance": pose.covariance.tolist(),
-        "rmse_m": pose.rmse_m,
-        "rays": pose.rays,
-        "on": pose.on,
-        "through": pose.through,
-        "before": pose.before,
-    }
-
-
-def _moment(moment: answer.Moment) -> Moment:
-    at = moment.pose
-    x, y, yaw = (None, None, None) if at is None else (at.x, at.y, at.yaw)
-    return {
-        "stamp_ns": moment.stamp_ns,
-        "path_m": moment.path_m,
-        "status": moment.status,
-        "session": moment.session,
-        "x": x,
-        "y": y,
-        "yaw": yaw,
-        "confidence": moment.confidence,
-    }
-
-
-def _pose(pose: SE2) -> Pose:
-    return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}

@@ -17,10 +17,10 @@ from typer.testing import CliRunner
 
 from pc2grid.model import MapOf, SensorKind
 from pc2grid.settings import dump_settings
-from pc2grid_cli.commands import export_command, simulate_command
 from pc2grid_cli.console import print_result
 from pc2grid_cli.documents import DOCUMENTS, schema
 from pc2grid_cli.main import app
+from pc2grid_cli.options import Export, Simulate
 from signature.config import Config
 from tests.helpers.json_schema import closed, keys
 
@@ -136,8 +136,8 @@ def test_every_command_shows_an_example_that_parses(name: str, command: Any) -> 
 @pytest.mark.parametrize(
     ("command", "option", "values"),
     [
-        (simulate_command, "sensor", SensorKind),
-        (export_command, "map_of_", MapOf),
+        (Simulate, "sensor", SensorKind),
+        (Export, "map_of", MapOf),
     ],
 )
 def test_an_option_takes_all_values_of_its_type(command: Any, option: str, values: Any) -> None:

@@ -26,7 +26,7 @@ from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.documents import schema
 from pc2grid_cli.main import app
-from pc2grid_cli.windows import write_places
+from pc2grid_cli.relocalize import write_places
 from signature.localization.map_index import MapIndex
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed

@@ -1,28 +1,27 @@
-"""What `pc2grid convert` does: jobs for its inputs, their results stored one after the other.
+"""`pc2grid convert`: jobs for its inputs, whose results are stored one after the other.
 
-What a database holds already of the sessions that `convert` would make.
+Before that it is compared with what the database holds already: a stored session that was made of the same
+input with the same settings stays, and any other of its name is refused.
 """
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-import typer
+from pydantic import Field
 
+from pc2grid import libraries as extras
 from pc2grid.display import counted
 from pc2grid.errors import ConfigError, DatabaseError, OutputError, Pc2GridError, one_line
 from pc2grid.model import is_part_of
-from pc2grid.observer import Observer, TimeSpan
-from pc2grid_cli import console
-from pc2grid_cli import output as data_loss
-from pc2grid_cli.documents import Converted, JoinedSession, OfDatabase, joined_document, session_document
-from pc2grid_cli.output import check_database_name
+from pc2grid.observer import Observer
+from pc2grid_cli import console, options, output
+from pc2grid_cli.documents import Converted, JoinedSession, joined_document, session_document
 from signature import conversion_jobs
-from signature.config import Config
 from signature.conversion_jobs import Job
 from signature.database import Label, Provenance, maintenance, open_database
 from signature.database.postgres import is_url
@@ -32,84 +31,37 @@ from signature.localization.joining.building import join_sessions
 from signature.sessions import digest_of
 
 
-class Convert(OfDatabase):
-    """`pc2grid convert --json`. unchanged: sessions that were stored already; failed: inputs left out.
-    joined: where those of the new sessions lie in a building that were joined with others."""
-
-    lossy: bool
-    sessions: list[Converted]
-    unchanged: list[str]
-    failed: list[str]
-    joined: list[JoinedSession]
-
-
-def jobs_of(
-    inputs: list[Path],
-    name: str | None,
-    settings: Config,
-    *,
-    span: TimeSpan,
-    recover: bool,
-    label: Label,
-) -> list[Job]:
-    """A job for each input. Raises ConfigError if two of them have the same name."""
-    if name is not None and len(inputs) > 1:
-        raise ConfigError("--name names one session, but there are several inputs")
-    names = [name or path.stem for path in inputs]
-    twice = sorted({n for n in names if names.count(n) > 1})
-    if twice:
-        raise ConfigError(
-            f"two inputs would both be the session {twice[0]!r}", hint="convert one later with --add --name"
-        )
-    return [
-        Job(path=path, name=session, config=settings, span=span, recover=recover, label=label)
-        for path, session in zip(inputs, names, strict=True)
-    ]
-
-
 @dataclass(kw_only=True)
-class Done:
-    """The results of all inputs so far.
+class Convert:
+    """`pc2grid convert --json`. database: its path, or its URL without a password. lossy: data was lost, or
+    an input failed. unchanged: sessions that were stored already; failed: inputs left out. joined: where
+    those of the new sessions lie in a building that were joined with others."""
 
-    lossy : data was lost, or an input failed. severe : so much that the exit code is 3. joined : where those
-    of the new sessions lie in a building that were joined with others.
-    """
-
+    database: str
+    lossy: bool = False
     sessions: list[Converted] = field(default_factory=list)
     unchanged: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    warnings: list[str] = field(default_factory=list)
     joined: list[JoinedSession] = field(default_factory=list)
-    lossy: bool = False
-    severe: bool = False
+    # So much was lost that the exit code is 3.
+    severe: Annotated[bool, Field(exclude=True)] = False
+    warnings: Annotated[list[str], Field(exclude=True)] = field(default_factory=list)
 
-    def document(self, database: str) -> Any:
-        """What `--json` prints."""
-        document: Convert = {
-            "database": database,
-            "lossy": self.lossy,
-            "sessions": self.sessions,
-            "unchanged": self.unchanged,
-            "failed": self.failed,
-            "joined": self.joined,
-        }
-        return plain(Convert, document)
-
-    def add(self, entry: Entry, *, quiet: bool, strict: bool) -> None:
+    def add(self, entry: Entry, given: options.Convert) -> None:
         """Keep and print a session made of one input."""
         session, _, origin = entry
         document = session_document(session, origin)
         self.sessions.append(document)
-        if not quiet:
+        if not given.json:
             print(one_line(_as_text(document)), flush=True)
         name, report = session.session, session.report
         self.warnings += [f"{name}: {warning}" for warning in report.warnings]
         if not session.submaps:
             self.warnings.append(f"{name}: no free space to cut submaps from: nothing is found in it")
         if report.lossy:
-            self.warnings.append(f"{name}: {data_loss.sentence(report)}")
+            self.warnings.append(f"{name}: {output.sentence(report)}")
             self.lossy = True
-            self.severe = self.severe or data_loss.ends_with_3(report, strict)
+            self.severe = self.severe or output.ends_with_3(report, given.strict)
 
     def fail(self, job: Job) -> None:
         """Count an input that failed while others go on."""
@@ -117,26 +69,56 @@ class Done:
         self.lossy = self.severe = True
 
 
-def convert_all(
-    jobs: list[Job],
-    output: str,
-    terminal: console.Console,
-    *,
-    keep: bool,
-    force: bool,
-    dask: str | None,
-    processes: int | None,
-    quiet: bool,
-    strict: bool,
-) -> Done:
-    """Convert, here or on a cluster, and store each result in a transaction of its own, in order."""
-    done = Done()
+def run(given: options.Convert, terminal: console.Console) -> int | None:
+    """Convert and store what is not stored yet, join it, and print what there is. Return the exit code."""
+    if given.dask is not None and (given.jobs is not None or "://" not in given.dask):
+        raise ConfigError(
+            "--dask ADDRESS names the scheduler of a cluster", hint="--jobs N: processes of this machine"
+        )
+    cluster = {} if given.dask is None else {"cluster": "--dask"}
+    extras.require(cluster | extras.of_addresses(given.output))
+    jobs = _jobs(given)
+    stored = _stored_sessions(given, jobs)
+    if any(job.name not in stored for job in jobs):
+        output.check_database(given.output)
+    jobs = [replace(job, stored=stored.get(job.name)) for job in jobs]
+    done = _convert_all(jobs, given, terminal, keep=given.add or bool(stored))
+    _join_added(done, given, terminal)
+    return _conclude(done, given)
+
+
+def _jobs(given: options.Convert) -> list[Job]:
+    """Return a job for each input. Raises ConfigError if two of them have the same name."""
+    if given.name is not None and len(given.inputs) > 1:
+        raise ConfigError("--name names one session, but there are several inputs")
+    names = [given.name or path.stem for path in given.inputs]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ConfigError(
+            f"two inputs would both be the session {twice[0]!r}", hint="convert one later with --add --name"
+        )
+    settings = given.settings(preset=given.preset, points=not given.no_points)
+    label = Label(building=given.building, floor=given.floor)
+    return [
+        Job(path=path, name=name, config=settings, span=given.span, recover=given.recover, label=label)
+        for path, name in zip(given.inputs, names, strict=True)
+    ]
+
+
+def _convert_all(
+    jobs: Sequence[Job], given: options.Convert, terminal: console.Console, *, keep: bool
+) -> Convert:
+    """Convert, here or on a cluster, and store each result in a transaction of its own, in order.
+
+    keep : the sessions that the database holds.
+    """
+    done = Convert(database=maintenance.shown(given.output))
     with contextlib.ExitStack() as stack:
         if len(jobs) > 1:
             stack.enter_context(_note_stored(terminal, done, len(jobs)))
         # If this block is left early, the cluster ends before anything is printed about it.
-        for outcome in stack.enter_context(_outcomes(jobs, dask, processes, terminal.observer())):
-            error = _store(outcome, output, keep=keep, force=force)
+        for outcome in stack.enter_context(_outcomes(jobs, given, terminal.observer())):
+            error = _store(outcome, given, keep=keep)
             if error is not None and len(jobs) == 1:
                 raise error
             if error is not None:
@@ -148,35 +130,35 @@ def convert_all(
             else:
                 keep = True
                 for entry in outcome.entries:
-                    done.add(entry, quiet=quiet, strict=strict)
+                    done.add(entry, given)
     return done
 
 
 @contextlib.contextmanager
 def _outcomes(
-    jobs: list[Job], dask: str | None, processes: int | None, observer: Observer
+    jobs: Sequence[Job], given: options.Convert, observer: Observer
 ) -> Iterator[Iterator[conversion_jobs.Outcome]]:
-    """The results of the jobs as they come, in their order; leaving the block ends what is not done."""
-    if dask is None and processes is None:
+    """Yield the results of the jobs in their order, as they come; leaving the block ends what is not done."""
+    if given.dask is None and given.jobs is None:
         with contextlib.closing(conversion_jobs.here(jobs, observer)) as outcomes:
             yield outcomes
         return
     workers = (
-        conversion_jobs.on_cluster(dask)
-        if dask is not None
-        else conversion_jobs.processes_here(min(processes or 1, len(jobs)))
+        conversion_jobs.on_cluster(given.dask)
+        if given.dask is not None
+        else conversion_jobs.processes_here(min(given.jobs or 1, len(jobs)))
     )
     at_once = conversion_jobs.at_once(jobs, workers, observer)
     with observer.step(f"convert {len(jobs)} recordings"), contextlib.closing(at_once) as outcomes:
         yield outcomes
 
 
-def _store(outcome: conversion_jobs.Outcome, output: str, *, keep: bool, force: bool) -> Exception | None:
-    """Store what a job made, if anything. Returns why it failed, or why its result is refused."""
+def _store(outcome: conversion_jobs.Outcome, given: options.Convert, *, keep: bool) -> Exception | None:
+    """Store what a job made, if anything. Return why it failed, or why its result is refused."""
     if not outcome.entries:
         return outcome.error
     try:
-        maintenance.store(output, outcome.entries, keep=keep, overwrite=force)
+        maintenance.store(given.output, outcome.entries, keep=keep, overwrite=given.force)
     except DatabaseError as refusal:
         if type(refusal) is not DatabaseError:  # a subclass: the database itself cannot be used
             raise
@@ -185,8 +167,8 @@ def _store(outcome: conversion_jobs.Outcome, output: str, *, keep: bool, force: 
 
 
 @contextlib.contextmanager
-def _note_stored(terminal: console.Console, done: Done, count: int) -> Iterator[None]:
-    """If the block fails, print how many sessions are stored: they stay."""
+def _note_stored(terminal: console.Console, done: Convert, count: int) -> Iterator[None]:
+    """Print, if the block fails, how many sessions are stored: they stay."""
     try:
         yield
     except BaseException:
@@ -205,25 +187,19 @@ def _as_text(d: Converted) -> str:
     return f"{d['session']}{floor}: {travel}{d['area_m2']:.0f} m2 free, {counted(d['submaps'], 'submap')}"
 
 
-def join_added(
-    output: str,
-    done: Done,
-    terminal: console.Console,
-    *,
-    wanted: bool | None,
-) -> None:
+def _join_added(done: Convert, given: options.Convert, terminal: console.Console) -> None:
     """Join the new sessions with those that the database holds.
 
-    wanted : None: only if the database holds sessions that are joined already.
+    Without --join and --no-join: only if the database holds sessions that are joined already.
     """
     names = [document["session"] for document in done.sessions]
-    if wanted is False or not names:
+    if given.join is False or not names:
         return
-    with open_database(output) as opened:
-        if wanted is None and not opened.frames():
+    with open_database(given.output) as opened:
+        if given.join is None and not opened.frames():
             return
         found = join_sessions(opened, only=names, observer=terminal.observer())
-    maintenance.place(output, found.frames)
+    maintenance.place(given.output, found.frames)
     done.joined = [joined_document(name, found.frames[name]) for name in names if name in found.frames]
     for document in done.joined:
         terminal.note(f"{document['session']}: joined, in the frame of {document['frame']}")
@@ -232,66 +208,66 @@ def join_added(
         done.warnings.append(f"{', '.join(alone)}: not joined with another session; see `pc2grid db join`")
 
 
-def conclude(output: str, done: Done, count: int, *, json: bool) -> None:
-    """Print what there is now, and what is to be said of it; end with the exit code."""
-    where = maintenance.shown(output)
-    if json:
-        console.print_result(done.document(where))
-    elif Path(output).is_file():
-        print(f"{where}: {Path(output).stat().st_size / 1e6:.1f} MB")
+def _conclude(done: Convert, given: options.Convert) -> int | None:
+    """Print what there is now, and what is to be said of it. Return the exit code."""
+    count, path = len(given.inputs), Path(given.output)
+    if given.json:
+        console.print_result(plain(Convert, done))
+    elif path.is_file():
+        print(f"{done.database}: {path.stat().st_size / 1e6:.1f} MB")
     for warning in done.warnings:
         console.warn(warning)
     if done.failed:
         console.warn(f"{len(done.failed)} of {count} failed: {', '.join(done.failed)}")
     if len(done.failed) == count:
-        raise typer.Exit(console.FAILED)
-    if done.severe:
-        raise typer.Exit(console.LOSSY)
+        return console.FAILED
+    return console.LOSSY if done.severe else None
 
 
-def stored_sessions(output: str, jobs: Sequence[Job], *, add: bool, force: bool) -> dict[str, Provenance]:
-    """Provenance of the sessions that are stored already and stay; without any, a new database is made.
+def _stored_sessions(given: options.Convert, jobs: Sequence[Job]) -> dict[str, Provenance]:
+    """Return the provenance of the sessions that are stored already and stay; {}: a new database is made.
 
     Raises OutputError if a database exists that the inputs must not be written to, DatabaseError if one that
     they are added to has a session of the same name that was made otherwise.
     """
-    there = maintenance.exists(output)
-    if not is_url(output) and not (there and add):
-        check_database_name(output)
+    add, force = given.add, given.force
+    there = maintenance.exists(given.output)
+    if not is_url(given.output) and not (there and add):
+        output.check_database_name(given.output)
     if not there or (force and not add):
         return {}
-    present = _present(output, jobs, add=add)
+    present = _present(given.output, jobs, add=add)
     if force:
         return {}
     difference = _difference(present, jobs)
     if not add:
-        _refuse_others(output, present, jobs, difference)
+        _refuse_others(given.output, present, jobs, difference)
     elif difference:
         raise DatabaseError(
-            f"{maintenance.shown(output)}: holds the session{difference}",
+            f"{maintenance.shown(given.output)}: holds the session{difference}",
             hint="--force replaces it; --name gives this one another name",
         )
     return present
 
 
-def _present(output: str, jobs: Sequence[Job], *, add: bool) -> dict[str, Provenance]:
-    """Provenance of the stored sessions by name."""
+def _present(database: str, jobs: Sequence[Job], *, add: bool) -> dict[str, Provenance]:
+    """Return the provenance of the stored sessions by name."""
     try:
-        with open_database(output) as opened:
+        with open_database(database) as opened:
             # A database may hold a whole fleet: for adding, only sessions of the same names matter.
             known = opened.sessions([job.name for job in jobs] if add else None)
         return {info.name: info.provenance for info in known}
     except DatabaseError:
         if add:
             raise
-        where = maintenance.shown(output)
+        where = maintenance.shown(database)
         raise OutputError(f"{where}: exists already", hint="--force replaces it") from None
 
 
 def _refuse_others(
-    output: str, present: Mapping[str, Provenance], jobs: Sequence[Job], difference: str
+    database: str, present: Mapping[str, Provenance], jobs: Sequence[Job], difference: str
 ) -> None:
-    """Raises OutputError unless the database is what an interrupted conversion of these jobs left behind."""
+    """Raise OutputError unless the database is what an interrupted conversion of these jobs left behind."""
     others = {
         name for name in present if not any(name == job.name or is_part_of(name, job.name) for job in jobs)
     }
@@ -302,13 +278,13 @@ def _refuse_others(
         difference = " and is made from the same input with the same settings"
     if difference:
         raise OutputError(
-            f"{maintenance.shown(output)}: exists already{difference}",
+            f"{maintenance.shown(database)}: exists already{difference}",
             hint="--force replaces it, --add adds to it",
         )
 
 
 def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
-    """How a stored session differs from the one that would be made, as the end of a sentence; empty: none."""
+    """Return the end of a sentence on how a stored session differs from the one that would be made, or ""."""
     for job in jobs:
         if job.name not in present:
             continue
@@ -324,7 +300,7 @@ def _difference(present: Mapping[str, Provenance], jobs: Sequence[Job]) -> str:
 
 
 def _settings(origin: Provenance) -> dict[str, Any]:
-    """What a session is made with: label, part of the recording, settings, versions of the libraries."""
+    """Return what a session is made with: label, part of the recording, settings, versions of libraries."""
     found: dict[str, Any] = {"start": origin.start_s, "duration": origin.duration_s}
     found |= {"building": origin.label.building, "floor": origin.label.floor}
     found |= {f"{section}.{key}": value for section, part in origin.config for key, value in part}
@@ -332,7 +308,7 @@ def _settings(origin: Provenance) -> dict[str, Any]:
 
 
 def _changed(was: Provenance, job: Job) -> bool:
-    """Whether the input has other content than that of the stored session."""
+    """Return whether the input has other content than that of the stored session."""
     try:
         return digest_of(job.path, job.config) != was.digest
     except Pc2GridError:

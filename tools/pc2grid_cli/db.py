@@ -1,6 +1,7 @@
-"""`pc2grid db`: look into databases, check, change, merge, split and copy them.
+"""`pc2grid db`: the sessions of a database: shown, checked, copied, renamed, removed, joined.
 
-`pc2grid db join`: which sessions show one building, and how they lie to each other.
+What is said of a database is the same for all commands that write one: how many sessions it holds now, and
+what damage was left out of a copy. `db join` draws and lists the pairs of sessions that were compared.
 """
 
 from __future__ import annotations
@@ -9,12 +10,10 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-import typer
-
 from pc2grid.display import counted, probability
-from pc2grid.errors import DatabaseError, one_line
+from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid.geometry import SE2
-from pc2grid_cli import console
+from pc2grid_cli import console, options, output
 from pc2grid_cli.documents import (
     JoinedSession,
     OfDatabase,
@@ -23,12 +22,11 @@ from pc2grid_cli.documents import (
     joined_document,
     stored_document,
 )
-from pc2grid_cli.output import show, table
 from signature.database import Problem, SessionInfo, SubmapDatabase, maintenance, open_database
-from signature.database.maintenance import check, shown
+from signature.database.maintenance import shown
 from signature.database.protocol import largest_m
 from signature.localization.answer_json import TypedDict, plain
-from signature.localization.joining.building import Joined
+from signature.localization.joining.building import Joined, join_sessions
 from signature.localization.joining.join import JoinStatus, SessionPair
 from signature.localization.shown.picture import draw_building
 
@@ -54,9 +52,9 @@ class DbWrite(OfDatabase):
     left_out: list[Problem]
 
 
-def tell_sessions(database: str, *, json: bool) -> None:
+def info(given: options.DbInfo, terminal: console.Console) -> None:
     """Print the sessions of a database."""
-    with open_database(database) as opened:
+    with open_database(given.database) as opened:
         sessions, frames, where = opened.sessions(), opened.frames(), opened.location
     about: DbInfo = {
         "database": where,
@@ -66,11 +64,11 @@ def tell_sessions(database: str, *, json: bool) -> None:
     submaps = counted(sum(session.submaps for session in sessions), "submap")
     lines = [f"{where}: {counted(len(sessions), 'session')}, {submaps}", *map(_line, sessions)]
     lines += [f"  joined, in the frame of {name}: {', '.join(of)}" for name, of in buildings(frames).items()]
-    console.print_result(plain(DbInfo, about) if json else "\n".join(map(one_line, lines)))
+    console.print_result(plain(DbInfo, about) if given.json else "\n".join(map(one_line, lines)))
 
 
 def _line(s: SessionInfo) -> str:
-    """What a person is told of a session."""
+    """Return a session in one line."""
     travel = f", {counted(s.scans, 'scan')}, {s.path_m:.1f} m in {s.duration_s:.0f} s" if s.scans else ""
     label = s.provenance.label
     where = f", {label}" if label.building or label.floor else ""
@@ -84,43 +82,68 @@ def _line(s: SessionInfo) -> str:
     return line
 
 
-def tell_damage(database: str, *, json: bool) -> None:
-    """Print all damage of a database. Raises typer.Exit if there is any."""
-    problems = check(database)
-    about: DbCheck = {"database": shown(database), "problems": list(problems)}
+def check(given: options.DbCheck, terminal: console.Console) -> int | None:
+    """Print all damage of a database. Return the exit code."""
+    problems, where = maintenance.check(given.database), shown(given.database)
+    about: DbCheck = {"database": where, "problems": list(problems)}
     damage = [one_line(f"{problem.where}: {problem.what}") for problem in problems]
-    text = "\n".join(damage) or f"{shown(database)}: sound"
-    console.print_result(plain(DbCheck, about) if json else text)
-    if problems:
-        raise typer.Exit(console.FAILED)
+    console.print_result(plain(DbCheck, about) if given.json else "\n".join(damage) or f"{where}: sound")
+    return console.FAILED if problems else None
 
 
-def size(output: str) -> str:
-    """The size of a copy: of a file in bytes, of anything else in sessions."""
-    path = Path(output)
-    return f"{path.stat().st_size / 1e6:.1f} MB" if path.is_file() else sessions_in(output)
+def merge(given: options.DbMerge, terminal: console.Console) -> None:
+    """Store the sessions of several databases in a new one."""
+    count = maintenance.merge(given.databases, given.output, overwrite=given.force)
+    _print(given.output, f"{shown(given.output)}: {counted(count, 'session')}", given.json)
 
 
-def sessions_in(database: str) -> str:
+def copy(given: options.DbCopy, terminal: console.Console) -> int | None:
+    """Store a compact copy of a database. Return the exit code."""
+    made, path = given.output, Path(given.output)
+    problems = maintenance.copy(given.database, made, recover=given.recover, overwrite=given.force)
+    for problem in problems:
+        console.warn(f"left out: {problem.where}: {problem.what}")
+    size = f"{path.stat().st_size / 1e6:.1f} MB" if path.is_file() else _sessions_in(made)
+    _print(made, f"{shown(made)}: {size}", given.json, problems)
+    return console.LOSSY if problems else None
+
+
+def split(given: options.DbSplit, terminal: console.Console) -> None:
+    """Copy sessions of a database into a new one."""
+    count = maintenance.split(given.database, given.sessions, given.output, overwrite=given.force)
+    _print(given.output, f"{shown(given.output)}: {counted(count, 'session')}", given.json)
+
+
+def rename(given: options.DbRename, terminal: console.Console) -> None:
+    """Give a session another name."""
+    maintenance.rename(given.database, given.old, given.new)
+    said = one_line(f"{shown(given.database)}: {given.old} is now {given.new}")
+    _print(given.database, said, given.json)
+
+
+def remove(given: options.DbRemove, terminal: console.Console) -> None:
+    """Remove sessions; without --force, not all. Raises DatabaseError."""
+    with open_database(given.database) as opened:
+        known = {info.name for info in opened.sessions()}
+        if not given.force and known and known <= set(given.sessions):
+            raise DatabaseError(
+                f"{opened.location}: no session would be left, and they cannot be brought back",
+                hint="--force removes them all the same; `pc2grid db copy` keeps a copy",
+            )
+    maintenance.remove(given.database, given.sessions)
+    left = f"{shown(given.database)}: {_sessions_in(given.database)} left"
+    _print(given.database, left, given.json)
+
+
+def _sessions_in(database: str) -> str:
     """Return how many sessions are in a database, with the noun."""
     with open_database(database) as opened:
         return counted(len(opened.sessions()), "session")
 
 
-def refuse_all(database: str, sessions: list[str]) -> None:
-    """Raises DatabaseError if no session of the database would be left."""
-    with open_database(database) as opened:
-        known = {info.name for info in opened.sessions()}
-        if known and known <= set(sessions):
-            raise DatabaseError(
-                f"{opened.location}: no session would be left, and they cannot be brought back",
-                hint="--force removes them all the same; `pc2grid db copy` keeps a copy",
-            )
-
-
-def tell(output: str, text: str, json: bool, left_out: Sequence[Problem] = ()) -> None:
+def _print(database: str, text: str, json: bool, left_out: Sequence[Problem] = ()) -> None:
     """Print a text or the document about a database that was written."""
-    with open_database(output) as opened:
+    with open_database(database) as opened:
         number, where = len(opened.sessions()), opened.location
     about: DbWrite = {"database": where, "sessions": number, "left_out": list(left_out)}
     console.print_result(plain(DbWrite, about) if json else text)
@@ -156,35 +179,60 @@ class DbJoin(OfDatabase):
     alone: list[str]
 
 
-def store(database: str, found: Joined, names: list[str]) -> None:
-    """Store where the sessions lie; those of `names` that lie in no building are no longer in one."""
-    maintenance.place(database, {name: found.frames.get(name) for name in names})
+def join(given: options.DbJoin, terminal: console.Console) -> None:
+    """Compare every two sessions, store how they lie to each other, and print it."""
+    output.check_file("plot", given.plot, given.force)
+    with open_database(given.database) as opened:
+        names = [info.name for info in opened.sessions()]
+        if len(names) < 2:
+            raise ConfigError(
+                f"{opened.location}: holds {counted(len(names), 'session')}, and two can be joined",
+                hint="`pc2grid convert LOG --add` adds one, `pc2grid db merge` puts databases together",
+            )
+        found = join_sessions(opened, frame=given.frame, observer=terminal.observer())
+        if given.plot is not None:
+            _draw(given.plot, opened, found)
+    if not given.dry_run:  # those that lie in no building are no longer in one
+        maintenance.place(given.database, {name: found.frames.get(name) for name in names})
+    alone = [name for name in names if name not in found.frames]
+    about: DbJoin = {
+        "database": shown(given.database),
+        "stored": not given.dry_run,
+        "pairs": [_compared(pair) for pair in found.pairs],
+        "sessions": [joined_document(session, at) for session, at in found.frames.items()],
+        "alone": alone,
+    }
+    if given.json:
+        console.print_result(plain(DbJoin, about))
+    else:
+        _report(found, alone, stored=not given.dry_run)
 
 
-def report(found: Joined, names: list[str], *, dry_run: bool = False) -> None:
+def _report(found: Joined, alone: Sequence[str], *, stored: bool) -> None:
     """Print the pairs, and the buildings that they make."""
-    pairs = table(
+    pairs = output.table(
         "sessions compared",
         ("target", "source", ""),
         ("x, m", "y, m", "turn, deg", "sigma, m", "in common, m2", "agreement", "probability"),
     )
     for pair in found.pairs:
         pairs.add_row(*map(one_line, _row(pair)))
-    show(pairs)
+    lines = []
     for name, sessions in buildings(found.frames).items():
-        show(f"in the frame of {one_line(name)}:")
+        lines.append(f"in the frame of {name}:")
         for session, at in sessions.items():
             T = at.T_building_session
             where = f"x {T.x:.2f} m, y {T.y:.2f} m, turned by {math.degrees(T.yaw):.1f} deg"
             bent = f", bent by {largest_m(at.bend):.2f} m at most" if at.bend else ""
-            show(one_line(f"  {session}: {where}, sigma {_sigma_m(at.covariance):.2f} m{bent}"))
-    alone = [name for name in names if name not in found.frames]
+            lines.append(f"  {session}: {where}, sigma {_sigma_m(at.covariance):.2f} m{bent}")
     if alone:
-        show(one_line(f"alone: {', '.join(alone)}"))
-    if dry_run:
-        show("nothing was stored")
+        lines.append(f"alone: {', '.join(alone)}")
+    if not stored:
+        lines.append("nothing was stored")
     elif found.frames:
-        show("from now on answers in these are in the frame of the building; --frame session: as before")
+        said = "from now on answers in these are in the frame of the building; --frame session: as before"
+        lines.append(said)
+    output.show(pairs, *map(one_line, lines))
 
 
 def _row(pair: SessionPair) -> tuple[str, ...]:
@@ -201,29 +249,18 @@ def _row(pair: SessionPair) -> tuple[str, ...]:
 
 
 def _sigma_m(covariance: Sequence[Sequence[float]]) -> float:
-    """The larger standard deviation of x and y."""
+    """Return the larger standard deviation of x and y."""
     return math.sqrt(max(covariance[0][0], covariance[1][1]))
 
 
-def draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
-    """A picture of the building with most sessions; none if nothing is joined."""
+def _draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
+    """Draw the building with most sessions; nothing if none is joined."""
     known = buildings(found.frames)
     if not known:
         console.warn(f"{path}: not written, no two sessions are joined")
         return
     name = max(known, key=lambda name: len(known[name]))
     draw_building(path, name, {s: (database.grid(s), at) for s, at in known[name].items()})
-
-
-def document(where: str, found: Joined, names: list[str], dry_run: bool) -> DbJoin:
-    """Return the document of the pairs and of the sessions that are joined."""
-    return {
-        "database": where,
-        "stored": not dry_run,
-        "pairs": [_compared(pair) for pair in found.pairs],
-        "sessions": [joined_document(session, at) for session, at in found.frames.items()],
-        "alone": [name for name in names if name not in found.frames],
-    }
 
 
 def _compared(pair: SessionPair) -> ComparedSessions:

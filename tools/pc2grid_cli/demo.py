@@ -1,6 +1,6 @@
-"""`pc2grid demo`: everything with simulated robots: map, query, answer, picture.
+"""`pc2grid demo` and `pc2grid simulate`: recordings of simulated robots.
 
-`pc2grid simulate`: a simulated recording with its ground truth.
+In the demonstration a robot with a lidar makes a map, and another one with a depth camera is found in it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ from pc2grid.io.atomic import require_writable
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.simulate import Building, SimulatedSession, SimulationConfig, load_building, simulate_session
-from pc2grid.simulate.config import LidarConfig, OdometryConfig
-from pc2grid_cli import console
+from pc2grid.simulate.config import LidarConfig
+from pc2grid_cli import console, options
 from pc2grid_cli.output import make_folder
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
@@ -38,9 +38,9 @@ QUERY_LENGTH_M = 15.0
 QUERY_START_M = (7.6, 8.0)
 
 
-def run(out: Path, terminal: console.Console, *, force: bool) -> None:
-    """Map the office, find the other robot, and leave all files in the folder `out`."""
-    begin = time.monotonic()
+def run(given: options.Demo, terminal: console.Console) -> int:
+    """Map the office, find the other robot, and leave all files in a folder. Return the exit code."""
+    begin, out, force = time.monotonic(), given.out, given.force
     lidar, depth = out / "lidar.mcap", out / "depth.mcap"
     database, picture, page = out / "office.submaps", out / "answer.png", out / "report.html"
     make_folder(out)
@@ -68,17 +68,16 @@ def run(out: Path, terminal: console.Console, *, force: bool) -> None:
     terminal.note("3/4 relocalize the depth camera's recording in it")
     truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
     with open_database(database) as opened:
-        found = find(depth, opened, config, observer=terminal.observer())
-        answer = found.answer
+        answer = find(depth, opened, config, observer=terminal.observer())
         # The frame of the database is the first pose of the lidar robot; the truth is in that of the plan.
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]
         terminal.note("4/4 draw it")
         truth_m = np.array([(p.x, p.y) for p in true_poses])
         with terminal.progress("draw the picture and the page") as update:
-            draw_answer(picture, opened, answer, found.poses, truth_m)
+            draw_answer(picture, opened, answer, answer.poses, truth_m)
             update(0.5)
-            write_report(page, opened, found=found, accept=config.relocalize.accept, truth_m=truth_m)
+            write_report(page, opened, found=answer, truth_m=truth_m)
     scans, submaps = counted(len(session.trajectory), "lidar scan"), counted(len(session.submaps), "submap")
     print(f"map: {scans}, {submaps}: {database}")
     print(as_text(answer))
@@ -88,39 +87,30 @@ def run(out: Path, terminal: console.Console, *, force: bool) -> None:
         turn = abs(math.degrees(wrap_angle(pose.yaw - true.yaw)))
         print(f"truth: x {true.x:.2f} m, y {true.y:.2f} m: off by {distance:.2f} m and {turn:.1f} deg")
     print(f"picture: {picture}, page to look into it: {page}   ({time.monotonic() - begin:.0f} s)")
-    if answer.status != "located":
-        raise typer.Exit(console.UNSURE)
+    return console.OK if answer.status == "located" else console.UNSURE
 
 
-def run_simulate(
-    files: list[Path],
-    sensor: SensorKind,
-    terminal: console.Console,
-    *,
-    force: bool,
-    json: bool,
-    clutter: int,
-    odometry: bool,
-    **drive: Any,
-) -> None:
-    """Simulate, and print what was written. drive : the further fields of `SimulationConfig`."""
+def simulate(given: options.Simulate, terminal: console.Console) -> None:
+    """Record a simulated drive, and print what was written."""
+    files, sensor, force = given.files, given.sensor, given.force
     grid = _building(files, force)
-    config = _config(clutter=clutter, odometry=OdometryConfig(enabled=odometry), **drive)
+    drive = {name: value for name, value in vars(given).items() if name in SimulationConfig.model_fields}
+    config = _config(**drive, odometry={"enabled": not given.no_odometry})
     with terminal.progress(f"simulate {sensor}") as update:
         made = simulate_session(
             files[-1], sensor=sensor, grid=grid, config=config, progress=update, overwrite=force
         )
-    if made.clutter < clutter:
-        console.warn(f"only {made.clutter} of {clutter} pieces of clutter could be placed")
+    if made.clutter < given.clutter:
+        console.warn(f"only {made.clutter} of {given.clutter} pieces of clutter could be placed")
     text = (
         f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s\n"
         f"{made.truth_path}: {made.scans} true poses of base_link in the map frame"
     )
-    console.print_result(plain(SimulatedSession, made) if json else text)
+    console.print_result(plain(SimulatedSession, made) if given.json else text)
 
 
 def _building(files: list[Path], force: bool) -> OccupancyGrid | Building | None:
-    """The building of `[BUILDING] OUT.mcap`, None for the office; what is written must be writable."""
+    """Return the building of `[BUILDING] OUT.mcap`, None for the office; check that OUT can be written."""
     if len(files) > 2:
         raise typer.BadParameter(f"expected [BUILDING] OUT.mcap, got {len(files)} files")
     if files[-1].suffix != ".mcap":
@@ -131,7 +121,7 @@ def _building(files: list[Path], force: bool) -> OccupancyGrid | Building | None
 
 
 def _config(**given: Any) -> SimulationConfig:
-    """Raises ConfigError for a value that does not fit."""
+    """Return the settings of a drive. Raises ConfigError for a value that does not fit."""
     try:
         return SimulationConfig(**given)
     except ValidationError as error:

@@ -1,10 +1,8 @@
-"""JSON Schemas (draft 2020-12) of what the commands print with `--json`, made of the types of the documents.
+"""The JSON documents of the commands: their schemas (draft 2020-12), and how a session is described in them.
 
-A type stands beside the command that fills it, so that mypy compares what is printed with what the schema
-says. It holds frozen types of the program as they are. Metres, radians, int64 nanoseconds, unless a name says
-otherwise.
-
-The description of a session in the JSON documents of `convert`, `db info` and `db join`.
+A schema is made of the type of a document, which stands beside the command that fills it, so that mypy
+compares what is printed with what the schema says. It holds frozen types of the program as they are. Metres,
+radians, int64 nanoseconds, unless a name says otherwise.
 """
 
 from __future__ import annotations
@@ -16,6 +14,7 @@ from collections import defaultdict
 from collections.abc import Mapping
 from typing import Any
 
+from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.model import (
     Consistency,
@@ -26,6 +25,8 @@ from pc2grid.model import (
     ThreeDigits,
     UncertainSegment,
 )
+from pc2grid.settings import dump_settings
+from pc2grid_cli import console, options
 from signature.config import Config
 from signature.database import Provenance, SessionInfo
 from signature.database.protocol import BuildingFrame, Covariance, largest_m
@@ -46,16 +47,32 @@ DOCUMENTS = {
     "info": "pc2grid_cli.info:Info",
     "info-map": "pc2grid_cli.info:InfoMap",
     "relocalize": "pc2grid_cli.relocalize:Relocalize",
-    "relocalize-check": "pc2grid_cli.check_pose:RelocalizeCheck",
+    "relocalize-check": "pc2grid_cli.known_pose:RelocalizeCheck",
     "simulate": "pc2grid.simulate.session:SimulatedSession",
     "watch": "pc2grid_cli.watch:Watch",
-    "watch-check": "pc2grid_cli.check_pose:WatchCheck",
+    "watch-check": "pc2grid_cli.watch:WatchCheck",
 }
 """By command, where the type of its document is: it is imported when its schema is asked for."""
 
 
+def dump(given: options.ConfigDump, terminal: console.Console) -> None:
+    """Print all settings."""
+    print(dump_settings(given.settings(preset=given.preset)), end="")
+
+
+def print_schema(given: options.ConfigSchema, terminal: console.Console) -> None:
+    """Print a schema, or the names of all. Raises ConfigError for another name."""
+    names = ["settings", *DOCUMENTS]
+    if given.name is None:
+        print("\n".join(names))
+    elif given.name in names:
+        console.print_result(schema(given.name))
+    else:
+        raise ConfigError(f"no schema {given.name!r}", hint=f"there are {', '.join(names)}")
+
+
 def schema(name: str) -> dict[str, Any]:
-    """JSON Schema of a command's document, or of all `settings` as TOML holds them. Raises KeyError."""
+    """Return the schema of a command's document, or of all `settings` as TOML holds them. Raises KeyError."""
     if name == "settings":
         about = adapter(Config).json_schema()
     else:
@@ -66,7 +83,7 @@ def schema(name: str) -> dict[str, Any]:
 
 
 def _complete(about: dict[str, Any]) -> dict[str, Any]:
-    """The schema of an object whose keys are always there, also those with a default."""
+    """Return the schema of an object whose keys are always there, also those with a default."""
     return {**about, "required": [*about["properties"]]} if "properties" in about else about
 
 
@@ -134,7 +151,7 @@ class JoinedSession(TypedDict):
 
 
 def session_document(session: SessionMap, origin: Provenance) -> Converted:
-    """The session made of one input, as the JSON document describes it."""
+    """Return the description of a session that was made of one input."""
     return {
         "session": session.session,
         "building": origin.label.building,
@@ -155,7 +172,7 @@ def session_document(session: SessionMap, origin: Provenance) -> Converted:
 
 
 def stored_document(s: SessionInfo) -> StoredInfo:
-    """A session of a database, as the JSON document describes it."""
+    """Return the description of a session of a database."""
     return {
         "name": s.name,
         "sensor": s.sensor,
@@ -181,7 +198,7 @@ def stored_document(s: SessionInfo) -> StoredInfo:
 
 
 def joined_document(session: str, frame: BuildingFrame) -> JoinedSession:
-    """Where a session lies in its building, as `convert` and `db join` describe it."""
+    """Return the description of where a session lies in its building."""
     return {
         "session": session,
         "frame": frame.name,
@@ -192,7 +209,7 @@ def joined_document(session: str, frame: BuildingFrame) -> JoinedSession:
 
 
 def buildings(frames: Mapping[str, BuildingFrame]) -> dict[str, dict[str, BuildingFrame]]:
-    """The joined sessions by the frame of their building. frames : by session."""
+    """Return the joined sessions by the frame of their building. frames : by session."""
     found: dict[str, dict[str, BuildingFrame]] = defaultdict(dict)
     for session, at in frames.items():
         found[at.name][session] = at
@@ -200,7 +217,7 @@ def buildings(frames: Mapping[str, BuildingFrame]) -> dict[str, dict[str, Buildi
 
 
 def precision_summary(precision: Precision | None) -> PrecisionSummary | None:
-    """How exactly the places of a map lie to each other, in a few numbers."""
+    """Return how exactly the places of a map lie to each other, in a few numbers."""
     if precision is None:
         return None
     return {

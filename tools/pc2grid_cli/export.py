@@ -1,40 +1,37 @@
 """`pc2grid export`: the sessions of a database in the formats of other programs.
 
-Databases and answers as MCAP for Foxglove and rerun: `examples/foxglove.json` is a layout for Foxglove.
-
-Topics: /map, /points (if the session has them), /path, /submaps; for an answer /query_path, /hypotheses,
-/pose and /initialpose too, and map -> odom -> base_link over time. For a map located in another one
-/query_map.
+Sessions and answers as MCAP, for Foxglove (`examples/foxglove.json` is a layout for it) and rerun: /map,
+/points (if the session has them), /path and /submaps; for an answer also /query_path, /hypotheses, /pose and
+/initialpose, and map -> odom -> base_link over time; for a map that was located in another one /query_map.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pc2grid import libraries as extras
 from pc2grid._version import __version__
 from pc2grid.errors import ConfigError, DatabaseError, one_line
+from pc2grid.geometry import F64
 from pc2grid.io.export import LogWriter, Marker, write_cloud, write_g2o, write_graph
 from pc2grid.io.maps import is_map_file, save_map
 from pc2grid.io.trajectory import write_trajectory
-from pc2grid.model import THING, MapOf, OccupancyGrid
-from pc2grid_cli import console, options
+from pc2grid.model import THING, MapOf, OccupancyGrid, Trajectory
+from pc2grid_cli import console, options, output
 from pc2grid_cli.documents import OfDatabase
-from pc2grid_cli.output import check_file, written_files
-from signature.localization.joining.building import floors_of, map_of
+from signature.database import SubmapDatabase, open_database
+from signature.database.protocol import BuildingFrame, SessionInfo
+from signature.localization.answer import Answer
+from signature.localization.answer_json import plain
 from signature.localization.shown.page import write_report
 from signature.localization.shown.picture import draw_building, draw_session
 
-if TYPE_CHECKING:
-    from pc2grid.geometry import F64
-    from pc2grid.model import MapOf, OccupancyGrid, Trajectory
-    from signature.database import SubmapDatabase
-    from signature.database.protocol import BuildingFrame, SessionInfo
-    from signature.localization.answer import Answer
+Frames = Mapping[str, BuildingFrame]
+"""Of the buildings that sessions are joined in, by session."""
 
 
 class Export(OfDatabase):
@@ -49,13 +46,50 @@ SHOWN: dict[MapOf, str] = {
     "walls": "things such as tables are unknown, and no obstacles",
     "raw": f"in percent, {THING} is a thing such as a table; nav2 takes what is below 100 for free",
 }
+_FILES = ("trajectory", "cloud", "graph", "g2o", "mcap", "plot", "map", "report")
+"""Options that name what is written, in this order."""
+_OF_FLOORS = {"map", "cloud", "plot"}
+"""Those that also show all joined sessions of a floor."""
 
 
-def check(
-    outputs: Mapping[str, Path], of: MapOf | None, format_: options.TrajectoryFormat | None, force: bool
-) -> None:
-    """Raises ConfigError if there is nothing to write, OutputError if a target cannot be written."""
-    if of is not None and not {"map", "mcap"} & outputs.keys():
+def run(given: options.Export, terminal: console.Console) -> None:
+    """Write all files, and print what was written."""
+    outputs = output.files_of(given, _FILES)
+    if "map" in outputs:
+        outputs["map"] = output.map_stem(outputs["map"])
+    _check(outputs, given)
+    extras.require(extras.of_addresses(given.database))
+    # Only maps of buildings need what joins them.
+    from signature.localization.joining.building import floors_of
+
+    with open_database(given.database) as opened:
+        if given.building is not None or given.floor is not None:
+            opened.keep_only(building=given.building, floor=given.floor)
+        frames = opened.frames() if given.frame == "building" else {}
+        floors, of_sessions = floors_of(opened, frames), outputs.keys() - {"report"}
+        name, whole = None, given.session is None and of_sessions <= _OF_FLOORS and len(floors) == 1
+        if of_sessions and whole:
+            _write_building(outputs, given, opened, floors[0], frames, terminal)
+        elif of_sessions:
+            name = given.session or _only_session(
+                opened, sorted(of_sessions - _OF_FLOORS), joined=bool(floors)
+            )
+            _write_session(outputs, given, opened, name, frames.get(name), terminal)
+        if "report" in outputs:
+            write_report(outputs["report"], opened)
+        written = output.written_files(outputs)
+        about: Export = {"database": opened.location, "session": name, "written": [*map(str, written)]}
+    if given.map_of not in (None, "everything"):
+        terminal.note(f"--map-of {given.map_of}: {SHOWN[given.map_of]}")
+    for path in written:
+        terminal.note(f"wrote {path}")
+    if given.json:
+        console.print_result(plain(Export, about))
+
+
+def _check(outputs: Mapping[str, Path], given: options.Export) -> None:
+    """Raise ConfigError if there is nothing to write, OutputError if a target cannot be written."""
+    if given.map_of is not None and not {"map", "mcap"} & outputs.keys():
         raise ConfigError("--map-of: no map is written", hint="name --map or --mcap, too")
     if not outputs:
         raise ConfigError(
@@ -63,42 +97,13 @@ def check(
             hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --plot, --report",
         )
     for option, named in outputs.items():
-        for path in written_files({option: named}):
-            check_file(option, path, force, any_suffix=option == "trajectory" and format_ is not None)
+        any_suffix = option == "trajectory" and given.format is not None
+        for path in output.written_files({option: named}):
+            output.check_file(option, path, given.force, any_suffix=any_suffix)
 
 
-@dataclass(frozen=True, slots=True)
-class As:
-    """How it is written: what maps show, the format of the trajectory (None: by its suffix), --force."""
-
-    of: MapOf
-    format: options.TrajectoryFormat | None
-    force: bool
-
-
-def write(
-    outputs: Mapping[str, Path],
-    as_told: As,
-    database: SubmapDatabase,
-    session: str | None,
-    frames: Mapping[str, BuildingFrame],
-    terminal: console.Console,
-) -> str | None:
-    """Write all files. Returns the session that was written; None if it was a whole building, or none."""
-    floors, of_sessions = floors_of(database, frames), outputs.keys() - {"report"}
-    name, of_one = None, of_sessions - {"map", "cloud", "plot"}
-    if of_sessions and session is None and not of_one and len(floors) == 1:
-        _write_building(outputs, as_told, database, floors[0], frames, terminal)
-    elif of_sessions:
-        name = session or _only_session(database, of_one, joined=bool(floors))
-        _write_session(outputs, as_told, database, name, frames.get(name), terminal)
-    if "report" in outputs:
-        write_report(outputs["report"], database)
-    return name
-
-
-def _only_session(database: SubmapDatabase, of_one: Collection[str], *, joined: bool) -> str:
-    """The session to write if none is named. Raises DatabaseError if there is not exactly one.
+def _only_session(database: SubmapDatabase, of_one: Sequence[str], *, joined: bool) -> str:
+    """Return the session to write if none is named. Raises DatabaseError if there is not exactly one.
 
     of_one : the options that write a session and no building. joined : whether sessions are.
     """
@@ -107,7 +112,7 @@ def _only_session(database: SubmapDatabase, of_one: Collection[str], *, joined: 
         return names[0]
     why, hint = "", "for one map of all: `pc2grid db join`, --building, --floor"
     if joined:
-        why = f"; --{min(of_one)} is of one session" if of_one else "; several floors are joined"
+        why = f"; --{of_one[0]} is of one session" if of_one else "; several floors are joined"
         hint = "of a floor, --map, --cloud and --plot alone show all: --building, --floor"
     raise DatabaseError(
         f"{database.location}: holds {len(names)} sessions: {', '.join(names) or 'none'}{why}",
@@ -117,10 +122,10 @@ def _only_session(database: SubmapDatabase, of_one: Collection[str], *, joined: 
 
 def _write_building(
     outputs: Mapping[str, Path],
-    as_told: As,
+    given: options.Export,
     database: SubmapDatabase,
     names: Sequence[str],
-    frames: Mapping[str, BuildingFrame],
+    frames: Frames,
     terminal: console.Console,
 ) -> None:
     """Write the map, the cloud and the picture of the sessions of a floor, in the frame of their building."""
@@ -128,7 +133,7 @@ def _write_building(
     if others:
         console.warn(f"not joined, and left out: {', '.join(others)}")
     if "map" in outputs:
-        _write_map(outputs["map"], database, names, frames, as_told.of)
+        _write_map(outputs["map"], database, names, frames, given.map_of)
     if "cloud" in outputs:
         _write_cloud(outputs["cloud"], database, names, frames, terminal)
     if "plot" in outputs:
@@ -138,7 +143,7 @@ def _write_building(
 
 def _write_session(
     outputs: Mapping[str, Path],
-    as_told: As,
+    given: options.Export,
     database: SubmapDatabase,
     name: str,
     frame: BuildingFrame | None,
@@ -151,13 +156,13 @@ def _write_session(
         raise DatabaseError(f"{database.location}: session {name!r} is an imported map and has no trajectory")
     frames = {} if frame is None else {name: frame}
     writers: dict[str, Callable[[Path], object]] = {
-        "trajectory": lambda path: write_trajectory(path, _in_building(poses, frame), as_told.format),
+        "trajectory": lambda path: write_trajectory(path, _in_building(poses, frame), given.format),
         "cloud": lambda path: _write_cloud(path, database, [name], frames, terminal),
         "graph": lambda path: write_graph(path, database.graph(name)),
         "g2o": lambda path: write_g2o(path, poses, database.loops(name)),
-        "mcap": lambda path: write_session(path, database, name, as_told.force, as_told.of),
+        "mcap": lambda path: _write_mcap(path, database, name, given),
         "plot": lambda path: draw_session(path, database, name),
-        "map": lambda stem: _write_map(stem, database, [name], frames, as_told.of),
+        "map": lambda stem: _write_map(stem, database, [name], frames, given.map_of),
     }
     for option, write in writers.items():
         if option in outputs:
@@ -165,25 +170,23 @@ def _write_session(
 
 
 def _write_map(
-    stem: Path,
-    database: SubmapDatabase,
-    names: Sequence[str],
-    frames: Mapping[str, BuildingFrame],
-    of: MapOf,
+    stem: Path, database: SubmapDatabase, names: Sequence[str], frames: Frames, of: MapOf | None
 ) -> None:
-    """The map of a session, or of all of a floor that are joined, and what it shows."""
+    """Write the map of a session, or of all of a floor that are joined. of : what it shows."""
+    from signature.localization.joining.building import map_of
+
     planes = dict.fromkeys(_plane(info, database.grid(info.name)) for info in database.sessions(names))
     save_map(
         map_of(database, names[0], frames),
         stem,
         mode="raw" if of == "raw" else "trinary",
-        of=of,
-        comment=f"pc2grid {__version__}, {' and '.join(planes)}:\n{SHOWN[of]}",
+        of=of or "everything",
+        comment=f"pc2grid {__version__}, {' and '.join(planes)}:\n{SHOWN[of or 'everything']}",
     )
 
 
 def _plane(info: SessionInfo, grid: OccupancyGrid) -> str:
-    """At which heights the plan of a session is cut."""
+    """Return at which heights the plan of a session is cut."""
     if is_map_file(Path(info.provenance.source)):
         return f"heights as in {one_line(info.provenance.source)}"
     if info.sensor == "laser":
@@ -194,6 +197,7 @@ def _plane(info: SessionInfo, grid: OccupancyGrid) -> str:
 
 
 def _in_building(poses: Trajectory, frame: BuildingFrame | None) -> Trajectory:
+    """Return poses of a session in the frame of its building; without one, as they are."""
     if frame is None:
         return poses
     T = np.array([at.lift() for at in frame.around(poses.planar()[:, :2])])
@@ -204,10 +208,10 @@ def _write_cloud(
     path: Path,
     database: SubmapDatabase,
     sessions: Sequence[str],
-    frames: Mapping[str, BuildingFrame],
+    frames: Frames,
     terminal: console.Console,
 ) -> None:
-    """The points in space of the sessions that have them; if none has, a point for each occupied cell."""
+    """Write the points in space of the sessions that have them; of none, a point for each occupied cell."""
     clouds, walls, voxel_m = [np.empty((0, 3))], [np.empty((0, 3))], 0.0
     for name in sessions:
         placed = frames[name].apply if name in frames else np.asarray
@@ -215,28 +219,25 @@ def _write_cloud(
         if points is not None:
             voxel_m = max(voxel_m, points.voxel_m)
             clouds.append(placed(points.points_m()))
-        flat = grid.to_point(np.argwhere(grid.occupied))
-        walls.append(placed(np.column_stack((flat, np.zeros(len(flat))))))
+        walls.append(placed(_lift(grid.to_point(np.argwhere(grid.occupied)))))
     cloud, wall = np.concatenate(clouds), np.concatenate(walls)
+    write_cloud(path, cloud if len(cloud) else wall)
     if len(cloud):
-        write_cloud(path, cloud)
         terminal.note(f"{path}: {len(cloud)} points, one a voxel of {voxel_m:g} m")
-        return
-    write_cloud(path, wall)
-    terminal.note(f"{path}: {len(wall)} occupied cells at z = 0; the database keeps no 3D points")
+    else:
+        terminal.note(f"{path}: {len(wall)} occupied cells at z = 0; the database keeps no 3D points")
 
 
 # Okabe and Ito's green, grey and purple.
 _GREEN, _GREY, _PURPLE = (0.0, 0.62, 0.45, 1.0), (0.4, 0.4, 0.4, 0.6), (0.8, 0.47, 0.65, 1.0)
 
 
-def write_session(
-    path: Path, database: SubmapDatabase, session: str, force: bool, of: MapOf = "everything"
-) -> None:
-    """A session's map, path and submaps, and the poses of its robot over time. of : what the map shows."""
+def _write_mcap(path: Path, database: SubmapDatabase, session: str, given: options.Export) -> None:
+    """Write a session's map, path and submaps, and the poses of its robot over time."""
     poses = database.trajectory(session)
-    with LogWriter(path, overwrite=force) as writer:
-        _write_map_message(writer, database, session, int(poses.stamps_ns[0]) if len(poses) else 0, of)
+    with LogWriter(path, overwrite=given.force) as writer:
+        first_ns = int(poses.stamps_ns[0]) if len(poses) else 0
+        _write_map_message(writer, database, session, first_ns, given.map_of or "everything")
         if len(poses):
             writer.path("/path", poses)
         for stamp_ns, T_session_base in zip(poses.stamps_ns, poses.T_session_base, strict=True):
@@ -246,7 +247,7 @@ def write_session(
 def write_answer(
     path: Path, database: SubmapDatabase, answer: Answer, located: Trajectory, force: bool
 ) -> None:
-    """A located recording in the map: `located` are its poses there."""
+    """Write a located recording in the map. located : its poses there."""
     assert answer.session is not None
     assert answer.T_map_base is not None
     assert answer.T_map_odom is not None
@@ -271,7 +272,7 @@ def write_answer(
 def write_located_map(
     path: Path, database: SubmapDatabase, answer: Answer, query: OccupancyGrid, force: bool
 ) -> None:
-    """A map that was located in another one: both grids, and map -> query_map between them."""
+    """Write a map that was located in another one: both grids, and map -> query_map between them."""
     assert answer.session is not None
     assert answer.T_map_odom is not None
     assert answer.covariance is not None
@@ -286,6 +287,7 @@ def write_located_map(
 def _write_map_message(
     writer: LogWriter, database: SubmapDatabase, session: str, stamp_ns: int, of: MapOf = "everything"
 ) -> None:
+    """Write the map of a session, its points and its submaps. of : what the map shows."""
     writer.occupancy_grid("/map", stamp_ns, database.grid(session), of=of)
     points = database.points(session)
     if points is not None:
@@ -306,7 +308,7 @@ def _write_map_message(
 
 
 def _hypotheses(answer: Answer) -> Marker:
-    """Markers of the hypotheses, the best first."""
+    """Return markers of the hypotheses, the best first."""
     poses = [hypothesis.fit.T_map_query @ answer.T_odom_base for hypothesis in answer.hypotheses]
     same = [answer.sessions[h.session_index] == answer.session for h in answer.hypotheses]
     points = [(pose.x, pose.y) for pose, here in zip(poses, same, strict=True) if here]
@@ -314,6 +316,6 @@ def _hypotheses(answer: Answer) -> Marker:
 
 
 def _lift(points_m: F64 | list[tuple[float, float]]) -> F64:
-    """Points (N, 2) as (N, 3) at z = 0."""
+    """Return points (N, 2) as (N, 3) at z = 0."""
     flat = np.asarray(points_m, np.float64).reshape(-1, 2)
     return np.column_stack((flat, np.zeros(len(flat))))

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import typer
 
 from pc2grid import libraries as extras
 from pc2grid.errors import Pc2GridError, one_line
@@ -22,8 +21,7 @@ from pc2grid.io.recording import is_submap_file
 from pc2grid.io.robots import Namespaces, camera_info_topic
 from pc2grid.io.source import Choice, LogInfo
 from pc2grid.model import SENSOR_MODELS
-from pc2grid_cli.console import LOSSY, print_result, warn
-from pc2grid_cli.options import make_config
+from pc2grid_cli import console, options
 from signature.localization.answer_json import TypedDict, plain
 
 if TYPE_CHECKING:
@@ -70,33 +68,33 @@ class InfoMap(TypedDict):
     tilt_deg: float
 
 
-def run(log: str, topic: str | None, assignments: list[str] | None, *, recover: bool, json: bool) -> None:
-    """Print what is in a recording, a map or a database."""
-    if "postgres" in extras.of_addresses(log) or is_submap_file(Path(log)):
-        from pc2grid_cli.db import tell_sessions
+def run(given: options.Info, terminal: console.Console) -> int | None:
+    """Print what is in a recording, a map or a database. Return the exit code."""
+    log, path = given.log, Path(given.log)
+    if "postgres" in extras.of_addresses(log) or is_submap_file(path):
+        from pc2grid_cli import db
 
-        tell_sessions(log, json=json)
-        return
-    if is_map_file(Path(log)) or is_building_file(Path(log)):
-        of_map = describe_map(Path(log), assignments)
-        print_result(plain(InfoMap, of_map) if json else one_line(_map_as_text(of_map)))
+        db.info(options.DbInfo(database=log, json=given.json), terminal)
+        return None
+    if is_map_file(path) or is_building_file(path):
+        of_map = describe_map(path, given.assignments)
+        console.print_result(plain(InfoMap, of_map) if given.json else one_line(_map_as_text(of_map)))
         for warning in of_map["warnings"]:
-            warn(warning)
-        return
-    info = describe(Path(log), topic=topic, recover=recover, assignments=assignments)
-    if json:
-        print_result(plain(Info, info))
+            console.warn(warning)
+        return None
+    info = describe(path, topic=given.topic, recover=given.recover, assignments=given.assignments)
+    if given.json:
+        console.print_result(plain(Info, info))
     else:
         _show(info)
-    if info.bytes_lost:
-        raise typer.Exit(LOSSY)
+    return console.LOSSY if info.bytes_lost else None
 
 
 def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
-    """The document of a map. Raises MapFileError if it cannot be read."""
+    """Return the document of a map. Raises MapFileError if it cannot be read."""
     from pc2grid.mapping.drawn import load_drawn_map
 
-    drawn = load_drawn_map(path, make_config(None, assignments))
+    drawn = load_drawn_map(path, options.Settings(assignments=assignments).settings())
     grid, R = drawn.grid, drawn.T_map_file[:3, :3]
     height, width = grid.cells.shape
     cell_m2 = grid.resolution_m**2
@@ -117,8 +115,7 @@ def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
 
 
 def _floor_z_m(drawn: DrawnMap) -> float:
-    """Height of the floor in the frame of the file, in the middle of the map."""
-
+    """Return the height of the floor in the frame of the file, in the middle of the map."""
     height, width = drawn.grid.cells.shape
     middle = drawn.grid.to_point(np.array([(height // 2, width // 2)]))[0]
     return float(transform_points(invert_pose(drawn.T_map_file), np.array([[*middle, 0.0]]))[0, 2])
@@ -139,12 +136,12 @@ def _map_as_text(d: InfoMap) -> str:
 def describe(
     path: Path, *, topic: str | None = None, recover: bool = False, assignments: list[str] | None = None
 ) -> Info:
-    """The document of a recording. If convert could not use it, `choice` is null and `problem` says why.
+    """Return the document of a recording. If convert could not use it, `choice` is null, and `problem` why.
 
     Reads the log's summary, a few messages and the first scans only, unless it has no summary.
     Raises LogError if the file cannot be opened.
     """
-    config = make_config(None, assignments, topic=topic)
+    config = options.Reading(topic=topic, assignments=assignments).settings()
     with open_log(path, config.read, recover=recover) as log:
         choice: ChosenTopics | None = None
         problem: str | None = None
@@ -161,7 +158,7 @@ def describe(
 
 
 def _chosen(choice: Choice, log: LogInfo) -> ChosenTopics:
-    """What would be used, with the topic of the calibration of the camera whose depth images are used."""
+    """Return what would be used, with the topic of the camera's calibration if depth images are."""
     images = [
         topic for topic in log.topics if topic.topic == choice.topic and SENSOR_MODELS[choice.sensor].image
     ]
@@ -183,10 +180,10 @@ def _show(info: Info) -> None:
         # Names come from the log, and may hold control sequences for a terminal.
         return markup.escape(one_line(text))
 
-    console = Console()
+    out = Console()
     choice, count = info.choice, info.message_count
-    console.print(f"[bold]{escape(str(info.path))}[/bold]", soft_wrap=True, highlight=False)
-    console.print(
+    out.print(f"[bold]{escape(str(info.path))}[/bold]", soft_wrap=True, highlight=False)
+    out.print(
         f"{info.format}, {info.size_bytes / 1e6:.1f} MB, {info.duration_s:.1f} s from "
         f"{_when(info.start_ns)}, {'?' if count is None else count} messages",
         soft_wrap=True,
@@ -207,18 +204,18 @@ def _show(info: Info) -> None:
     # As wide as the names are: a terminal wraps long lines better than a table breaks names.
     Console(width=_WIDEST).print(table)
     if choice is not None:
-        console.print(f"convert uses {escape(choice.topic)}: {escape(choice.reason)}", soft_wrap=True)
+        out.print(f"convert uses {escape(choice.topic)}: {escape(choice.reason)}", soft_wrap=True)
         frames = ", ".join((choice.sensor_frame or "(unnamed)", *choice.further_frames))
         where = f"base frame {choice.base_frame}, scans in frame {frames}"
-        console.print(escape(where), soft_wrap=True, highlight=False)
+        out.print(escape(where), soft_wrap=True, highlight=False)
     else:
-        console.print(f"convert cannot use this log: {escape(str(info.problem))}", soft_wrap=True)
+        out.print(f"convert cannot use this log: {escape(str(info.problem))}", soft_wrap=True)
     for warning in info.warnings:
-        console.print(f"note: {escape(warning)}", soft_wrap=True, highlight=False)
+        out.print(f"note: {escape(warning)}", soft_wrap=True, highlight=False)
 
 
 def _when(stamp_ns: int) -> str:
-    """RFC 3339, UTC."""
+    """Return the time as RFC 3339 writes it, in UTC."""
     try:
         moment = datetime.fromtimestamp(stamp_ns // 1_000_000_000, tz=timezone.utc)
     except (OverflowError, ValueError, OSError):

@@ -1,8 +1,7 @@
-"""What options say about the query's pose beforehand: `--near`, `--near-pose`, `--check`, `--check-topic`.
+"""What is known of the robot's pose beforehand (--near, --near-pose), and the check of a pose (--check,
+--check-topic).
 
-The database that a query of the command line is looked for in, and the query's path there.
-
-The message that nav2 takes as `/initialpose`: written, and read.
+A pose is read from a file or a topic as nav2 and AMCL write it, and written as nav2 takes it.
 """
 
 from __future__ import annotations
@@ -12,133 +11,106 @@ import dataclasses
 import json
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import yaml
 
-from pc2grid.errors import ConfigError
-from pc2grid.geometry import SE2
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.display import probability
+from pc2grid.errors import ConfigError, one_line
+from pc2grid.geometry import F64, SE2
+from pc2grid.io import Log, open_log
 from pc2grid.io import export as ros
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.map_pose import MapPose
-from pc2grid_cli import console
+from pc2grid.model import Health, RegisteredScan
+from pc2grid.observer import Observer, TimeSpan
+from pc2grid_cli import console, options
+from pc2grid_cli.options import KnownPose
+from signature.config import Config
+from signature.database import SubmapDatabase
+from signature.localization.answer import Answer
+from signature.localization.answer_json import (
+    Labelled,
+    Pose,
+    QueryRecording,
+    StampedPose,
+    TypedDict,
+    plain,
+)
+from signature.localization.map_index import MapIndex
+from signature.localization.pose_check import CheckStatus, PoseCheck, check_pose
 from signature.localization.posterior import Prior
-from signature.sessions import open_places
-
-if TYPE_CHECKING:
-    from pc2grid.geometry import F64
-    from pc2grid.io import Log
-    from pc2grid.model import Trajectory
-    from pc2grid.observer import TimeSpan
-    from signature.database import SubmapDatabase
-    from signature.localization.answer import Answer
+from signature.sessions import about_log, open_places, query_config, tracked
 
 
-Three = tuple[float, float, float]
+def validate(known: KnownPose, *, is_map: bool = False) -> None:
+    """Raise ConfigError for options that do not go together. is_map : the query is a map."""
+    given = {
+        "--near": known.near,
+        "--near-pose": known.near_pose,
+        "--check": known.check,
+        "--check-topic": known.check_topic,
+    }
+    names = [name for name, value in given.items() if value is not None]
+    if len(names) > 1:
+        raise ConfigError(f"{' and '.join(names)} do not go together", hint="give one of them")
+    if names and is_map:
+        raise ConfigError(f"{names[0]}: there is no robot in a map", hint="give a recording")
+    if known.session is not None and not names:
+        raise ConfigError(
+            "--session: says whose map frame a known pose is in, but none is given",
+            hint="add --near X Y RADIUS or --check X Y YAW_DEG",
+        )
+    if known.check is not None and not all(map(math.isfinite, known.check)):
+        raise ConfigError("--check: expected x and y in metres and the heading in degrees")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KnownPose:
-    """The options as they were given.
+def region(known: KnownPose) -> Prior | None:
+    """Return the region of `--near`; None if none is given. Raises ConfigError."""
+    validate(known)
+    return None if known.near is None else Prior.around(*known.near, session=known.session)
 
-    near : x, y, radius in metres. near_pose : a file, or a topic of the recording. check : x, y in metres and
-    yaw in degrees. check_topic : a topic of the recording. session : whose map frame they are in.
+
+def prior(known: KnownPose, log: Log, span: TimeSpan) -> Prior | None:
+    """Return the region that the pose is in at a part of a recording; None if none is given.
+
+    Raises ConfigError, or what `Log.map_pose` raises.
     """
-
-    near: Three | None = None
-    near_pose: str | None = None
-    check: Three | None = None
-    check_topic: str | None = None
-    session: str | None = None
-
-    @property
-    def is_check(self) -> bool:
-        """Whether a pose is to be checked, and none to be found."""
-        return self.check is not None or self.check_topic is not None
-
-    def validate(self, *, is_map: bool) -> None:
-        """Raises ConfigError for options that do not go together. is_map : the query is a map."""
-        given = {
-            "--near": self.near,
-            "--near-pose": self.near_pose,
-            "--check": self.check,
-            "--check-topic": self.check_topic,
-        }
-        names = [name for name, value in given.items() if value is not None]
-        if len(names) > 1:
-            raise ConfigError(f"{' and '.join(names)} do not go together", hint="give one of them")
-        if names and is_map:
-            raise ConfigError(f"{names[0]}: there is no robot in a map", hint="give a recording")
-        if self.session is not None and not names:
-            raise ConfigError(
-                "--session: says whose map frame a known pose is in, but none is given",
-                hint="add --near X Y RADIUS or --check X Y YAW_DEG",
-            )
-        if self.check is not None and not all(map(math.isfinite, self.check)):
-            raise ConfigError("--check: expected x and y in metres and the heading in degrees")
-
-    def region(self) -> Prior | None:
-        """The region of `--near`; None if none is given. Raises ConfigError."""
-        self.validate(is_map=False)
-        if self.near is None:
-            return None
-        x_m, y_m, radius_m = self.near
-        return Prior.around(x_m, y_m, radius_m, session=self.session)
-
-    def at_start(self) -> Prior | None:
-        """The region of `--near` as one in which the first scan was taken."""
-        region = self.region()
-        return None if region is None else replace(region, stamp_ns=0)
-
-    def prior(self, log: Log, span: TimeSpan) -> Prior | None:
-        """The region that the pose is in at a part of a recording; None if none is given.
-
-        Raises ConfigError, or what `Log.map_pose` raises.
-        """
-        if self.near_pose is None:
-            return self.region()
-        is_topic = self.near_pose.startswith("/") and not Path(self.near_pose).exists()
-        pose = log.map_pose(self.near_pose, end_s(span)) if is_topic else read_pose(Path(self.near_pose))
-        if pose.covariance is None:
-            raise ConfigError(
-                f"--near-pose: poses of {self.near_pose} have no covariance",
-                hint="--near X Y RADIUS names a region",
-            )
-        # A stamp of 0 is the newest scan, as AMCL takes it.
-        stamp_ns = pose.stamp_ns or None
-        return Prior.of_pose(pose.T_map_base, pose.covariance, stamp_ns=stamp_ns, session=self.session)
+    if known.near_pose is None:
+        return region(known)
+    is_topic = known.near_pose.startswith("/") and not Path(known.near_pose).exists()
+    pose = log.map_pose(known.near_pose, _end_s(span)) if is_topic else read_pose(Path(known.near_pose))
+    if pose.covariance is None:
+        raise ConfigError(
+            f"--near-pose: poses of {known.near_pose} have no covariance",
+            hint="--near X Y RADIUS names a region",
+        )
+    # A stamp of 0 is the newest scan, as AMCL takes it.
+    stamp_ns = pose.stamp_ns or None
+    return Prior.of_pose(pose.T_map_base, pose.covariance, stamp_ns=stamp_ns, session=known.session)
 
 
-def end_s(span: TimeSpan) -> float | None:
-    """The end of a part of a recording, seconds after the recording's start; None: its own end."""
+def _end_s(span: TimeSpan) -> float | None:
+    """Return the end of a part of a recording, seconds after the recording's start; None: its own end."""
     return None if span.duration_s is None else span.start_s + span.duration_s
 
 
 @contextlib.contextmanager
-def searched(
-    database: str, building: str | None, floor: str | None
-) -> Iterator[tuple[SubmapDatabase, list[str]]]:
-    """A database, or a map as one, to look in; only the sessions of a building and floor if they are given.
+def searched(given: options.Places) -> Iterator[tuple[SubmapDatabase, list[str]]]:
+    """Open the database, or the map as one; only the sessions of a building and floor if they are given.
 
     Yields it, and what is damaged in it and left out, of which the user is warned.
     """
-    with open_places(database, warn=console.warn) as opened:
-        if building is not None or floor is not None:
-            opened.keep_only(building=building, floor=floor)
+    with open_places(given.database, warn=console.warn) as opened:
+        if given.building is not None or given.floor is not None:
+            opened.keep_only(building=given.building, floor=given.floor)
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]
         for damage in left_out:
             console.warn(f"{opened.location}: damaged and left out: {damage}")
         yield opened, left_out
-
-
-def in_map(poses: Trajectory, answer: Answer) -> Trajectory | None:
-    """The query's poses in the map frame; None without an answer."""
-    if answer.T_map_odom is None:
-        return None
-    return replace(poses, T_session_base=answer.T_map_odom.lift() @ poses.T_session_base)
 
 
 _MOST_BYTES = 1 << 20
@@ -146,7 +118,7 @@ _MOST_BYTES = 1 << 20
 
 
 def write_initialpose(path: Path, answer: Answer) -> None:
-    """The pose as JSON that `ros2 topic pub --once /initialpose` takes. The answer must be located."""
+    """Write the pose as JSON that `ros2 topic pub --once /initialpose` takes. The answer must be located."""
     assert answer.T_map_base is not None
     assert answer.covariance is not None
     message = initialpose(answer.stamp_ns, answer.T_map_base, answer.covariance)
@@ -155,7 +127,7 @@ def write_initialpose(path: Path, answer: Answer) -> None:
 
 
 def initialpose(stamp_ns: int, T_map_base: SE2, covariance: F64, frame: str = "map") -> dict[str, Any]:
-    """geometry_msgs/PoseWithCovarianceStamped, plain types only.
+    """Return geometry_msgs/PoseWithCovarianceStamped in plain types.
 
     covariance : (3, 3) of x, y, yaw; of these the variances, see `ros_messages.initialpose`.
     """
@@ -169,8 +141,8 @@ def initialpose(stamp_ns: int, T_map_base: SE2, covariance: F64, frame: str = "m
 
 
 def read_pose(path: Path) -> MapPose:
-    """A pose with covariance from a file: JSON as `write_initialpose` writes it, or YAML as `ros2 topic echo`
-    prints it.
+    """Read a pose with covariance from a file: JSON as `write_initialpose` writes it, or YAML as `ros2 topic
+    echo` prints it.
 
     Raises ConfigError if the file cannot be read or holds no such message.
     """
@@ -195,3 +167,132 @@ def read_pose(path: Path) -> MapPose:
         raise ConfigError(f"{path}: neither JSON nor YAML", hint=advice) from error
     except (KeyError, TypeError, ValueError, IndexError) as error:
         raise ConfigError(f"{path}: not a PoseWithCovarianceStamped message", hint=advice) from error
+
+
+class CheckedPose(Pose):
+    """The pose at the last scan, in the map frame."""
+
+    stamp_ns: int
+
+
+class BetterPlace(Labelled):
+    """Where the query is instead, with certainty."""
+
+    session: str | None
+    pose: StampedPose | None
+    confidence: float
+
+
+class CheckedAgainst(TypedDict):
+    """The database."""
+
+    path: str
+
+
+class CheckedPoseJudgement(TypedDict):
+    """What is said of a pose that the robot believes in.
+
+    status: fine, lost, or unsure. probability: that the pose is right; an upper bound unless it is fine.
+    off_m, off_rad: from the pose to the best fit near it, null if nothing fits there. comparable: false if
+    registration was lost after the time of the pose. better: null unless another place is certain.
+    """
+
+    status: CheckStatus
+    probability: float
+    session: str
+    pose: CheckedPose
+    off_m: float | None
+    off_rad: float | None
+    comparable: bool
+    better: BetterPlace | None
+    database: CheckedAgainst
+
+
+class RelocalizeCheck(CheckedPoseJudgement):
+    """`pc2grid relocalize --check` and `--check-topic`, with `--json`."""
+
+    query: QueryRecording
+
+
+def check_log(
+    given: options.Relocalize, database: SubmapDatabase, config: Config, observer: Observer
+) -> tuple[PoseCheck, RelocalizeCheck]:
+    """Check the pose at the end of a recording, or of the part of it that is named."""
+    (path,), span = given.logs, given.span
+    config = query_config(database, config)
+    with open_log(path, config.read, recover=given.recover) as log:
+        T_map_base, stamp_ns = _believed(log, given)
+        health: list[Health] = []
+
+        def counted() -> Iterator[tuple[RegisteredScan, PlanarScan]]:
+            for registered, planar_scan in tracked(log, config, span, observer):
+                health.append(registered.health)
+                yield registered, planar_scan
+
+        with observer.step("check", span.length_ns(log.info.start_ns, log.info.end_ns) * 1e-9):
+            index = MapIndex.of(database, config)
+            checked = check_pose(counted(), index, T_map_base, stamp_ns=stamp_ns, session=given.session)
+        about = about_log(path, log, checked, span, health)
+        document: RelocalizeCheck = {**judgement(checked, database.location), "query": about}
+        return checked, plain(RelocalizeCheck, document)
+
+
+def _believed(log: Log, given: options.Relocalize) -> tuple[SE2, int | None]:
+    """Return the pose to be checked, and its time; None: the last scan."""
+    if given.check_topic is not None:
+        pose = log.map_pose(given.check_topic, _end_s(given.span))
+        return pose.T_map_base, pose.stamp_ns
+    assert given.check is not None
+    x_m, y_m, yaw_deg = given.check
+    return SE2(x_m, y_m, math.radians(yaw_deg)), None
+
+
+def judgement(checked: PoseCheck, where: str) -> CheckedPoseJudgement:
+    """Return what is said of a pose. where : the database."""
+    pose, better = checked.T_map_base, checked.better
+    return {
+        "status": checked.status,
+        "probability": checked.probability,
+        "session": checked.session,
+        "pose": {"x": pose.x, "y": pose.y, "yaw": pose.yaw, "stamp_ns": checked.stamp_ns},
+        "off_m": checked.off_m,
+        "off_rad": checked.off_rad,
+        "comparable": not checked.lapsed,
+        "better": None
+        if better is None
+        else {
+            "session": better.session,
+            "building": better.label.building,
+            "floor": better.label.floor,
+            "pose": better.stamped_pose,
+            "confidence": better.confidence,
+        },
+        "database": {"path": where},
+    }
+
+
+def as_text(checked: PoseCheck) -> str:
+    """Return the judgement in one or two lines."""
+    pose = checked.T_map_base
+    where = f"x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg"
+    told = f"{checked.status}: {where} in {one_line(checked.session)}"
+    if checked.lapsed:
+        return f"{told}: registration was lost after that pose, so it cannot be compared"
+    told += f", right with probability {_bound(checked)}"
+    if checked.off_m is not None and checked.off_rad is not None and checked.status == "fine":
+        told += f", {checked.off_m:.2f} m and {math.degrees(checked.off_rad):.1f} deg from the best fit"
+    told += f", after {checked.path_m:.1f} m of travel"
+    better = checked.better
+    if better is not None and better.T_map_base is not None:
+        pose = better.T_map_base
+        told += (
+            f"\n  better, in {one_line(better.session or '')}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
+            f" yaw {math.degrees(pose.yaw):.1f} deg, confidence {probability(better.confidence)}"
+        )
+    return told
+
+
+def _bound(checked: PoseCheck) -> str:
+    """Return the probability in words: an upper bound unless the pose is fine."""
+    told = probability(checked.probability)
+    return told if checked.status == "fine" or told.startswith("<") else f"at most {told}"

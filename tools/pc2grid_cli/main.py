@@ -1,23 +1,20 @@
-"""The program `pc2grid`: global options and the list of commands.
+"""The program `pc2grid`: its commands, the options that may stand anywhere, and what was removed.
 
-How the words of a command are read, in addition to what typer does.
-
-Global options are understood behind the command as well, where people put them. The declaration of a command
-is imported when it is used, and what does its work when it runs (`commands.py`).
-
-What is said of commands and options that the program had before.
+A command is known by its name and one sentence until it is used. Then its declaration is imported: a type of
+`options.py`, or a function of the laboratory. What does its work is imported when it runs.
 """
 
 from __future__ import annotations
 
 import atexit
 import gc
+import inspect
 import os
+import pkgutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cached_property
-from importlib import import_module
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal, get_origin
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -38,7 +35,7 @@ LABORATORY = "pc2grid_lab"
 
 
 def _apply(context: typer.Context, option: typer.CallbackParam, value: int) -> None:
-    """Add what a global option says to what the console knows."""
+    """Set what a global option means on the console."""
     terminal = console.of(context)
     if option.name == "verbose":
         terminal.verbose += value
@@ -68,7 +65,7 @@ def _global_options(
         typer.Option("--debug", callback=_apply, expose_value=False, help="tracebacks for errors"),
     ] = False,
 ) -> None:
-    """The options that may stand before and behind any command."""
+    """Declare the options that may stand before and behind any command."""
 
 
 _made = typer.Typer(add_completion=False)
@@ -84,7 +81,7 @@ class Command(TyperCommand):
         self.params += _GLOBAL
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Let an error say what to type."""
+        """Parse the words; an error says what to type instead."""
         try:
             return super().parse_args(ctx, args)
         except Exception as error:  # its class is not public
@@ -92,20 +89,44 @@ class Command(TyperCommand):
             raise
 
 
+def _callback(options: Any, work: str) -> Callable[..., None]:
+    """Return a function for typer, which makes the options of what is typed and gives them to the work.
+
+    options : a type of `options.py`. work : "package.module:function", which takes the options and the
+    console and returns the exit code, or None. What must be typed stands first, then the command's own
+    options, then those of the types that it extends.
+    """
+    names = [name for kind in options.__mro__ for name in vars(kind).get("__annotations__", ())]
+    place = {name: number for number, name in enumerate(names)}
+    typed = inspect.signature(options).parameters.values()
+    declared = [one for one in typed if get_origin(one.annotation) is Annotated]
+    declared.sort(key=lambda one: (one.default is not one.empty, place[one.name]))
+
+    def run(context: typer.Context, **given: Any) -> None:
+        raise typer.Exit(pkgutil.resolve_name(work)(options(**given), console.of(context)) or console.OK)
+
+    context = inspect.Parameter("context", inspect.Parameter.KEYWORD_ONLY, annotation=typer.Context)
+    run.__signature__ = inspect.Signature([context, *declared])  # type: ignore[attr-defined]
+    run.__doc__ = options.__doc__
+    return run
+
+
 class LateCommand(TyperCommand):
     """A command that is known by its name and one sentence until it is used."""
 
-    def __init__(self, name: str, function: str, sentence: str) -> None:
-        """function : "package.module:function". sentence : what lists of commands say of it."""
+    def __init__(self, name: str, sentence: str, declaration: str, work: str = "") -> None:
+        """declaration : "package.module:name". work : see `_callback`; empty: the declaration is a function.
+
+        sentence : for lists of commands.
+        """
         super().__init__(name, help=sentence)
-        self._function = function
+        self._declaration, self._work = declaration, work
 
     @cached_property
     def command(self) -> Any:
         """The command itself."""
-        name, _, function = self._function.partition(":")
         try:
-            module = import_module(name)
+            declared = pkgutil.resolve_name(self._declaration)
         except ModuleNotFoundError as error:
             if error.name != LABORATORY:
                 raise
@@ -114,19 +135,19 @@ class LateCommand(TyperCommand):
                 hint="in the clone: pip install -e .",
             ) from None
         app = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
-        app.command(self.name, cls=Command)(getattr(module, function))
+        app.command(self.name, cls=Command)(_callback(declared, self._work) if self._work else declared)
         return get_command(app)
 
     def make_context(self, *arguments: Any, **more: Any) -> Any:
-        """The context of the command itself."""
+        """Return the context of the command itself."""
         return self.command.make_context(*arguments, **more)
 
 
 class Group(TyperGroup):
     """A group of commands that takes the global options."""
 
-    late: ClassVar[Mapping[str, tuple[str, str]]] = {}
-    """By name: "package.module:function", and one sentence about the command."""
+    late: ClassVar[Mapping[str, tuple[str, ...]]] = {}
+    """By name: what `LateCommand` takes."""
 
     def __init__(self, **about: Any) -> None:
         super().__init__(**about)
@@ -134,7 +155,7 @@ class Group(TyperGroup):
         self.commands = {**{name: LateCommand(name, *of) for name, of in self.late.items()}, **self.commands}
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that the words name, with the words behind its name."""
+        """Return the command that the words name, with the words behind its name."""
         try:
             return super().resolve_command(ctx, args)
         except Exception as error:  # its class is not public
@@ -142,73 +163,71 @@ class Group(TyperGroup):
             raise
 
 
-def group(commands: Mapping[str, tuple[str, str]]) -> type[Group]:
-    """A group of commands, which are imported when they are used; see `Group.late`."""
-    return type("Group", (Group,), {"late": commands})
-
-
 def _hint_of_removed(error: Exception, ctx: Any, word: str) -> None:
-    """Let the error for an unknown command or option say what to use, if there was one of that name."""
+    """Add to the error for an unknown command or option what to use, if there was one of that name."""
     error.suggestion = REMOVED.get(f"{ctx.command_path} {word}")  # type: ignore[attr-defined]
 
 
-_NEW_OBJECTS = 100_000
-"""After so many new objects the collector looks for cycles. `convert` leaves 2,000 objects in cycles in 150 s
-of a laser."""
-# Name, "package.module:function", and what lists of commands say of it.
+def _group(commands: Mapping[str, tuple[str, ...]], sentence: str, **about: Any) -> typer.Typer:
+    """Return a group of commands, see `Group.late`."""
+    kind = type("Group", (Group,), {"late": commands})
+    return typer.Typer(cls=kind, help=sentence, no_args_is_help=True, **about)
+
+
+def _command(sentence: str, declaration: str, work: str) -> tuple[str, str, str]:
+    """Return a command of the program. declaration : a type of `options.py`. work : "file:function"."""
+    return sentence, f"pc2grid_cli.options:{declaration}", f"pc2grid_cli.{work}"
+
+
+def _experiment(sentence: str, declaration: str) -> tuple[str, str]:
+    """Return a command of the laboratory. No module of the product imports it: it is loaded by its name."""
+    return sentence, f"{LABORATORY}.commands:{declaration}"
+
+
 COMMANDS = {
-    "demo": ("pc2grid_cli.commands:demo_command", "Map a simulated office, and find another robot in it."),
-    "simulate": ("pc2grid_cli.commands:simulate_command", "Drive a robot through a building and record it."),
-    "info": ("pc2grid_cli.commands:info_command", "Say what is in a recording, a map or a database."),
-    "convert": ("pc2grid_cli.commands:convert_command", "Make a submap database from recordings or maps."),
-    "relocalize": ("pc2grid_cli.commands:relocalize_command", "Find where a recording was made."),
-    "watch": ("pc2grid_cli.commands:watch_command", "Find where a running robot is, while it drives."),
-    "export": ("pc2grid_cli.commands:export_command", "Write a session's map, trajectory, picture or page."),
-    "view": ("pc2grid_cli.commands:view_command", "Look into a database in the browser, and locate there."),
+    "demo": _command("Map a simulated office, and find another robot in it.", "Demo", "demo:run"),
+    "simulate": _command("Drive a robot through a building and record it.", "Simulate", "demo:simulate"),
+    "info": _command("Say what is in a recording, a map or a database.", "Info", "info:run"),
+    "convert": _command("Make a submap database from recordings or maps.", "Convert", "convert:run"),
+    "relocalize": _command("Find where a recording was made.", "Relocalize", "relocalize:run"),
+    "watch": _command("Find where a running robot is, while it drives.", "Watch", "watch:run"),
+    "export": _command("Write a session's map, trajectory, picture or page.", "Export", "export:run"),
+    "view": _command("Look into a database in the browser, and locate there.", "View", "view:run"),
 }
 DB = {
-    "info": ("pc2grid_cli.commands:db_info_command", "Show the sessions of a database."),
-    "check": ("pc2grid_cli.commands:db_check_command", "Read everything and list all damage."),
-    "merge": ("pc2grid_cli.commands:db_merge_command", "Put the sessions of several databases into one."),
-    "join": (
-        "pc2grid_cli.commands:db_join_command",
-        "Find out how sessions of a building lie to each other.",
-    ),
-    "copy": ("pc2grid_cli.commands:db_copy_command", "Write a compact copy of a database."),
-    "split": ("pc2grid_cli.commands:db_split_command", "Copy sessions into a database of their own."),
-    "rename": ("pc2grid_cli.commands:db_rename_command", "Give a session another name."),
-    "remove": ("pc2grid_cli.commands:db_remove_command", "Remove sessions from a database."),
+    "info": _command("Show the sessions of a database.", "DbInfo", "db:info"),
+    "check": _command("Read everything and list all damage.", "DbCheck", "db:check"),
+    "merge": _command("Put the sessions of several databases into one.", "DbMerge", "db:merge"),
+    "join": _command("Find out how sessions of a building lie to each other.", "DbJoin", "db:join"),
+    "copy": _command("Write a compact copy of a database.", "DbCopy", "db:copy"),
+    "split": _command("Copy sessions into a database of their own.", "DbSplit", "db:split"),
+    "rename": _command("Give a session another name.", "DbRename", "db:rename"),
+    "remove": _command("Remove sessions from a database.", "DbRemove", "db:remove"),
 }
 CONFIG = {
-    "dump": ("pc2grid_cli.commands:config_dump_command", "Print every setting as TOML."),
-    "schema": ("pc2grid_cli.commands:config_schema_command", "Print the JSON Schema of a document."),
+    "dump": _command("Print every setting as TOML.", "ConfigDump", "documents:dump"),
+    "schema": _command("Print the JSON Schema of a document.", "ConfigSchema", "documents:print_schema"),
 }
-# Commands of the laboratory. No module of the product imports it: it is loaded by name when it is asked for.
 COMPARE = {
-    "recordings": (
-        "pc2grid_lab.commands:compare_recordings_command",
-        "Real recordings as maps, located in each other; and what changed.",
+    "recordings": _experiment(
+        "Real recordings as maps, located in each other; and what changed.", "compare_recordings_command"
     ),
-    "sensors": ("pc2grid_lab.commands:compare_sensors_command", "Each sensor in the maps of each."),
-    "peers": (
-        "pc2grid_lab.commands:compare_peers_command",
-        "Other programs, the same maps and queries.",
-    ),
-    "paper": ("pc2grid_lab.commands:compare_paper_command", "The paper's tables and figures 9 and 10."),
-    "scale": ("pc2grid_lab.commands:compare_scale_command", "The paper's recall in larger databases."),
+    "sensors": _experiment("Each sensor in the maps of each.", "compare_sensors_command"),
+    "peers": _experiment("Other programs, the same maps and queries.", "compare_peers_command"),
+    "paper": _experiment("The paper's tables and figures 9 and 10.", "compare_paper_command"),
+    "scale": _experiment("The paper's recall in larger databases.", "compare_scale_command"),
 }
 
-app = typer.Typer(
-    cls=group(COMMANDS),
-    help="Recordings to a submap database, and where in it a later recording was made.",
-    no_args_is_help=True,
+app = _group(
+    COMMANDS,
+    "Recordings to a submap database, and where in it a later recording was made.",
     rich_markup_mode=MARKUP,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
 
-def _say_version(wanted: bool) -> None:
+def _print_version(wanted: bool) -> None:
     if wanted:
         print(f"pc2grid {pc2grid.__version__}")
         raise typer.Exit
@@ -218,32 +237,22 @@ def _say_version(wanted: bool) -> None:
 def options(
     version: Annotated[
         bool,
-        typer.Option("--version", callback=_say_version, is_eager=True, help="print the version and stop"),
+        typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and stop"),
     ] = False,
 ) -> None:
     """Recordings to a submap database, and where in it a later recording was made."""
 
 
-app.add_typer(
-    typer.Typer(
-        cls=group(COMPARE),
-        help="Measure: recordings, sensors, peers, the paper's tables, scale. Only in a clone.",
-        no_args_is_help=True,
-    ),
-    name="compare",
-)
-app.add_typer(
-    typer.Typer(
-        cls=group(DB),
-        help="Look into databases, check, join, change, merge, split and copy them.",
-        no_args_is_help=True,
-    ),
-    name="db",
-)
-app.add_typer(
-    typer.Typer(cls=group(CONFIG), help="Settings, and schemas of JSON documents.", no_args_is_help=True),
-    name="config",
-)
+for _name, _commands, _sentence in (
+    ("compare", COMPARE, "Measure: recordings, sensors, peers, the paper's tables, scale. Only in a clone."),
+    ("db", DB, "Look into databases, check, join, change, merge, split and copy them."),
+    ("config", CONFIG, "Settings, and schemas of JSON documents."),
+):
+    app.add_typer(_group(_commands, _sentence), name=_name)
+
+_NEW_OBJECTS = 100_000
+"""After so many new objects the collector looks for cycles. `convert` leaves 2,000 objects in cycles in 150 s
+of a laser."""
 
 
 def main() -> None:

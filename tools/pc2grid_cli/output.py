@@ -1,9 +1,4 @@
-"""The files that options name for writing; they are checked before any work begins.
-
-The one style of the tables that commands print on stdout.
-
-Data that was lost while a recording was read: the warning, and whether the exit code is 3.
-"""
+"""What commands write: files, which are checked before any work begins, tables, and warnings of lost data."""
 
 from __future__ import annotations
 
@@ -11,16 +6,13 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rich.box import SIMPLE_HEAD
-from rich.console import Console
-from rich.table import Table
-
 from pc2grid.errors import OutputError
 from pc2grid.io.atomic import require_writable
+from pc2grid.model import ReadReport
 from signature.database.postgres import is_url
 
 if TYPE_CHECKING:
-    from pc2grid.model import ReadReport
+    from rich.table import Table
 
 
 SUFFIXES: dict[str, tuple[str, ...]] = {
@@ -61,13 +53,13 @@ def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool 
     require_writable(path, force)
 
 
-def files_of(**options: Path | None) -> dict[str, Path]:
-    """What is to be written, by option; an option that was not given is left out."""
-    return {option: path for option, path in options.items() if path is not None}
+def files_of(given: object, names: Iterable[str]) -> dict[str, Path]:
+    """Return what is to be written, by the name of its option; options that were not given are left out."""
+    return {name: path for name in names if (path := getattr(given, name)) is not None}
 
 
 def written_files(outputs: Mapping[str, Path]) -> list[Path]:
-    """The files of some options; `map` names the stem of two."""
+    """Return the files of some options; `map` names the stem of two."""
     files = []
     for option, path in outputs.items():
         ends = (".yaml", ".pgm") if option == "map" else ("",)
@@ -76,9 +68,9 @@ def written_files(outputs: Mapping[str, Path]) -> list[Path]:
 
 
 def map_stem(path: Path) -> Path:
-    """The stem of a nav2 map: its files are STEM.yaml and STEM.pgm. Either may be named instead of the stem.
+    """Return the stem of a nav2 map, whose files are STEM.yaml and STEM.pgm.
 
-    Raises OutputError for the suffix of another format.
+    Either of these may be named instead of the stem. Raises OutputError for the suffix of another format.
     """
     suffix = path.suffix.lower()
     if suffix in SUFFIXES["map"]:
@@ -92,7 +84,7 @@ def map_stem(path: Path) -> Path:
 
 
 def check_database_name(output: str) -> None:
-    """Raises OutputError if the file of a new database has the suffix of another format."""
+    """Raise OutputError if the file of a new database has the suffix of another format."""
     path = Path(output)
     if path.suffix.lower() in _OF_OTHERS:
         raise OutputError(
@@ -102,7 +94,7 @@ def check_database_name(output: str) -> None:
 
 
 def check_database(output: str) -> None:
-    """Raises OutputError if the file of a database cannot be written; a server is asked later."""
+    """Raise OutputError if the file of a database cannot be written; a server is asked later."""
     if not is_url(output):
         require_writable(output, overwrite=True)
 
@@ -124,7 +116,10 @@ left out."""
 
 
 def table(title: str, texts: Iterable[str], numbers: Iterable[str] = ()) -> Table:
-    """An empty table: columns of texts, aligned left, and then columns of numbers, aligned right."""
+    """Return an empty table: columns of texts, aligned left, then columns of numbers, aligned right."""
+    from rich.box import SIMPLE_HEAD
+    from rich.table import Table
+
     made = Table(
         title=title,
         title_justify="left",
@@ -143,6 +138,8 @@ def table(title: str, texts: Iterable[str], numbers: Iterable[str] = ()) -> Tabl
 
 def show(*parts: Table | str) -> None:
     """Print tables, and sentences between them."""
+    from rich.console import Console
+
     console = Console(width=_WIDEST, highlight=False)
     for part in parts:
         if isinstance(part, str):
@@ -152,7 +149,7 @@ def show(*parts: Table | str) -> None:
 
 
 def sentence(report: ReadReport) -> str:
-    """What was lost, by reason, for a warning."""
+    """Return what was lost, by reason, for a warning."""
     parts = [f"{count} scans skipped ({reason})" for reason, count in report.scans_skipped.items()]
     if report.bytes_lost:
         parts.append(f"{report.bytes_lost} bytes unreadable")
@@ -160,5 +157,5 @@ def sentence(report: ReadReport) -> str:
 
 
 def ends_with_3(report: ReadReport, strict: bool) -> bool:
-    """Whether the loss is severe; with `strict` any loss is."""
+    """Return whether the loss is severe; with `strict` any loss is."""
     return report.severe or (strict and report.lossy)

@@ -1,8 +1,7 @@
 """`pc2grid view`: a database in the browser, and recordings that are dropped there, located at once.
 
-What happens while something is located, as server-sent events for all pages that look on.
-
-The server of `pc2grid view`: pages, an upload, and events, for this machine only.
+`Locator` locates, `Events` passes what happens on to all pages that look on (server-sent events), and
+`ViewServer` serves the pages, takes an upload, and sends the events, for this machine only.
 
 Other web sites that are open in the same browser must not reach it: it listens on the loopback address, all
 paths begin with a random token, and requests with a foreign `Host` (DNS rebinding) or `Origin` are refused.
@@ -21,56 +20,73 @@ import secrets
 import select
 import socket
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
+from pc2grid import libraries as extras
 from pc2grid.errors import ConfigError, LogTruncated, OutputError, Pc2GridError
 from pc2grid.geometry import SE2
 from pc2grid.io.live.live_log import open_live
-from pc2grid.model import Health
+from pc2grid.model import Health, RegisteredScan
 from pc2grid.observer import Observer
-from pc2grid_cli import console
-from pc2grid_cli import options as options
+from pc2grid_cli import console, known_pose, options
 from pc2grid_cli.console import json_text
-from pc2grid_cli.known_pose import KnownPose
-from pc2grid_cli.windows import run
-from signature.localization.localizer import Follower, Localizer
+from pc2grid_cli.watch import feed
+from signature.config import Config
+from signature.database import SubmapDatabase
+from signature.localization.localizer import Estimate, Follower, Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.page import page
 from signature.sessions import find, query_config
-
-if TYPE_CHECKING:
-    from pc2grid.model import RegisteredScan
-    from signature.config import Config
-    from signature.database import SubmapDatabase
-    from signature.localization.localizer import Estimate
-
 
 _SHARES_EVERY_S = 0.2
 _META = '<meta http-equiv="Content-Security-Policy"'
 
 
-def serve(
-    server: ViewServer, locator: Locator, source: str | None, terminal: console.Console, *, browser: bool
-) -> None:
+def run(given: options.View, terminal: console.Console) -> None:
     """Serve the pages until the program is stopped."""
+    extras.require(extras.of_addresses(given.source, given.database))
+    settings, most_bytes = given.settings(), round(given.most_gb * 1e9)
+    with (
+        known_pose.searched(given) as (opened, _),
+        tempfile.TemporaryDirectory(prefix="pc2grid-view-") as folder,
+    ):
+        locator = Locator(opened, settings)
+        try:
+            server = ViewServer(given.port, locator.events, Path(folder), locator.work, most_bytes=most_bytes)
+        except OSError as error:
+            raise OutputError(
+                f"port {given.port}: {error.strerror}", hint="--port 0 takes any port that is free"
+            ) from error
+        locator.pages = server.pages
+        server.pages[""] = live_page(opened)
+        try:
+            _serve(server, locator, given, terminal)
+        finally:
+            server.stop()
+
+
+def _serve(server: ViewServer, locator: Locator, given: options.View, terminal: console.Console) -> None:
+    """Print the address, and serve; follow the source, if there is one."""
     print(server.url, flush=True)
-    if source is None:
+    if given.source is None:
         terminal.note("drop a recording onto the page; Ctrl-C ends this")
-    if browser:
+    if not given.no_browser:
         _open_browser(server.url)
-    if source is None:
+    if given.source is None:
         server.serve_forever()
         return
     with server.in_background():
-        locator.follow(source)
+        locator.follow(given.source)
         terminal.note("the page stays as it is; Ctrl-C ends this")
         threading.Event().wait()
 
@@ -80,14 +96,13 @@ class Locator:
 
     def __init__(self, database: SubmapDatabase, settings: Config) -> None:
         self._database, self._settings = database, settings
-        self._index: MapIndex | None = None
         self.events = Events()
         self.pages: dict[str, bytes] = {}
 
-    def work(self, path: Path, options: Options, check: Callable[[], None]) -> dict[str, Any]:
+    def work(self, path: Path, asked: Options, check: Callable[[], None]) -> dict[str, Any]:
         """Locate a recording: a `pc2grid_cli.view.Work`.
 
-        options : `near`, x,y,radius in metres, and `session`, whose map frame they are in.
+        asked : `near`, x,y,radius in metres, and `session`, whose map frame they are in.
         """
         events, progress = self.events, Progress(self.events)
         events.publish("begin", {"source": path.name})
@@ -99,19 +114,18 @@ class Locator:
                 progress.tell(estimate)
 
         try:
-            known = KnownPose(near=_near(options.get("near")), session=options.get("session"))
+            known = options.KnownPose(near=_near(asked.get("near")), session=asked.get("session"))
             found = find(
                 path,
                 self._database,
                 self._settings,
                 observer=_Shares(events),
                 see=see,
-                prior=known.prior,
-                index=self._prepared(),
+                prior=lambda log, span: known_pose.prior(known, log, span),
+                index=self._index,
             )
             progress.flush()
-            accept = self._settings.relocalize.accept
-            self.pages["answer"] = live_page(self._database, found=found, accept=accept)
+            self.pages["answer"] = live_page(self._database, found=found)
         except BaseException as error:
             told: dict[str, Any] = {"error": "internal error; the terminal shows it", "hint": None}
             if isinstance(error, Pc2GridError):
@@ -122,10 +136,9 @@ class Locator:
                 told["error"] = "stopped"
             events.publish("end", {"source": path.name, **told})
             raise
-        answer = found.answer
-        told = {"status": answer.status, "session": answer.session, "confidence": answer.confidence}
+        told = {"status": found.status, "session": found.session, "confidence": found.confidence}
         events.publish("end", {"source": path.name, **told})
-        return {**answer.to_json(), "query": found.about}
+        return {**found.to_json(), "query": found.about}
 
     def follow(self, source: str) -> None:
         """Show a running robot until its source ends.
@@ -133,7 +146,7 @@ class Locator:
         source : as `pc2grid watch` takes it. Raises the errors of `pc2grid.io.live.live_log.open_live`.
         """
         config = query_config(self._database, self._settings)
-        localizer, progress = Localizer(self._prepared()), Progress(self.events)
+        localizer, progress = Localizer(self._index), Progress(self.events)
         with (
             open_live(source, config.read) as live,
             Follower(localizer, beside=True, step_m=config.relocalize.step_m) as follower,
@@ -147,15 +160,14 @@ class Locator:
                 return False
 
             self.events.publish("begin", {"source": source})
-            run(live, follower, config, poll, see=progress.add)
+            feed(live, follower, config, poll, see=progress.add)
             progress.flush()
         self.events.publish("end", {"source": source, "error": "the source has ended", "hint": None})
 
-    def _prepared(self) -> MapIndex:
+    @cached_property
+    def _index(self) -> MapIndex:
         """The maps, prepared once for all recordings."""
-        if self._index is None:
-            self._index = MapIndex.of(self._database, query_config(self._database, self._settings))
-        return self._index
+        return MapIndex.of(self._database, query_config(self._database, self._settings))
 
 
 class _Shares(Observer):
@@ -172,7 +184,7 @@ class _Shares(Observer):
 
 
 def live_page(database: SubmapDatabase, **answer: Any) -> bytes:
-    """The page of a report, with the part that takes recordings and shows events."""
+    """Return the page of a report, with the part that takes recordings and shows events."""
     html = page(database, **answer)
     live = files("pc2grid_cli").joinpath("view.html").read_text(encoding="utf-8")
     # The policy of a report allows no connection; the server sends one that allows those to itself.
@@ -185,7 +197,7 @@ def live_page(database: SubmapDatabase, **answer: Any) -> bytes:
 
 
 def _near(text: str | None) -> tuple[float, float, float] | None:
-    """x,y,radius of a request. Raises ConfigError."""
+    """Return x, y, radius of a request. Raises ConfigError."""
     if text is None:
         return None
     try:
@@ -262,7 +274,7 @@ class Events:
                 self._pages.remove(page)
 
     def close(self) -> None:
-        """No more events: tell all pages."""
+        """Tell all pages that no more events come."""
         with self._lock:
             self._closed = True
             for page in self._pages:
@@ -299,7 +311,7 @@ class Progress:
     _base: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
     def add(self, registered: RegisteredScan | None) -> None:
-        """The next scan; None: what follows does not go on from what was before."""
+        """Add the next scan; None: what follows does not go on from what was before."""
         if registered is None:
             self._waiting.append([*self._base, 1])
             return
@@ -309,7 +321,7 @@ class Progress:
             self.flush()
 
     def tell(self, estimate: Estimate) -> None:
-        """An estimate; without an answer, the best place all the same."""
+        """Publish an estimate; without an answer, the best place all the same."""
         moment = estimate.answer.history[-1]
         self.flush()
         self.events.publish(
@@ -332,7 +344,7 @@ class Progress:
 
 
 def _planar(registered: RegisteredScan) -> tuple[float, float, float]:
-    """x, y, yaw of the base in the query's frame, as finely as it can be seen."""
+    """Return x, y, yaw of the base in the query's frame, as finely as it can be seen."""
     base = SE2.from_matrix(registered.T_session_base)
     return round(base.x, 3), round(base.y, 3), round(base.yaw, 4)
 
@@ -393,7 +405,7 @@ class ViewServer(http.server.ThreadingHTTPServer):
 
     @contextlib.contextmanager
     def in_background(self) -> Iterator[None]:
-        """Serves in a thread of its own; no recordings are taken meanwhile."""
+        """Serve in a thread of its own; no recordings are taken meanwhile."""
         thread = threading.Thread(target=self.serve_forever, daemon=True)
         with self.busy:
             thread.start()
@@ -423,7 +435,7 @@ class ViewServer(http.server.ThreadingHTTPServer):
         self.close_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """A client that went away is no error of ours; anything else is printed."""
+        """Print an error, unless the client went away."""
         if not isinstance(sys.exc_info()[1], (ConnectionError, TimeoutError)):
             super().handle_error(request, client_address)
 
@@ -437,10 +449,10 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     """Whether an answer was begun. A connection carries one request: HTTP/1.0."""
 
     def log_message(self, format: str, *args: Any) -> None:
-        """Requests are not printed."""
+        """Print nothing of requests."""
 
     def do_GET(self) -> None:
-        """A page, or the events."""
+        """Send a page, or the events."""
         self._answered(self._get)
 
     def do_POST(self) -> None:
@@ -491,7 +503,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     # --- who asks -------------------------------------------------------------------------------------
 
     def _allowed(self) -> str | None:
-        """The name of what is asked for, without the token; None, and an answer, if it is not allowed."""
+        """Return the name of what is asked for, without the token; None, and an answer, if not allowed."""
         port = self.server.server_port
         hosts = {f"{host}:{port}" for host in (_ADDRESS, "localhost")}
         origin = self.headers.get("Origin")
@@ -511,7 +523,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         return name.strip("/")
 
     def _is_gone(self) -> bool:
-        """Whether the client has closed the connection. It sends nothing more after the recording."""
+        """Return whether the client has closed the connection. It sends nothing more after the recording."""
         try:
             readable, _, _ = select.select([self.connection], [], [], 0)
             return bool(readable) and not self.connection.recv(1, socket.MSG_PEEK)
@@ -565,7 +577,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     # --- an upload ------------------------------------------------------------------------------------
 
     def _locate(self) -> tuple[HTTPStatus, Any] | None:
-        """The answer, or why there is none; None if nobody waits for it."""
+        """Return the answer, or why there is none; None if nobody waits for it."""
         options = {key: values[-1] for key, values in parse_qs(urlsplit(self.path).query).items()}
         text = self.headers.get("Content-Length", "")
         if not re.fullmatch(r"[0-9]{1,18}", text):
@@ -615,7 +627,7 @@ def _refusal(status: HTTPStatus, error: str, hint: str | None = None) -> tuple[H
 
 
 def safe_name(name: str) -> str:
-    """A name for the file of an upload: the last part of what the client calls it, of harmless characters.
+    """Return a name for the file of an upload: the last part of the client's name, of harmless characters.
 
     >>> safe_name("../../etc/passwd"), safe_name("C:\\\\logs\\\\run 1.mcap"), safe_name("..")
     ('passwd', 'run_1.mcap', 'recording')

@@ -1,4 +1,9 @@
-"""`pc2grid watch`: where in the database is the robot that is running now?"""
+"""`pc2grid watch`: where in the database is the robot that is running now?
+
+What is followed is a robot, or a finished recording of one, of which every scan is used. After each metre the
+database is searched, or with --check-topic the pose is judged that the robot believes in; a line is printed,
+and the robot is told, if that is asked for.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +13,29 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from pathlib import Path
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
+from pc2grid import libraries as extras
 from pc2grid.display import probability
-from pc2grid.errors import ConfigError, one_line
+from pc2grid.errors import ConfigError, TrackingLost, one_line
 from pc2grid.geometry import SE2
-from pc2grid.io.live.live_log import LiveLog, is_robot
-from pc2grid.io.live.nav2 import Nav2Publisher
-from pc2grid_cli import console
-from pc2grid_cli import options as options
-from pc2grid_cli.check_pose import as_text as check_as_text
-from pc2grid_cli.check_pose import live_document
-from pc2grid_cli.windows import Followed, Live, live, run
+from pc2grid.io import Log, open_log
+from pc2grid.io.live.feed import FeedCounts, News
+from pc2grid.io.live.live_log import LiveLog, is_robot, open_live
+from pc2grid.io.live.nav2 import Nav2Publisher, Outlet
+from pc2grid.io.map_pose import BelievedPose, MapPose
+from pc2grid.io.source import Choice, RawMessage
+from pc2grid.model import ReadReport, RegisteredScan, Scan
+from pc2grid.observer import Observer
+from pc2grid.pipeline import follow
+from pc2grid.settings import ReadConfig
+from pc2grid_cli import console, known_pose, options
+from signature.config import Config
+from signature.database import SubmapDatabase
+from signature.database.protocol import BuildingFrame, SessionInfo
 from signature.localization.answer import answer_in_building
 from signature.localization.answer_json import (
     Labelled,
@@ -29,24 +43,28 @@ from signature.localization.answer_json import (
     PoseInSpace,
     StampedPose,
     Status,
-    in_space_document,
-    off_map_document,
+    TypedDict,
     plain,
-    stamped_pose,
 )
 from signature.localization.belief import State
 from signature.localization.joining.building import map_of
-from signature.localization.localizer import Follower, Localizer, ResetPolicy
+from signature.localization.localizer import Estimate, Follower, Localizer, ResetPolicy
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch
+from signature.localization.posterior import Prior
+from signature.sessions import query_config
 
-if TYPE_CHECKING:
-    from pc2grid.io.live.nav2 import Outlet
-    from signature.config import Config
-    from signature.database import SubmapDatabase
-    from signature.database.protocol import BuildingFrame, SessionInfo
-    from signature.localization.localizer import Estimate
-    from signature.localization.posterior import Prior
+
+class Live(TypedDict):
+    """How a running robot is followed. scans: used so far. dropped: left out because the computer is too
+    slow. reconnected: lost connections made again. lag_s, elapsed_s: seconds from a scan's arrival to its
+    use, and for this estimate."""
+
+    scans: int
+    dropped: int
+    reconnected: int
+    lag_s: float
+    elapsed_s: float
 
 
 class WatchedMap(Labelled):
@@ -81,15 +99,42 @@ class Watch(Live):
     published: list[str]
 
 
+class WatchCheck(known_pose.CheckedPoseJudgement, Live):
+    """A line of `pc2grid watch --check-topic --json`. path_m: travel that the judgement rests on."""
+
+    path_m: float
+
+
 EstimateT = TypeVar("EstimateT")
 
 
-def check_publishes(source: str, check_topic: str | None) -> None:
-    """Raises ConfigError if nothing can be published."""
-    if check_topic is not None:
-        raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
-    if not is_robot(source):
-        raise ConfigError(f"--publish: {source} takes no messages", hint="ws://ROBOT:8765 does")
+def run(given: options.Watch, terminal: console.Console) -> int | None:
+    """Follow a robot or a recording, and print what is found. Return the exit code."""
+    extras.require(extras.of_addresses(given.source, given.database))
+    settings = given.settings()
+    prior, check_topic = known_pose.region(given), given.check_topic
+    if given.first and (given.publish == "tf" or check_topic is not None):
+        goes_on = "--publish tf" if given.publish == "tf" else "--check-topic"
+        raise ConfigError(f"--first: {goes_on} goes on until it is stopped", hint="leave --first out")
+    if given.publish != "none" or given.publish_map:
+        if check_topic is not None:
+            raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
+        if not is_robot(given.source):
+            raise ConfigError(f"--publish: {given.source} takes no messages", hint="ws://ROBOT:8765 does")
+    end_s = math.inf if given.timeout is None else time.monotonic() + given.timeout
+    with (
+        known_pose.searched(given) as (opened, _),
+        followed(given.source, settings.read, real_time=given.real_time) as drive,
+    ):
+        following = Following(given, drive, opened, query_config(opened, settings), end_s, terminal)
+        if check_topic is not None:
+            good = _check(following, check_topic)
+        else:
+            with _robot_of(following) as robot:
+                # The region is that of the first scan.
+                good = _search(following, robot, prior and replace(prior, stamp_ns=0))
+        _summarize(drive, terminal)
+    return None if good else console.UNSURE
 
 
 @dataclass(frozen=True)
@@ -99,71 +144,79 @@ class Following:
     config : see `query_config`.
     """
 
+    given: options.Watch
     drive: Followed
     database: SubmapDatabase
     config: Config
     end_s: float
     terminal: console.Console
 
-    def run(self, follower: Follower[EstimateT], use: Callable[[EstimateT], bool]) -> None:
-        """Feed `follower` with scans. use : what to do with each estimate; true if that was enough."""
-        drive, over = self.drive, False
+    @property
+    def index(self) -> MapIndex:
+        """The maps, prepared for searches."""
+        return MapIndex.of(self.database, self.config, self.terminal.observer())
 
-        def poll() -> bool:
-            nonlocal over
-            _tell_news(drive)
-            for estimate in follower.take():
-                over = over or use(estimate)
-            over = over or time.monotonic() > self.end_s
-            return over
+    def run(self, searcher: Any, use: Callable[[EstimateT, threading.Lock], bool]) -> None:
+        """Search after each metre.
 
-        drive.on_poll = poll  # a robot may be silent from the beginning
-        choice = drive.choose()
-        self.terminal.note(f"{drive.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
-        run(drive, follower, self.config, poll, observer=self.terminal.observer())
+        searcher : what `Follower` takes. use : what to do with each estimate, and with the lock that is held
+        to read the database; true if that was enough.
+        """
+        drive, over, step_m = self.drive, False, self.config.relocalize.step_m
+        with Follower(searcher, beside=drive.realtime, step_m=step_m) as follower:
+
+            def poll() -> bool:
+                nonlocal over
+                _print_news(drive)
+                for estimate in follower.take():
+                    over = over or use(estimate, follower.lock)
+                over = over or time.monotonic() > self.end_s
+                return over
+
+            drive.on_poll = poll  # a robot may be silent from the beginning
+            choice = drive.choose()
+            self.terminal.note(f"{drive.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
+            feed(drive, follower, self.config, poll, observer=self.terminal.observer())
 
 
-def search(following: Following, robot: _Robot, prior: Prior | None, *, first: bool, as_json: bool) -> bool:
-    """Follow the robot; whether it is located at last.
+def _search(following: Following, robot: _Robot, prior: Prior | None) -> bool:
+    """Follow the robot. Return whether it is located at last.
 
-    prior : where the robot is at the beginning, as far as it is known. first : stop when it is located.
+    prior : where the robot is at the beginning, as far as it is known.
     """
-    drive, config = following.drive, following.config
-    index = MapIndex.of(following.database, config, following.terminal.observer())
-    localizer = Localizer(index if prior is None else index.within(prior))
-    located = False
-    with Follower(localizer, beside=drive.realtime, step_m=config.relocalize.step_m) as follower:
+    given, index, located = following.given, following.index, False
 
-        def use(estimate: Estimate) -> bool:
-            nonlocal located
-            estimate = replace(estimate, answer=answer_in_building(estimate.answer, robot.frames))
-            published = robot.tell(estimate, follower.lock)
-            document = _document(estimate, drive, robot, published)
-            console.print_result(document if as_json else as_text(estimate, published), indent=None)
-            located = estimate.answer.status == "located"
-            return estimate.is_told and first
+    def use(estimate: Estimate, lock: threading.Lock) -> bool:
+        nonlocal located
+        estimate = replace(estimate, answer=answer_in_building(estimate.answer, robot.frames))
+        published = robot.tell(estimate, lock)
+        document = _document(estimate, following.drive, robot, published)
+        console.print_result(document if given.json else as_text(estimate, published), indent=None)
+        located = estimate.answer.status == "located"
+        return estimate.is_told and given.first
 
-        following.run(follower, use)
+    following.run(Localizer(index if prior is None else index.within(prior)), use)
     return located
 
 
-def check(following: Following, topic: str, session: str | None, *, as_json: bool) -> bool:
-    """Follow the robot, and judge the pose that it believes in; whether the last one was fine."""
-    drive, config = following.drive, following.config
+def _check(following: Following, topic: str) -> bool:
+    """Follow the robot, and judge the pose that it believes in. Return whether the last one was fine."""
+    given, drive, fine = following.given, following.drive, False
     drive.listen_to_pose(topic)
-    index = MapIndex.of(following.database, config, following.terminal.observer())
-    watch = PoseWatch(index, lambda: drive.believed, session)
-    fine = False
-    with Follower(watch, beside=drive.realtime, step_m=config.relocalize.step_m) as follower:
 
-        def use(checked: PoseCheck) -> bool:
-            nonlocal fine
-            fine = checked.status == "fine"
-            document = live_document(checked, drive, following.database.location)
-            console.print_result(document if as_json else check_as_text(checked), indent=None)
-            return False
+    def use(checked: PoseCheck, lock: threading.Lock) -> bool:
+        nonlocal fine
+        fine = checked.status == "fine"
+        document: WatchCheck = {
+            **known_pose.judgement(checked, following.database.location),
+            **live(drive, checked.elapsed_s),
+            "path_m": checked.path_m,
+        }
+        said = plain(WatchCheck, document) if given.json else known_pose.as_text(checked)
+        console.print_result(said, indent=None)
+        return False
 
-        following.run(follower, use)
+    following.run(PoseWatch(following.index, lambda: drive.believed, given.session), use)
     if drive.believed is None:
         console.warn(f"{topic}: no pose of the robot in a map; nothing was checked")
     return fine
@@ -173,36 +226,20 @@ def check(following: Following, topic: str, session: str | None, *, as_json: boo
 class _Robot:
     """The robot that is told where it is.
 
-    publisher : None if it is not told anything.
-    map_session : the session whose map was published. sessions : of the database, by name. frames : of the
-    buildings that answers are in, by session.
+    sessions : of the database, by name. frames : of the buildings that answers are in, by session.
+    publisher : None if it is not told anything. map_session : the session whose map was published.
     """
 
-    drive: Followed
-    database: SubmapDatabase
-    sessions: dict[str, SessionInfo]
-    publish: options.Publish
-    publish_map: bool
+    following: Following
+    sessions: Mapping[str, SessionInfo]
     frames: Mapping[str, BuildingFrame]
     publisher: Nav2Publisher | None = None
     resets: ResetPolicy = field(default_factory=ResetPolicy)
     map_session: str | None = None
 
-    def about_map(self, session: str) -> WatchedMap:
-        """The map of a session, as a document says it."""
-        info = self.sessions[session]
-        label = info.provenance.label
-        return {
-            "database": self.database.location,
-            "session": session,
-            "building": label.building,
-            "floor": label.floor,
-            "digest": info.digest,
-        }
-
     def tell(self, estimate: Estimate, lock: threading.Lock) -> list[str]:
-        """Publish what follows from an estimate; returns the topics. lock : is held to read the database."""
-        publisher, live, session = self.publisher, self.drive, estimate.answer.session
+        """Publish what follows from an estimate. Return the topics. lock : is held to read the database."""
+        publisher, live, session = self.publisher, self.following.drive, estimate.answer.session
         if publisher is None or not isinstance(live, LiveLog):
             return []
         if estimate.state == "lost":
@@ -218,23 +255,24 @@ class _Robot:
     def _tell_map(
         self, publisher: Nav2Publisher, estimate: Estimate, session: str, lock: threading.Lock
     ) -> list[str]:
-        if not self.publish_map or session == self.map_session:
+        if not self.following.given.publish_map or session == self.map_session:
             return []
         self.map_session = session
         with lock:
-            grid = map_of(self.database, session, self.frames)
+            grid = map_of(self.following.database, session, self.frames)
         publisher.map(estimate.registered.scan.stamp_ns, grid)
         return ["/map"]
 
     def _tell_pose(
         self, publisher: Nav2Publisher, live: LiveLog, estimate: Estimate, may_reset: bool
     ) -> list[str]:
-        if self.publish == "initialpose" and may_reset:
+        publish = self.following.given.publish
+        if publish == "initialpose" and may_reset:
             assert estimate.answer.covariance is not None
             stamp_ns, T_map_base = _now(estimate, live)
             publisher.initialpose(stamp_ns, T_map_base, estimate.answer.covariance)
             return ["/initialpose"]
-        if self.publish != "tf":
+        if publish != "tf":
             return []
         T_map_odom, odom_frame = estimate.T_map_odom, live.odometry_frame
         if T_map_odom is None or odom_frame is None:
@@ -245,33 +283,24 @@ class _Robot:
 
 
 @contextlib.contextmanager
-def robot_of(
-    drive: Followed,
-    database: SubmapDatabase,
-    publish: options.Publish,
-    publish_map: bool,
-    map_frame: str,
-    frames: Mapping[str, BuildingFrame],
-) -> Iterator[_Robot]:
-    """The robot, ready to be told where it is. Raises LiveError if it takes no messages."""
+def _robot_of(following: Following) -> Iterator[_Robot]:
+    """Yield the robot, ready to be told where it is. Raises LiveError if it takes no messages."""
+    given, drive = following.given, following.drive
     robot = _Robot(
-        drive=drive,
-        database=database,
-        sessions={info.name: info for info in database.sessions()},
-        publish=publish,
-        publish_map=publish_map,
-        frames=frames,
+        following=following,
+        sessions={info.name: info for info in following.database.sessions()},
+        frames=following.database.frames() if given.frame == "building" else {},
     )
-    topics = [*([f"/{publish}"] if publish != "none" else []), *(["/map"] if publish_map else [])]
+    topics = [f"/{given.publish}"] * (given.publish != "none") + ["/map"] * given.publish_map
     with contextlib.ExitStack() as stack:
         if topics and isinstance(drive, LiveLog):
-            robot.publisher = stack.enter_context(Nav2Publisher(cast("Outlet", drive.feed), map_frame))
+            robot.publisher = stack.enter_context(Nav2Publisher(cast(Outlet, drive.feed), given.map_frame))
             robot.publisher.announce(*topics)
         yield robot
 
 
 def _now(estimate: Estimate, live: LiveLog) -> tuple[int, SE2]:
-    """The newest odometry: its stamp, and the pose of the base there: the estimate is older."""
+    """Return the stamp of the newest odometry, and the pose of the base there: the estimate is older."""
     T_map_odom, newest = estimate.T_map_odom, live.newest_odometry()
     if T_map_odom is None or newest is None:
         assert estimate.answer.T_map_base is not None
@@ -280,14 +309,14 @@ def _now(estimate: Estimate, live: LiveLog) -> tuple[int, SE2]:
     return stamp_ns, T_map_odom @ SE2.from_matrix(T_odom_base)
 
 
-def _tell_news(drive: Followed) -> None:
+def _print_news(drive: Followed) -> None:
     for sentence in drive.news.take():
         console.warn(sentence)
 
 
-def summarize(drive: Followed, terminal: console.Console) -> None:
-    """What was left out, at the end."""
-    _tell_news(drive)
+def _summarize(drive: Followed, terminal: console.Console) -> None:
+    """Print what was left out, at the end."""
+    _print_news(drive)
     report, counts = drive.report(), drive.counts
     for warning in report.warnings:
         console.warn(warning)
@@ -301,7 +330,7 @@ def summarize(drive: Followed, terminal: console.Console) -> None:
 
 
 def as_text(estimate: Estimate, published: list[str]) -> str:
-    """An estimate in one line."""
+    """Return an estimate in one line."""
     answer = estimate.answer
     begin = f"after {answer.path_m:.1f} m: {estimate.state.replace('_', ' the ')}"
     away = answer.beside_map
@@ -328,19 +357,136 @@ def as_text(estimate: Estimate, published: list[str]) -> str:
 
 def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: list[str]) -> Any:
     answer, session = estimate.answer, estimate.answer.session
+    watched: WatchedMap | None = None
+    if session is not None:
+        watched = {
+            "database": robot.following.database.location,
+            "session": session,
+            "building": answer.label.building,
+            "floor": answer.label.floor,
+            "digest": robot.sessions[session].digest,
+        }
     document: Watch = {
         "state": estimate.state,
         "status": answer.status,
         "stamp_ns": answer.stamp_ns,
         "path_m": answer.path_m,
-        "map": None if session is None else robot.about_map(session),
+        "map": watched,
         "frame": robot.frames[session].name if session and session in robot.frames else None,
-        "pose": stamped_pose(answer),
+        "pose": answer.stamped_pose,
         "T_map_odom": estimate.T_map_odom,
-        "in_space": in_space_document(answer),
-        "off_map": off_map_document(answer),
+        "in_space": None if answer.in_space is None else answer.in_space.to_json(),
+        "off_map": answer.off_map_pose,
         "confidence": answer.confidence,
         "published": published,
         **live(drive, estimate.elapsed_s),
     }
     return plain(Watch, document)
+
+
+@contextlib.contextmanager
+def followed(source: str, config: ReadConfig, *, real_time: bool = False) -> Iterator[Followed]:
+    """Open a robot by its address, or a recording by its path.
+
+    real_time : a recording is replayed at its own pace. Raises what `open_live` and `open_log` do.
+    """
+    if real_time or is_robot(source):
+        with open_live(source, config) as live:
+            yield live
+    else:
+        with open_log(Path(source), config) as log:
+            yield WholeRecording(log)
+
+
+class WholeRecording:
+    """A finished recording, read as by all other commands: each scan once, as fast as it can be used."""
+
+    realtime = False
+    lag_s = 0.0
+
+    def __init__(self, log: Log) -> None:
+        self.on_poll: Callable[[], bool] = lambda: False
+        self.name = str(log.info.path)
+        self.counts, self.news = FeedCounts(), News()
+        self._log = log
+        self._pose: BelievedPose | None = None
+        self._messages: Iterator[RawMessage] = iter(())
+        self._next: RawMessage | None = None
+
+    def choose(self) -> Choice:
+        """See LiveLog."""
+        return self._log.choose()
+
+    def parts(self) -> Iterator[Iterator[Scan]]:
+        """See LiveLog."""
+        yield self._log.scans()
+        if self._pose is not None and self._pose.problem is not None:
+            self.news.tell(str(self._pose.problem))
+
+    def report(self) -> ReadReport:
+        """See LiveLog."""
+        return self._log.report()
+
+    def listen_to_pose(self, topic: str) -> None:
+        """See LiveLog."""
+        self._pose = BelievedPose(topic)
+        self._pose.find(self._log.info.topics, self.choose().base_frame)
+        self._messages = self._log.messages(self._pose.topics)
+        self._next = next(self._messages, None)
+
+    @property
+    def believed(self) -> MapPose | None:
+        """The newest pose that was recorded before the last scan."""
+        if self._pose is None:
+            return None
+        while self._next is not None and self._next.log_time_ns <= self._log.last_scan_ns:
+            self._pose.take(self._next)
+            self._next = next(self._messages, None)
+        return self._pose.newest
+
+
+Followed = LiveLog | WholeRecording
+"""Scans, part after part, and what is known of how they come."""
+
+
+def feed(
+    drive: Followed,
+    follower: Follower[Any],
+    config: Config,
+    poll: Callable[[], bool],
+    *,
+    see: Callable[[RegisteredScan | None], None] = lambda registered: None,
+    observer: Observer = Observer(),
+) -> None:
+    """Feed a follower with all scans of a robot or a recording.
+
+    poll : called after each scan, and while none comes; true if that was enough.
+    see : called with each registered scan; None: what follows does not go on from what was before.
+    """
+    drive.on_poll = poll
+    for scans in drive.parts():
+        try:
+            for registered, planar_scan in follow(scans, config, observer):
+                see(registered)
+                follower.add(registered, planar_scan)
+                if poll():
+                    return
+        except TrackingLost as error:
+            console.warn(error.in_short)
+        if poll():
+            return
+        follower.restart()
+        see(None)
+    follower.finish()
+    poll()
+
+
+def live(drive: Followed, elapsed_s: float) -> Live:
+    """Return how it is followed so far. elapsed_s : time that the estimate took."""
+    return {
+        "scans": drive.report().scans_read,
+        "dropped": drive.counts.dropped,
+        "reconnected": drive.counts.reconnected,
+        "lag_s": drive.lag_s,
+        "elapsed_s": elapsed_s,
+    }

@@ -1,18 +1,16 @@
 """A database, and an answer found in it, as one page that needs no network: `report.html` filled with data.
 
 Everything shown is in the page as one JSON document; the template draws it. Metres and radians, in the map
-frame of each session.
+frame of each session. The page shows
 
-Where the signatures of a submap come from, as plain data for the page: points, a graph and two axes.
+- the sessions of the database: map, path, junction graph, submaps and their signatures;
+- where the signatures of a submap come from: points, a graph and two axes, in cells of the submap's grid, x
+  before y;
+- the answer: the walls of the query at each hypothesis, coloured by what the map shows there;
+- why the best place, and why not the next one: for each view of the query the histograms that can be drawn on
+  those of the map, and the log-likelihood ratio that `signature.retrieval.index` adds up.
 
-Positions are cells of the submap's grid, x before y; the page turns them into metres of the map frame.
-
-Why the best place, and why not the next one: their signatures on top of the query's, for the page.
-
-Why a place: the three signatures of what the query shows there, beside those of the map.
-
-For each view of a query, and where a hypothesis puts it in a map, the histograms that can be drawn on top of
-each other, and the log-likelihood ratio that `signature.retrieval.index` adds up. Nothing here decides.
+Nothing here decides.
 """
 
 from __future__ import annotations
@@ -22,8 +20,9 @@ import itertools
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime, timezone
+from functools import partial
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -32,15 +31,30 @@ import cv2
 import numpy as np
 
 from pc2grid._version import __version__
-from pc2grid.geometry import F32, F64, SE2, BoolGrid
-from pc2grid.io.atomic import replace_file
+from pc2grid.errors import OutputError
+from pc2grid.geometry import F32, F64, I64, SE2, BoolGrid
+from pc2grid.io.atomic import replace_file, require_writable
 from pc2grid.matching.score import Support
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import Consistency, Loop, OccupancyGrid, Precision, ReadReport, Submap, Trajectory
+from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import look_around
 from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_edges, boundary_points, boundary_seen
+from signature.config import SignatureConfig
+from signature.database import SessionInfo, SubmapDatabase, open_database
 from signature.freespace import PATH_BINS, freespace_nodes, freespace_seen, visibility_graph
-from signature.localization.shown.picture import FURNITURE, PALETTE, UNKNOWN, agreements, drawn_as
-from signature.paper import score_matrix
+from signature.localization.answer import Answer
+from signature.localization.answer_json import QueryRecording
+from signature.localization.shown.picture import (
+    FURNITURE,
+    PALETTE,
+    UNKNOWN,
+    agreements,
+    answer_figure,
+    drawn_as,
+    figure_png,
+    write_figure,
+)
+from signature.paper import SignatureTable, score_matrix
 from signature.retrieval.index import POSES
 from signature.symmetry import line_segments, mirror_agreement, symmetry_axes
 from signature.visible import PROFILE_BEARINGS, seen_signatures
@@ -48,15 +62,7 @@ from signature.weights import seen_spread, seen_weights
 
 if TYPE_CHECKING:
     import networkx as nx
-
-    from pc2grid.geometry import F64, I64
-    from pc2grid.model import Consistency, Loop, OccupancyGrid, Precision, ReadReport, Submap, Trajectory
-    from pc2grid.settings import PartitionConfig
-    from signature.config import SignatureConfig
-    from signature.database import SessionInfo, SubmapDatabase
-    from signature.localization.answer import Answer
-    from signature.localization.answer_json import QueryRecording
-    from signature.paper import SignatureTable
+    from matplotlib.figure import Figure
 
 
 _LARGEST_PIXELS = 3000
@@ -70,67 +76,97 @@ _BAND_FROM_M = 0.1
 """Positions with a smaller standard deviation have no band: two cells of the default resolution."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Found:
-    """An answer and the query it is about.
+NO_POSES = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
+"""Of a query that is a map."""
 
-    poses : the query in its own frame, see `followed`; empty for a map. drawn : the query if it is a map.
-    about : the description of the query in the JSON document.
-    report : what was read of a recording, and what was lost; None for a map.
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Found(Answer):
+    """The answer of `pc2grid.relocalize`, with the query and the database it is about: it can be drawn.
+
+    about : the description of the query in the JSON document. database : where was looked. accept : the
+    confidence that `located` needed. poses : the query in its own frame, see `followed`; empty for a map.
+    drawn : the query if it is a map. read : what was read of a recording, and what was lost; None for a map.
     """
 
-    answer: Answer
-    poses: Trajectory
     about: QueryRecording
+    database: str
+    accept: float
+    poses: Trajectory = NO_POSES
     drawn: OccupancyGrid | None = None
-    report: ReadReport | None = None
+    read: ReadReport | None = None
+
+    @staticmethod
+    def of(answer: Answer, **asked: Any) -> Found:
+        """Return the answer to a query. asked : the further fields."""
+        return Found(**{field.name: getattr(answer, field.name) for field in fields(answer)}, **asked)
+
+    def plot(self) -> Figure:
+        """Return the map with the best hypothesis, and what supports and contradicts it, as a figure of
+        matplotlib.
+
+        A notebook shows it; `figure.savefig` and `save` write it.
+        """
+        figure = answer_figure(self, self.map or self.local_map, self.poses)
+        figure._repr_png_ = partial(figure_png, figure)  # type: ignore[attr-defined]
+        return figure
+
+    def report(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the page of `pc2grid relocalize --report`, which needs no network.
+
+        The database is read again: it must be there still, and be no map.
+
+        Raises OutputError if the page cannot be written, and the errors of `pc2grid.open_database`.
+        """
+        require_writable(path, overwrite)
+        with open_database(self.database) as database:
+            write_report(Path(path), database, found=self)
+
+    def save(self, path: str | Path, *, overwrite: bool = False) -> None:
+        """Write the answer: as the document of `to_json` to a .json, as the picture of `plot` to a .png.
+
+        Raises OutputError for another suffix, and for a file that exists without `overwrite`.
+        """
+        path = Path(path)
+        if path.suffix not in (".json", ".png"):
+            raise OutputError(f"{path}: an answer is saved as .json or .png", hint="end its name so")
+        require_writable(path, overwrite)
+        if path.suffix == ".png":
+            write_figure(self.plot(), path)
+            return
+        with replace_file(path) as temporary:
+            temporary.write_text(json.dumps(self.to_json(), indent=1), encoding="utf-8")
 
 
 def write_report(
-    path: Path,
-    database: SubmapDatabase,
-    *,
-    found: Found | None = None,
-    accept: float = 0.9,
-    truth_m: F64 | None = None,
+    path: Path, database: SubmapDatabase, *, found: Found | None = None, truth_m: F64 | None = None
 ) -> None:
     """Write the page. Raises OutputError if it cannot be written.
 
-    found : an answer to show over the map. accept : the confidence it needed to be `located`.
-    truth_m : (N, 2) the query's true path in the map frame, if known.
+    found : an answer to show over the map. truth_m : (N, 2) the query's true path in the map frame, if known.
     """
-    html = page(database, found=found, accept=accept, truth_m=truth_m)
+    html = page(database, found=found, truth_m=truth_m)
     with replace_file(path) as temporary:
         temporary.write_text(html, encoding="utf-8")
 
 
-def page(
-    database: SubmapDatabase,
-    *,
-    found: Found | None = None,
-    accept: float = 0.9,
-    truth_m: F64 | None = None,
-) -> str:
-    """The page as text; parameters as for `write_report`."""
+def page(database: SubmapDatabase, *, found: Found | None = None, truth_m: F64 | None = None) -> str:
+    """Return the page as text; parameters as for `write_report`."""
     template = files("signature.localization.shown").joinpath("report.html").read_text(encoding="utf-8")
-    document = contents(database, found=found, accept=accept, truth_m=truth_m)
+    document = contents(database, found=found, truth_m=truth_m)
     # "<" is the only character that could end the script element.
     data = json.dumps(document, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     return template.replace("/*DATA*/null", data, 1)
 
 
 def contents(
-    database: SubmapDatabase,
-    *,
-    found: Found | None = None,
-    accept: float = 0.9,
-    truth_m: F64 | None = None,
+    database: SubmapDatabase, *, found: Found | None = None, truth_m: F64 | None = None
 ) -> dict[str, Any]:
-    """The data of the page as plain types."""
+    """Return the data of the page as plain types."""
     config, table, infos = database.config(), database.signatures(), database.sessions()
     explained = {info.name for info in infos}
     if found is not None:  # only the maps that the answer is about
-        explained = {found.answer.sessions[h.session_index] for h in found.answer.hypotheses}
+        explained = {found.sessions[h.session_index] for h in found.hypotheses}
     if sum(info.submaps for info in infos if info.name in explained) > _MOST_EXPLAINED:
         explained = set()
     return {
@@ -152,7 +188,7 @@ def contents(
             }
             for index, info in enumerate(infos)
         ],
-        "answer": None if found is None else _answer(found, database, accept, truth_m),
+        "answer": None if found is None else _answer(found, database, truth_m),
     }
 
 
@@ -178,7 +214,7 @@ def _facts(info: SessionInfo, poses: Trajectory) -> dict[str, Any]:
 
 
 def _date(poses: Trajectory) -> str | None:
-    """The day of the first scan, UTC; None if its stamp is not a time of day but counts from a start."""
+    """Return the day of the first scan, UTC; None if its stamp is no time of day but counts from a start."""
     begin_s = poses.stamps_ns[0] / 1e9 if len(poses) else 0.0
     return None if begin_s < _CLOCK_FROM_S else f"{datetime.fromtimestamp(begin_s, timezone.utc):%Y-%m-%d}"
 
@@ -186,7 +222,7 @@ def _date(poses: Trajectory) -> str | None:
 def _submaps(
     database: SubmapDatabase, table: SignatureTable, session_index: int, session: str, *, explain: bool
 ) -> list[dict[str, Any]]:
-    """The submaps of a session with their signatures and the places that are most similar.
+    """Return the submaps of a session with their signatures and the places that are most similar.
 
     explain : also where the signatures come from, see `submap_sources`.
     """
@@ -212,7 +248,7 @@ def _submaps(
 
 
 def _graph(graph: nx.Graph) -> dict[str, Any]:
-    """Nodes of the junction graph (x, y, whether a junction), and the pairs of them that are joined."""
+    """Return the nodes of the junction graph (x, y, whether a junction), and the pairs that are joined."""
     return {
         "nodes": [
             [*_short(node["center_m"], 2), int(node["kind"] == "junction")] for _, node in graph.nodes.items()
@@ -222,7 +258,7 @@ def _graph(graph: nx.Graph) -> dict[str, Any]:
 
 
 def runs(poses: Trajectory) -> list[dict[str, Any]]:
-    """Pieces of a path of equal health, as x, y, x, y, ...; each starts where the last one ends."""
+    """Return pieces of a path of equal health, as x, y, x, y, ...; each starts where the last one ends."""
     xy = poses.planar()[:, :2]
     health = [h.value for h in poses.health] or ["fine"] * len(xy)
     pieces: list[dict[str, Any]] = []
@@ -239,13 +275,13 @@ def runs(poses: Trajectory) -> list[dict[str, Any]]:
 
 
 def _loops(poses: Trajectory, loops: tuple[Loop, ...]) -> list[list[float]]:
-    """The two poses of each loop: x, y, x, y, whether it was accepted."""
+    """Return the two poses of each loop: x, y, x, y, whether it was accepted."""
     xy = poses.planar()[:, :2]
     return [[*_short(xy[loop.older], 2), *_short(xy[loop.newer], 2), int(loop.accepted)] for loop in loops]
 
 
 def _contradicted(poses: Trajectory, consistency: Consistency | None) -> list[list[float]]:
-    """The parts of a path along which the scans do not agree with the map, as x, y, x, y, ..."""
+    """Return the parts of a path along which the scans do not agree with the map, as x, y, x, y, ..."""
     xy, parts = poses.planar()[:, :2], []
     for stretch in () if consistency is None else consistency.stretches:
         first, last = np.searchsorted(poses.stamps_ns, (stretch.from_ns, stretch.to_ns))
@@ -258,7 +294,7 @@ def _contradicted(poses: Trajectory, consistency: Consistency | None) -> list[li
 
 
 def _bands(poses: Trajectory, precision: Precision | None) -> list[list[float]]:
-    """Pieces of a path with the standard deviation of the positions there: metres, then x, y, x, y, ...
+    """Return pieces of a path with the standard deviation of the positions there: metres, x, y, x, y, ...
 
     Pieces that are known better than a path is drawn wide are left out.
     """
@@ -274,8 +310,7 @@ def _bands(poses: Trajectory, precision: Precision | None) -> list[list[float]]:
     return bands
 
 
-def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 | None) -> dict[str, Any]:
-    answer = found.answer
+def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dict[str, Any]:
     document = answer.to_json()
     pose = document["pose"]
     compared = agreements(answer, database)
@@ -287,9 +322,9 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
         "pose": pose and {key: pose[key] for key in ("x", "y", "yaw")},
         "deviation": None if pose is None else _short(_deviation(answer, database), 4),
         "confidence": round(answer.confidence, 4),
-        "accept": accept,
+        "accept": answer.accept,
         "space": document["in_space"],
-        "query": {**found.about, "is_map": found.about["sensor"] == "map"},
+        "query": {**answer.about, "is_map": answer.about["sensor"] == "map"},
         "walls": _short(np.ravel(walls_m), 2),
         "hypotheses": [
             {
@@ -305,7 +340,7 @@ def _answer(found: Found, database: SubmapDatabase, accept: float, truth_m: F64 
             {"path_m": m.path_m, "status": m.status, "confidence": m.confidence} for m in answer.history
         ],
         "why": why_here(answer, database),
-        "path": runs(found.poses),
+        "path": runs(answer.poses),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
     }
 
@@ -317,7 +352,7 @@ def _deviation(answer: Answer, database: SubmapDatabase) -> tuple[float, float, 
 
 
 def deviation(covariance: F64, resolution_m: float, radius_m: float) -> tuple[float, float, float]:
-    """Standard deviations of x, y (metres) and yaw (radians), but not less than the map can show.
+    """Return standard deviations of x, y (metres) and yaw (radians), but not less than the map can show.
 
     covariance : (3, 3), of the refinement alone: with thousands of wall points it gets far smaller than the
         error of the map. resolution_m : of the map; a position is given no finer than half a cell.
@@ -333,8 +368,8 @@ def deviation(covariance: F64, resolution_m: float, radius_m: float) -> tuple[fl
 
 
 def _picture(grid: OccupancyGrid) -> dict[str, Any]:
-    """The known part of a grid as a PNG, unknown cells transparent. Large grids are reduced so that walls
-    stay."""
+    """Return the known part of a grid as a PNG, unknown cells transparent. Large grids are reduced so that
+    walls stay."""
     kinds = drawn_as(grid)
     known = np.argwhere(grid.cells >= 0)
     (r0, c0), (r1, c1) = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), (1, 1))
@@ -358,7 +393,7 @@ def _picture(grid: OccupancyGrid) -> dict[str, Any]:
 
 
 def _short(values: Any, digits: int) -> list[float]:
-    """Plain numbers, rounded to digits that can be seen."""
+    """Return plain numbers, rounded to digits that can be seen."""
     return [round(float(v), digits) for v in np.asarray(values, np.float64)]
 
 
@@ -367,7 +402,7 @@ _SIMILAR = 5
 
 
 def sources(submap: Submap, config: SignatureConfig) -> dict[str, Any]:
-    """What the three histograms and scores of a submap are computed from (paper III-B to III-D).
+    """Return what the three histograms and scores of a submap are computed from (paper III-B to III-D).
 
     corner, cell_m : the lower left corner of the submap's grid in the map frame, and the size of its cells.
     boundary : the boundary points. nodes, edges : the free-space graph, see `joined_pairs`.
@@ -388,7 +423,9 @@ def sources(submap: Submap, config: SignatureConfig) -> dict[str, Any]:
 
 
 def joined_pairs(graph: nx.Graph) -> str:
-    """The edges of a graph with nodes 0 .. N - 1 as bits, base64: whether i < j are joined, (0, 1) first.
+    """Return the edges of a graph with nodes 0 .. N - 1 as bits, base64: whether i < j are joined.
+
+    (0, 1) is the first.
 
     A graph of lines of sight has so many edges that a list of them would be the largest part of the page.
     """
@@ -401,9 +438,10 @@ def joined_pairs(graph: nx.Graph) -> str:
 def similar_places(
     table: SignatureTable, rows: Sequence[int], partition: PartitionConfig, config: SignatureConfig
 ) -> list[list[tuple[int, float]]]:
-    """For each of these rows of a table the most similar places elsewhere: (row, score of Eq. 6), best first.
+    """Return for each of these rows of a table the most similar places elsewhere: (row, score of Eq. 6).
 
-    Submaps of the same session whose centre is nearer than the radius show the same walls and are left out.
+    The best come first. Submaps of the same session whose centre is nearer than the radius show the same
+    walls and are left out.
     """
     found = []
     for row in rows:
@@ -419,13 +457,13 @@ def similar_places(
 
 
 def _columns_first(cells: I64) -> list[int]:
-    """Cells (N, 2) as (row, column) in one list: x, y, x, y, ..."""
+    """Return cells (N, 2) as (row, column) in one list: x, y, x, y, ..."""
     return [int(v) for v in cells[:, ::-1].ravel()]
 
 
 def why_here(answer: Answer, database: SubmapDatabase) -> dict[str, Any] | None:
-    """The signatures of the query's views at the best place and at its best rival, elsewhere or in another
-    map; None without a hypothesis or a view.
+    """Return the signatures of the query's views at the best place and at its best rival, elsewhere or in
+    another map; None without a hypothesis or a view.
 
     views : where they lie in the query's frame. told_apart : the number of the view whose likelihoods differ
     most between the two, of those that stand on free floor at both. places : of each, the number of its
@@ -465,7 +503,7 @@ def _document(view: ComparedView) -> dict[str, Any]:
 
 
 def _short_number(values: np.ndarray) -> list[float]:
-    """Shares, to three digits behind the point."""
+    """Return shares, to three digits behind the point."""
     return [round(v, 3) for v in values.tolist()]
 
 
@@ -507,7 +545,7 @@ def compare_views(
     T_map_query: SE2,
     sight_m: float,
 ) -> tuple[ComparedView, ...]:
-    """The signatures of each view of a query beside those of the map at the same point, in the map's frame.
+    """Return the signatures of each view of a query beside those of the map at the same point, in its frame.
 
     query : what was seen, in the query's frame. grid : the map. sight_m : as the places of the map were
     described.
@@ -532,7 +570,7 @@ def compare_views(
 
 
 def _free_at(grid: OccupancyGrid, points_m: F64) -> list[bool]:
-    """Whether the cells at points (N, 2) are free."""
+    """Return whether the cells at points (N, 2) are free."""
     cells = grid.to_cell(points_m)
     inside: BoolGrid = np.asarray(((cells >= 0) & (cells < grid.cells.shape)).all(axis=1))
     inside[inside] = grid.free[tuple(cells[inside].T)]
@@ -542,8 +580,8 @@ def _free_at(grid: OccupancyGrid, points_m: F64) -> list[bool]:
 def _described(
     grid: OccupancyGrid, points_m: F64, sight_m: float, turned: int
 ) -> tuple[list[DrawnSignatures], F32]:
-    """What is seen from points (N, 2), and the signatures (N, K); the axes of symmetry are counted on by
-    `turned`."""
+    """Return what is seen from points (N, 2), and the signatures (N, K); the axes of symmetry are counted on
+    by `turned`."""
     ranges_m, ends = look_around(grid, points_m, sight_m, bearings=PROFILE_BEARINGS)
     boundary = boundary_seen(ranges_m, ends, sight_m)[:, RANGE_BINS + 1 :][:, : PAIR_BINS + 2] ** 2
     freespace = freespace_seen(ranges_m, ends, sight_m)[:, :PATH_BINS] ** 2

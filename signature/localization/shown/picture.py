@@ -14,20 +14,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid.display import counted, probability
+from pc2grid.geometry import F64, SE2, U8
 from pc2grid.io.atomic import replace_file
 from pc2grid.matching.score import Agreement, Support, agreement
 from pc2grid.matching.walls import Walls
+from pc2grid.model import OccupancyGrid, Trajectory
+from signature.database import SubmapDatabase
+from signature.database.protocol import BuildingFrame
+from signature.localization.answer import Answer
+from signature.localization.hypotheses import Hypothesis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    from pc2grid.geometry import F64, SE2, U8
-    from pc2grid.model import OccupancyGrid, Trajectory
-    from signature.database import SubmapDatabase
-    from signature.database.protocol import BuildingFrame
-    from signature.localization.answer import Answer
-    from signature.localization.hypotheses import Hypothesis
-    from signature.localization.shown.page import Found
 
 BLUE, ORANGE, GREEN, VERMILLION, PURPLE = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7"
 GREY = "#777777"
@@ -65,7 +63,7 @@ class _Box:
 
     @staticmethod
     def around(points_m: F64, margin_m: float = 0.0) -> _Box:
-        """The box of points (N, 2)."""
+        """Return the box of points (N, 2)."""
         (left, bottom), (right, top) = points_m.min(axis=0) - margin_m, points_m.max(axis=0) + margin_m
         return _Box(float(left), float(right), float(bottom), float(top))
 
@@ -80,14 +78,14 @@ class _Box:
         return self.top - self.bottom
 
     def with_ratio(self, height_by_width: float) -> _Box:
-        """The smallest box around this one with a given ratio of its sides."""
+        """Return the smallest box around this one with a given ratio of its sides."""
         x, y = 0.5 * (self.left + self.right), 0.5 * (self.bottom + self.top)
         half_x = 0.5 * max(self.width_m, self.height_m / height_by_width)
         half_y = half_x * height_by_width
         return _Box(x - half_x, x + half_x, y - half_y, y + half_y)
 
     def united(self, other: _Box) -> _Box:
-        """The smallest box around both."""
+        """Return the smallest box around both."""
         left, right = min(self.left, other.left), max(self.right, other.right)
         return _Box(left, right, min(self.bottom, other.bottom), max(self.top, other.top))
 
@@ -96,7 +94,7 @@ class _Box:
 
 
 def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...]:
-    """For each hypothesis of an answer, best first, what supports and what contradicts it."""
+    """Return for each hypothesis of an answer, best first, what supports and what contradicts it."""
     query = Walls.of(answer.local_map)
     indices = {hypothesis.session_index for hypothesis in answer.hypotheses}
     names = {index: answer.sessions[index] for index in indices}
@@ -119,7 +117,7 @@ def drawn_as(grid: OccupancyGrid) -> U8:
 
 
 def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
-    """The map of a session with its submaps and the path of the robot."""
+    """Draw the map of a session with its submaps and the path of the robot."""
     grid = database.grid(session)
     figure, (axes,) = _panels(_known(grid))
     _draw_map(axes, grid)
@@ -132,7 +130,7 @@ def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
 
 
 def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid, BuildingFrame]]) -> None:
-    """The walls of the sessions of a building over each other: as they were stored, and as they are joined.
+    """Draw the walls of the sessions of a building over each other: as they were stored, and as joined.
 
     name : of the building's frame.
     """
@@ -151,7 +149,7 @@ def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid,
 
 
 def _around_walls(walls: Iterable[F64]) -> _Box:
-    """The box of all walls; of none a square metre."""
+    """Return the box of all walls; of none a square metre."""
     boxes = [_Box.around(points_m, _CLOSE_MARGIN_M) for points_m in walls if len(points_m)]
     return reduce(_Box.united, boxes or [_Box(0.0, 1.0, 0.0, 1.0)])
 
@@ -181,7 +179,7 @@ def answer_figure(
     way: Trajectory | None = None,
     truth_m: F64 | None = None,
 ) -> Figure:
-    """The map with the best hypothesis: the query's walls, coloured by what the map says about them.
+    """Return the map with the best hypothesis: the query's walls, coloured by what the map shows there.
 
     In a large map a second panel shows the place from near. Without any hypothesis there is only the map.
 
@@ -217,14 +215,17 @@ def answer_figure(
     return made
 
 
-def draw_answers(path: Path, database: SubmapDatabase, found: Sequence[Found]) -> None:
-    """The maps in which queries were located, each with their paths, and arrows where these end.
+def draw_answers(
+    path: Path, database: SubmapDatabase, found: Sequence[tuple[Answer, Trajectory, str]]
+) -> None:
+    """Draw the maps in which queries were located, each with their paths, and arrows where these end.
 
-    Each recording has a colour. If none was located there is only the first map.
+    found : answers, with the poses of the query in its own frame, and the name of its recording. Each
+    recording has a colour. If none was located there is only the first map.
     """
-    located = Counter(one.answer.session for one in found if one.answer.session is not None)
+    located = Counter(answer.session for answer, *_ in found if answer.session is not None)
     sessions = [session for session, _ in located.most_common()] or [database.sessions()[0].name]
-    sources = dict.fromkeys(one.about["source"] for one in found)
+    sources = dict.fromkeys(source for *_, source in found)
     colours = dict(zip(sources, itertools.cycle((PURPLE, BLUE, VERMILLION, GREEN, ORANGE)), strict=False))
     grids = [database.grid(session) for session in sessions]
     figure, panels = _panels(*(_known(grid) for grid in grids))
@@ -233,7 +234,7 @@ def draw_answers(path: Path, database: SubmapDatabase, found: Sequence[Found]) -
         _draw_way(axes, database.trajectory(session))
         title = f"located in {session}: {located[session]} of {len(found)} queries"
         axes.set_title(title, loc="left", fontsize=10)
-        for answer, poses, source in ((one.answer, one.poses, one.about["source"]) for one in found):
+        for answer, poses, source in found:
             if answer.session == session and answer.T_map_odom and answer.T_map_base:
                 path_m = answer.T_map_odom.apply(poses.planar()[:, :2])
                 axes.plot(*path_m.T, color=colours[source], lw=1.8, label=f"{source}: path as located")
@@ -242,7 +243,7 @@ def draw_answers(path: Path, database: SubmapDatabase, found: Sequence[Found]) -
 
 
 def _title(answer: Answer, session: str, compared: Agreement | None) -> str:
-    """The answer, and what it rests on."""
+    """Return the answer, and what it rests on, as the title of its picture."""
     said = {"located": f"located in {session}", "ambiguous": "ambiguous", "not_found": "not found"}
     title = f"{said[answer.status]}, confidence {probability(answer.confidence)}"
     if compared is None:
@@ -258,7 +259,7 @@ def _title(answer: Answer, session: str, compared: Agreement | None) -> str:
 
 
 def _known(grid: OccupancyGrid) -> _Box:
-    """The part of the map that is known, with a margin."""
+    """Return the part of the map that is known, with a margin."""
     cells = np.argwhere(grid.cells >= 0)
     if not len(cells):
         cells = np.array([(0, 0), grid.cells.shape])
@@ -268,7 +269,7 @@ def _known(grid: OccupancyGrid) -> _Box:
 
 
 def _panels(whole: _Box, *more: _Box) -> tuple[Any, list[Any]]:
-    """A figure with a panel for a map and one for each other box, such as a close-up, beside or below it."""
+    """Return a figure with a panel for a map and, beside or below it, one for each other box."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -339,7 +340,7 @@ def _draw_way(axes: Any, way: Trajectory | None) -> None:
 
 
 def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_size: float) -> None:
-    """The query's walls at a hypothesis, and the map's walls that it should have seen."""
+    """Draw the query's walls at a hypothesis, and the map's walls that it should have seen."""
     points_m = best.fit.T_map_query.apply(compared.points_m)
     for kind in (Support.FITS, Support.CONTRADICTED, Support.UNKNOWN):
         chosen = points_m[compared.support == kind]
@@ -358,7 +359,7 @@ def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_s
 
 
 def _draw_robot(axes: Any, best: Hypothesis, answer: Answer, poses: Trajectory) -> None:
-    """The path of the query at a hypothesis, and an arrow where it ends; of a map, its frame."""
+    """Draw the path of the query at a hypothesis, and an arrow where it ends; of a map, its frame."""
     if len(poses):
         path = best.fit.T_map_query.apply(poses.planar()[:, :2])
         label = (
@@ -376,7 +377,7 @@ def _draw_robot(axes: Any, best: Hypothesis, answer: Answer, poses: Trajectory) 
 
 
 def _draw_arrow(axes: Any, pose: SE2, colour: str) -> None:
-    """An arrow from where a robot is to where it looks."""
+    """Draw an arrow from where a robot is to where it looks."""
     length = 0.035 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim()))
     axes.annotate(
         "",
@@ -388,7 +389,7 @@ def _draw_arrow(axes: Any, pose: SE2, colour: str) -> None:
 
 
 def _draw_rivals(axes: Any, answer: Answer, session: str) -> None:
-    """The next hypotheses in this session, where they lie within the panel."""
+    """Draw the next hypotheses in this session, where they lie within the panel."""
     box = _Box(*axes.get_xlim(), *axes.get_ylim())
     places = [
         h.fit.T_map_query @ answer.T_odom_base
@@ -400,8 +401,10 @@ def _draw_rivals(axes: Any, answer: Answer, session: str) -> None:
         label = "other hypotheses"
         axes.plot(*zip(*shown, strict=True), "s", color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)
     if answer.line is not None:
-        ends = zip(answer.line.begin_m, answer.line.end_m, strict=True)
-        axes.plot(*ends, "--", color=PURPLE, lw=1.2, label="line of likely places")
+        begin, end = answer.line.begin, answer.line.end
+        axes.plot(
+            (begin.x, end.x), (begin.y, end.y), "--", color=PURPLE, lw=1.2, label="line of likely places"
+        )
 
 
 def _outline(whole: Any, close: Any) -> None:
@@ -414,7 +417,7 @@ def _outline(whole: Any, close: Any) -> None:
 
 
 def _with_legend(figure: Any, axes: Any) -> Any:
-    """The figure with the legend of what it shows."""
+    """Return the figure with the legend of what it shows."""
     entries: dict[str, Any] = {}
     for panel in figure.axes:
         for handle, label in zip(*panel.get_legend_handles_labels(), strict=True):
@@ -444,7 +447,7 @@ def write_figure(figure: Figure, path: Path) -> None:
 
 
 def figure_png(figure: Figure) -> bytes:
-    """A figure as PNG, without empty bands."""
+    """Return a figure as PNG, without empty bands."""
     png = io.BytesIO()
     figure.savefig(png, format="png", bbox_inches="tight", pad_inches=0.12, metadata={"Software": "pc2grid"})
     return png.getvalue()

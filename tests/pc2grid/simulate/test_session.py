@@ -215,28 +215,25 @@ def test_existing_files_are_not_overwritten(tmp_path: Path) -> None:
 
 
 def test_command_line(tmp_path: Path) -> None:
-    import typer
     from typer.testing import CliRunner
 
     from pc2grid.io.maps import save_map
-    from pc2grid_cli.commands import simulate_command
+    from pc2grid_cli.main import app
 
     yaml, _ = save_map(small_house(), tmp_path / "house")
-    app = typer.Typer()
-    app.command()(simulate_command)
     out = tmp_path / "out.mcap"
     options = ["--sensor", "laser", "--length", "2", "--clutter", "2", "--start", "1.5", "0.5", "--seed", "4"]
-    ran = CliRunner().invoke(app, [str(yaml), str(out), *options, "--no-odometry"])
+    ran = CliRunner().invoke(app, ["simulate", str(yaml), str(out), *options, "--no-odometry"])
     assert ran.exit_code == 0, ran.output
     assert "laser scans, 2.0 m" in ran.output
     x, y, _ = read_tum(tmp_path / "out.tum").planar()[0]
     assert np.hypot(x - 1.5, y - 0.5) < 0.1
     assert {name for name, _, _ in messages(out)} == {"/scan", "/tf_static"}
-    ran = CliRunner().invoke(app, [str(yaml), str(out), *options])
+    ran = CliRunner().invoke(app, ["simulate", str(yaml), str(out), *options])
     assert isinstance(ran.exception, OutputError)
-    assert CliRunner().invoke(app, ["out.txt", *options]).exit_code == 2
-    assert CliRunner().invoke(app, ["a.yaml", "b.yaml", "c.mcap", *options]).exit_code == 2
-    assert CliRunner().invoke(app, [str(out)]).exit_code == 2
+    assert CliRunner().invoke(app, ["simulate", "out.txt", *options]).exit_code == 2
+    assert CliRunner().invoke(app, ["simulate", "a.yaml", "b.yaml", "c.mcap", *options]).exit_code == 2
+    assert CliRunner().invoke(app, ["simulate", str(out)]).exit_code == 2
 
 
 @pytest.mark.skipif(not (DATA / "maps").is_dir(), reason="no real maps: set PC2GRID_DATA")

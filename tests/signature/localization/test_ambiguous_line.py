@@ -22,7 +22,7 @@ def test_places_along_a_corridor_are_one_line() -> None:
     line = ambiguous_line(bases, (0.3, 0.2, 0.1, 0.1))
     assert line is not None
     assert line.length_m == pytest.approx(11.0, abs=0.1)
-    assert {line.begin_m[0] < line.end_m[0], line.begin_m[1] < line.end_m[1]} in ({True}, {False})
+    assert {line.begin.x < line.end.x, line.begin.y < line.end.y} in ({True}, {False})
     assert line.yaw_rad == pytest.approx(ALONG)
     assert line.probability == pytest.approx(0.7)
 

@@ -24,7 +24,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.observer import TimeSpan
 from pc2grid.pipeline import follow
-from pc2grid_cli.options import make_config
+from pc2grid_cli.options import Reading
 from pc2grid_lab.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
 from pc2grid_lab.recordings.run import Folder, Followed
 from pc2grid_lab.recordings.table import (
@@ -181,7 +181,7 @@ def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -
 def config_of(recording: Recording) -> Config:
     """The settings that the commands read a recording with."""
     given = dict(zip(recording.options[::2], recording.options[1::2], strict=True))
-    return make_config(None, None, topic=given.get("--topic"), odometry=given.get("--odometry"))
+    return Reading(topic=given.get("--topic"), odometry=given.get("--odometry")).settings()
 
 
 def hits_at(folder: Folder, recording: Recording, stamp_ns: int) -> F64:

@@ -87,9 +87,9 @@ def test_walls_have_the_colour_of_what_the_map_says_about_them(
     database: SubmapDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = located(changed_part(), database, tmp_path)
-    assert found.answer.status == "located"
+    assert found.status == "located"
     labels = labels_of(monkeypatch)
-    draw_answer(tmp_path / "a.png", database, found.answer, found.poses)
+    draw_answer(tmp_path / "a.png", database, found, found.poses)
     drawn = {colour: pixels_of(tmp_path / "a.png", colour) for colour in (GREEN, VERMILLION, BLUE, ORANGE)}
     assert min(drawn.values()) > 20
     assert drawn[GREEN] > 5 * drawn[VERMILLION]
@@ -130,7 +130,7 @@ def test_a_map_as_the_query_has_no_last_scan_and_no_path(
 ) -> None:
     found = located(cut(office(), 4.0, 3.0, 15.0, 12.0), database, tmp_path)
     labels = labels_of(monkeypatch)
-    draw_answer(tmp_path / "a.png", database, found.answer, found.poses)
+    draw_answer(tmp_path / "a.png", database, found, found.poses)
     assert "frame of the query" in labels
     assert not [label for label in labels if "last scan" in label or "query: path" in label]
     # A part of the very map is contradicted nowhere, so the legend does not name this.
@@ -144,7 +144,7 @@ def test_without_a_hypothesis_there_is_only_the_map(
     database: SubmapDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = located(plan(8, 5, []), database, tmp_path)
-    none = replace(found.answer, status="not_found", hypotheses=(), places=(), submap_ids=())
+    none = replace(found, status="not_found", hypotheses=(), places=(), submap_ids=())
     labels = labels_of(monkeypatch)
     draw_answer(tmp_path / "a.png", database, none, found.poses)
     assert labels == ["path of the map's robot"]
@@ -155,7 +155,7 @@ def test_a_small_query_is_also_shown_from_near(database: SubmapDatabase, tmp_pat
     part, whole = cut(office(), 4.0, 3.0, 9.0, 8.5), cut(office(), 0.5, 0.5, 19.0, 13.0)
     for name, grid in (("near", part), ("far", whole)):
         found = located(grid, database, tmp_path)
-        draw_answer(tmp_path / f"{name}.png", database, found.answer, found.poses)
+        draw_answer(tmp_path / f"{name}.png", database, found, found.poses)
     near, far = (cv2.imread(str(tmp_path / f"{name}.png")).shape for name in ("near", "far"))
     assert near[0] * near[1] > 1.3 * far[0] * far[1]
 
@@ -190,7 +190,7 @@ def test_no_band_of_a_picture_is_empty(name: str, database: SubmapDatabase, tmp_
         draw_session(tmp_path / "a.png", database, "office")
     else:
         found = located(changed_part(), database, tmp_path)
-        draw_answer(tmp_path / "a.png", database, found.answer, found.poses)
+        draw_answer(tmp_path / "a.png", database, found, found.poses)
     drawn = cv2.imread(str(tmp_path / "a.png")).min(axis=-1) < 250
     for axis in (0, 1):
         used = np.flatnonzero(drawn.any(axis=1 - axis))

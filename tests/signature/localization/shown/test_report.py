@@ -168,7 +168,7 @@ def test_how_exactly_places_are_known_is_drawn_along_the_path(tmp_path: Path) ->
 
 
 def test_an_answer_comes_with_how_exactly_the_map_is_known_there(tmp_path: Path, found: Found) -> None:
-    stamps, pose = way().stamps_ns, found.answer.T_map_base
+    stamps, pose = way().stamps_ns, found.T_map_base
     assert pose is not None
     nearest = int(np.argmin(np.hypot(*(way().planar()[:, :2] - (pose.x, pose.y)).T)))
     known = Precision(stamps_ns=(int(stamps[0]), int(stamps[nearest]) + 1), sigma_m=(0.1, 0.75))
@@ -178,19 +178,19 @@ def test_an_answer_comes_with_how_exactly_the_map_is_known_there(tmp_path: Path,
         origin = provenance(Path("office.mcap"), "a" * 64, Config())
         add_sessions(path, [(replace(office_map, precision=precision), origin)], Config())
     with open_database(tmp_path / "known.submaps") as database:
-        assert map_sigma_m(found.answer, database) == pytest.approx(0.75, abs=1e-6)
+        assert map_sigma_m(found, database) == pytest.approx(0.75, abs=1e-6)
     with open_database(tmp_path / "unknown.submaps") as database:
-        assert map_sigma_m(found.answer, database) is None
+        assert map_sigma_m(found, database) is None
 
 
 def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: Found) -> None:
-    shown = contents(database, found=found, accept=0.8)["answer"]
-    assert shown["status"] == "located" == found.answer.status
+    shown = contents(database, found=replace(found, accept=0.8))["answer"]
+    assert shown["status"] == "located" == found.status
     assert shown["session"] == "office" and shown["accept"] == 0.8
     assert (shown["pose"]["x"], shown["pose"]["y"]) == pytest.approx((4.0, 3.0), abs=0.05)
     assert shown["query"]["is_map"] and shown["query"]["source"] == "part.yaml"
     assert shown["hypotheses"][0]["T"] == pytest.approx([4.0, 3.0, 0.0], abs=0.05)
-    assert len(shown["hypotheses"]) == len(found.answer.hypotheses)
+    assert len(shown["hypotheses"]) == len(found.hypotheses)
 
 
 def test_the_walls_of_the_query_are_weighed_at_each_hypothesis(
@@ -218,9 +218,7 @@ def test_the_signatures_of_the_query_lie_on_those_of_the_map_where_it_is_and_not
     """The query is a part of the map: a view in its middle sees the same in both."""
     shown = contents(database, found=found)["answer"]
     why = shown["why"]
-    assert [tuple(at) for at in why["views"]] == [
-        pytest.approx(at, abs=ROUNDED_M) for at in found.answer.views_m
-    ]
+    assert [tuple(at) for at in why["views"]] == [pytest.approx(at, abs=ROUNDED_M) for at in found.views_m]
     here, *rivals = why["places"]
     assert here["hypothesis"] == 0 and len(here["views"]) == len(why["views"])
     apart = []
@@ -233,7 +231,7 @@ def test_the_signatures_of_the_query_lie_on_those_of_the_map_where_it_is_and_not
     assert min(apart) < 0.3
     assert sum(view["log_ratio"] or 0.0 for view in here["views"]) > 0.0
     for rival in rivals:
-        assert found.answer.places[rival["hypothesis"]] != found.answer.places[0]
+        assert found.places[rival["hypothesis"]] != found.places[0]
         told = why["told_apart"]
         assert here["views"][told]["log_ratio"] > rival["views"][told]["log_ratio"]
 
@@ -301,7 +299,7 @@ def test_similar_places_are_the_nearest_in_the_database_but_not_those_around(
 def test_a_page_about_an_answer_explains_the_maps_of_its_hypotheses(
     database: SubmapDatabase, found: Found
 ) -> None:
-    there = {found.answer.sessions[h.session_index] for h in found.answer.hypotheses}
+    there = {found.sessions[h.session_index] for h in found.hypotheses}
     for session_ in contents(database, found=found)["sessions"]:
         explained = [submap["sources"] is not None for submap in session_["submaps"]]
         assert set(explained) == {session_["name"] in there}
@@ -345,7 +343,7 @@ def in_space(found: Found) -> Found:
         status="agrees", T_map_base=T, covariance=np.diag(variances), rmse_m=0.02,
         rays=512, on=0.73, through=0.2, before=0.07,
     )  # fmt: skip
-    return replace(found, answer=replace(found.answer, in_space=pose))
+    return replace(found, in_space=pose)
 
 
 @LOOKS
@@ -470,7 +468,7 @@ def test_the_place_that_a_reader_chooses_is_the_one_weighed(
     """A query of a symmetric room fits it in both headings."""
     save_map(cut(plan(8, 5, []), 0.0, 0.0, 8.0, 5.0), tmp_path / "room")
     found = find(tmp_path / "room.yaml", database, Config())
-    assert found.answer.status == "ambiguous"
+    assert found.status == "ambiguous"
     write_report(tmp_path / "page.html", database, found=found)
     data = contents(database, found=found)["answer"]
     act = 'document.querySelectorAll("#hypotheses tr")[2].click();'
