@@ -33,7 +33,7 @@ from signature.config import Config
 from signature.database import Label, Provenance, open_database
 from signature.database.maintenance import exists, store
 from signature.database.postgres import is_url
-from signature.localization.answer import Answer, followed
+from signature.localization.answer import Answer, QueryRecording, followed
 from signature.localization.localizer import Estimate, Localizer, locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
@@ -46,7 +46,6 @@ if TYPE_CHECKING:
     from pc2grid.mapping.drawn import DrawnMap
     from pc2grid.model import RegisteredScan
     from signature.database import SubmapDatabase
-    from signature.localization.answer_json import QueryRecording
     from signature.localization.pose_check import PoseCheck
     from signature.localization.posterior import Prior
 
@@ -209,7 +208,12 @@ def find(
     if is_drawn_map(path):
         drawn = load_drawn_map(path, config)
         answer = locate_map(drawn.grid, index or MapIndex.of(database, config, observer))
-        about = about_map(path, drawn, answer)
+        about = QueryRecording(
+            path_m=answer.path_m,
+            stamp_ns=answer.stamp_ns,
+            source=path.name,
+            warnings=tuple(drawn.warnings),
+        )
         return Found.of(answer, about=about, drawn=drawn.grid, **asked)
     with open_log(path, config.read, recover=recover) as log:
         known = prior(log, span)
@@ -257,32 +261,17 @@ def about_log(
     health : of its scans.
     """
     report = query.report()
-    return {
-        "path_m": answer.path_m,
-        "stamp_ns": answer.stamp_ns,
-        "source": path.name,
-        "start_s": span.start_s,
-        "duration_s": span.duration_s,
-        "scans": len(health),
-        "sensor": query.choose().sensor,
-        "lossy": report.lossy,
-        "warnings": [*report.warnings, *lost_warnings(health)],
-    }
-
-
-def about_map(path: Path, drawn: DrawnMap, answer: Answer) -> QueryRecording:
-    """Return the description of a map in the JSON document of the answer."""
-    return {
-        "path_m": answer.path_m,
-        "stamp_ns": answer.stamp_ns,
-        "source": path.name,
-        "start_s": 0.0,
-        "duration_s": None,
-        "scans": 0,
-        "sensor": "map",
-        "lossy": False,
-        "warnings": list(drawn.warnings),
-    }
+    return QueryRecording(
+        path_m=answer.path_m,
+        stamp_ns=answer.stamp_ns,
+        source=path.name,
+        start_s=span.start_s,
+        duration_s=span.duration_s,
+        scans=len(health),
+        sensor=query.choose().sensor,
+        lossy=report.lossy,
+        warnings=(*report.warnings, *lost_warnings(health)),
+    )
 
 
 # --- from a recording or a map to a session -----------------------------------------------------------

@@ -13,22 +13,61 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, is_dataclass, replace
+from functools import cache
 from itertools import compress
-from typing import Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
+from pydantic import Field, TypeAdapter
 
 from pc2grid.display import html_picture, html_table, map_png, probability, short
 from pc2grid.geometry import F64, I64, SE2, freeze, wrap_angle
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization import answer_json as form
-from signature.localization.answer_json import AmbiguousLine, Point
-from signature.localization.answer_json import SpaceStatus as SpaceStatus
-from signature.localization.answer_json import Status as Status
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.posterior import POSTERIOR, PRIOR, Evidence
+
+SCHEMA_VERSION = 1
+"""Of all documents. Within a version they only gain keys: a reader must ignore keys that it does not know."""
+Status = Literal["located", "ambiguous", "not_found"]
+SpaceStatus = Literal["agrees", "unsure", "contradicts"]
+
+adapter = cache(TypeAdapter)
+"""What makes the JSON of a type, and its schema."""
+
+
+def plain(document: Any) -> dict[str, Any]:
+    """Return a document of plain types: frozen types in it become objects, with the digits they declare."""
+    return {"schema_version": SCHEMA_VERSION, **_plain(document)}
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return adapter(type(value)).dump_python(value, mode="json", by_alias=True)
+    if isinstance(value, Mapping):
+        return {key: _plain(part) for key, part in value.items()}
+    return [_plain(part) for part in value] if isinstance(value, (list, tuple)) else value
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QueryRecording:
+    """The description of a query in documents.
+
+    path_m, stamp_ns : how far it travelled, and the stamp of its last scan. start_s, duration_s : the part of
+    the recording that was read; None: to its end. sensor : lidar, laser, depth, or map. lossy : data was lost
+    while reading.
+    """
+
+    path_m: float
+    stamp_ns: int
+    source: str
+    start_s: float = 0.0
+    duration_s: float | None = None
+    scans: int = 0
+    sensor: str = "map"
+    lossy: bool = False
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +100,7 @@ class PoseInSpace:
         pitch = math.asin(float(np.clip(-R[2, 0], -1.0, 1.0)))
         return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
 
-    def to_json(self) -> form.PoseInSpace:
+    def to_json(self) -> dict[str, Any]:
         """Return the pose as plain types."""
         x, y, z = self.T_map_base[:3, 3].tolist()
         roll, pitch, yaw = self.rpy_rad
@@ -134,7 +173,7 @@ class Moment:
     pose: SE2 | None
     confidence: float
 
-    def to_json(self) -> form.Moment:
+    def to_json(self) -> dict[str, Any]:
         """Return the moment as plain types."""
         at = self.pose
         x, y, yaw = (None, None, None) if at is None else (at.x, at.y, at.yaw)
@@ -280,7 +319,7 @@ class Answer:
         return self.frame_of(self.hypotheses[0]) if self.status == "located" else None
 
     @property
-    def stamped_pose(self) -> form.StampedPose | None:
+    def stamped_pose(self) -> dict[str, Any] | None:
         """The pose of the base as plain types; None unless it is located."""
         if self.T_map_base is None or self.covariance is None:
             return None
@@ -288,7 +327,7 @@ class Answer:
         return {"stamp_ns": self.stamp_ns, **pose, "covariance": self.covariance.tolist()}
 
     @property
-    def off_map_pose(self) -> form.OffMap | None:
+    def off_map_pose(self) -> dict[str, Any] | None:
         """Where the base is beside the map, as plain types; None if it is not most likely there."""
         away = self.beside_map
         if away is None:
@@ -302,10 +341,10 @@ class Answer:
             "probability": away.mass,
         }
 
-    def to_json(self) -> form.AnswerDocument:
+    def to_json(self) -> dict[str, Any]:
         """Return the answer as plain types: most of what `pc2grid relocalize --json` prints."""
         excluded = None if self.excluded is None else self.excluded.to_json()
-        about: form.AnswerDocument = {
+        about = {
             "status": self.status,
             "session": self.session,
             "frame": self.frame,
@@ -337,8 +376,7 @@ class Answer:
             "database": {"sessions": list(self.sessions)},
             "timing_ms": self.timing_ms,
         }
-        made: form.AnswerDocument = form.plain(form.AnswerDocument, about)
-        return made
+        return plain(about)
 
 
 AnswerT = TypeVar("AnswerT", bound=Answer)
@@ -351,8 +389,31 @@ def _pose(pose: SE2) -> str:
     return f"x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg"
 
 
-def _planar(pose: SE2) -> form.Pose:
+def _planar(pose: SE2) -> dict[str, float]:
     return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A point of a map, metres."""
+
+    x: float
+    y: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AmbiguousLine:
+    """Likely places that lie on one line, all with one heading.
+
+    begin, end : the places at its ends, in the frame of the best hypothesis. probability : that the base is
+    at one of these places.
+    """
+
+    begin: Point
+    end: Point
+    yaw_rad: Annotated[float, Field(serialization_alias="yaw")]
+    length_m: float
+    probability: float
 
 
 def ambiguous_line(bases: Sequence[SE2], masses: Sequence[float]) -> AmbiguousLine | None:

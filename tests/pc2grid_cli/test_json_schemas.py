@@ -7,6 +7,7 @@ import re
 import shutil
 import sys
 from collections.abc import Iterator
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -15,13 +16,28 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
-from pc2grid.model import MapOf, SensorKind
+from pc2grid.geometry import SE2
+from pc2grid.io.source import TopicInfo
+from pc2grid.model import (
+    Consistency,
+    Contradiction,
+    MapOf,
+    OdometryCheck,
+    OdometryOutlier,
+    ReadReport,
+    SensorKind,
+    UncertainSegment,
+)
 from pc2grid.settings import dump_settings
+from pc2grid.simulate import SimulatedSession
 from pc2grid_cli.console import print_result
 from pc2grid_cli.documents import DOCUMENTS, schema
+from pc2grid_cli.info import ChosenTopics, Info
 from pc2grid_cli.main import app
 from pc2grid_cli.options import Export, Simulate
 from signature.config import Config
+from signature.database import Problem
+from signature.localization.answer import AmbiguousLine, Point, QueryRecording, adapter
 from tests.helpers.json_schema import closed, keys
 
 
@@ -83,6 +99,21 @@ def test_the_keys_of_a_document_stay(name: str) -> None:
     """Scripts rely on them. What is printed is what the schema says (the test above); more keys may come."""
     known = json.loads((Path(__file__).parent / "json_keys.json").read_text())
     assert set(known[name]) - keys(schema(name)) == set()
+
+
+@pytest.mark.parametrize(
+    "kind",
+    [
+        SE2, Consistency, Contradiction, OdometryCheck, OdometryOutlier, ReadReport, UncertainSegment, TopicInfo, ChosenTopics,
+        Info, SimulatedSession, Problem, QueryRecording, AmbiguousLine, Point,
+    ],
+)  # fmt: skip
+def test_frozen_types_are_printed_as_the_schema_says(kind: Any) -> None:
+    """Also those that no command of the tests prints."""
+    names = {"Info": "info", "SimulatedSession": "simulate"}
+    schemas = json.loads(files("pc2grid_cli").joinpath("schemas.json").read_text())["$defs"]
+    printed = adapter(kind).json_schema(mode="serialization")["properties"]
+    assert [*printed] == [*schemas[names.get(kind.__name__, kind.__name__)]["properties"]]
 
 
 def test_every_document_is_validated_by_a_test() -> None:

@@ -10,9 +10,7 @@ import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any
-
-from pydantic import Field
+from typing import Any
 
 from pc2grid import libraries as extras
 from pc2grid.display import counted
@@ -20,32 +18,43 @@ from pc2grid.errors import ConfigError, DatabaseError, OutputError, Pc2GridError
 from pc2grid.model import is_part_of
 from pc2grid.observer import Observer
 from pc2grid_cli import console, options, output
-from pc2grid_cli.documents import Converted, JoinedSession, joined_document, session_document
+from pc2grid_cli.documents import Document, joined_document, session_document
 from signature import conversion_jobs
 from signature.conversion_jobs import Job
 from signature.database import Label, Provenance, maintenance, open_database
 from signature.database.postgres import is_url
 from signature.database.protocol import Entry
-from signature.localization.answer_json import plain
+from signature.localization.answer import plain
 from signature.localization.joining.building import join_sessions
 from signature.sessions import digest_of
 
 
 @dataclass(kw_only=True)
 class Convert:
-    """`pc2grid convert --json`. database: its path, or its URL without a password. lossy: data was lost, or
-    an input failed. unchanged: sessions that were stored already; failed: inputs left out. joined: where
-    those of the new sessions lie in a building that were joined with others."""
+    """What became of the inputs, as far as they are done.
+
+    lossy : data was lost, or an input failed. severe : so much that the exit code is 3.
+    """
 
     database: str
     lossy: bool = False
-    sessions: list[Converted] = field(default_factory=list)
+    sessions: list[Document] = field(default_factory=list)
     unchanged: list[str] = field(default_factory=list)
     failed: list[str] = field(default_factory=list)
-    joined: list[JoinedSession] = field(default_factory=list)
-    # So much was lost that the exit code is 3.
-    severe: Annotated[bool, Field(exclude=True)] = False
-    warnings: Annotated[list[str], Field(exclude=True)] = field(default_factory=list)
+    joined: list[Document] = field(default_factory=list)
+    severe: bool = False
+    warnings: list[str] = field(default_factory=list)
+
+    def document(self) -> Document:
+        """Return what `--json` prints."""
+        return {
+            "database": self.database,
+            "lossy": self.lossy,
+            "sessions": self.sessions,
+            "unchanged": self.unchanged,
+            "failed": self.failed,
+            "joined": self.joined,
+        }
 
     def add(self, entry: Entry, given: options.Convert) -> None:
         """Keep and print a session made of one input."""
@@ -177,7 +186,7 @@ def _note_stored(terminal: console.Console, done: Convert, count: int) -> Iterat
         raise
 
 
-def _as_text(d: Converted) -> str:
+def _as_text(d: Document) -> str:
     travel = (
         f"{counted(d['scans'], d['sensor'] + ' scan')}, {d['path_m']:.1f} m in {d['duration_s']:.0f} s, "
         if d["scans"]
@@ -212,7 +221,7 @@ def _conclude(done: Convert, given: options.Convert) -> int | None:
     """Print what there is now, and what is to be said of it. Return the exit code."""
     count, path = len(given.inputs), Path(given.output)
     if given.json:
-        console.print_result(plain(Convert, done))
+        console.print_result(plain(done.document()))
     elif path.is_file():
         print(f"{done.database}: {path.stat().st_size / 1e6:.1f} MB")
     for warning in done.warnings:

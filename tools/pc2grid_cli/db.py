@@ -12,51 +12,22 @@ from pathlib import Path
 
 from pc2grid.display import counted, probability
 from pc2grid.errors import ConfigError, DatabaseError, one_line
-from pc2grid.geometry import SE2
 from pc2grid_cli import console, options, output
-from pc2grid_cli.documents import (
-    JoinedSession,
-    OfDatabase,
-    StoredInfo,
-    buildings,
-    joined_document,
-    stored_document,
-)
+from pc2grid_cli.documents import Document, buildings, joined_document, stored_document
 from signature.database import Problem, SessionInfo, SubmapDatabase, maintenance, open_database
 from signature.database.maintenance import shown
 from signature.database.protocol import largest_m
-from signature.localization.answer_json import TypedDict, plain
+from signature.localization.answer import plain
 from signature.localization.joining.building import Joined, join_sessions
-from signature.localization.joining.join import JoinStatus, SessionPair
+from signature.localization.joining.join import SessionPair
 from signature.localization.shown.picture import draw_building
-
-
-class DbInfo(OfDatabase):
-    """`pc2grid db info --json`. joined: where those of the sessions lie that are joined in a building."""
-
-    sessions: list[StoredInfo]
-    joined: list[JoinedSession]
-
-
-class DbCheck(OfDatabase):
-    """`pc2grid db check --json`; no problems: sound."""
-
-    problems: list[Problem]
-
-
-class DbWrite(OfDatabase):
-    """`pc2grid db merge`, `copy`, `split`, `rename` and `remove` with `--json`. sessions: how many are in
-    the database now; left_out: damage that was not copied."""
-
-    sessions: int
-    left_out: list[Problem]
 
 
 def info(given: options.DbInfo, terminal: console.Console) -> None:
     """Print the sessions of a database."""
     with open_database(given.database) as opened:
         sessions, frames, where = opened.sessions(), opened.frames(), opened.location
-    about: DbInfo = {
+    about = {
         "database": where,
         "sessions": [stored_document(session) for session in sessions],
         "joined": [joined_document(name, frame) for name, frame in frames.items()],
@@ -64,7 +35,7 @@ def info(given: options.DbInfo, terminal: console.Console) -> None:
     submaps = counted(sum(session.submaps for session in sessions), "submap")
     lines = [f"{where}: {counted(len(sessions), 'session')}, {submaps}", *map(_line, sessions)]
     lines += [f"  joined, in the frame of {name}: {', '.join(of)}" for name, of in buildings(frames).items()]
-    console.print_result(plain(DbInfo, about) if given.json else "\n".join(map(one_line, lines)))
+    console.print_result(plain(about) if given.json else "\n".join(map(one_line, lines)))
 
 
 def _line(s: SessionInfo) -> str:
@@ -85,9 +56,9 @@ def _line(s: SessionInfo) -> str:
 def check(given: options.DbCheck, terminal: console.Console) -> int | None:
     """Print all damage of a database. Return the exit code."""
     problems, where = maintenance.check(given.database), shown(given.database)
-    about: DbCheck = {"database": where, "problems": list(problems)}
+    about = {"database": where, "problems": list(problems)}
     damage = [one_line(f"{problem.where}: {problem.what}") for problem in problems]
-    console.print_result(plain(DbCheck, about) if given.json else "\n".join(damage) or f"{where}: sound")
+    console.print_result(plain(about) if given.json else "\n".join(damage) or f"{where}: sound")
     return console.FAILED if problems else None
 
 
@@ -145,38 +116,11 @@ def _print(database: str, text: str, json: bool, left_out: Sequence[Problem] = (
     """Print a text or the document about a database that was written."""
     with open_database(database) as opened:
         number, where = len(opened.sessions()), opened.location
-    about: DbWrite = {"database": where, "sessions": number, "left_out": list(left_out)}
-    console.print_result(plain(DbWrite, about) if json else text)
+    about = {"database": where, "sessions": number, "left_out": list(left_out)}
+    console.print_result(plain(about) if json else text)
 
 
 _SAID = {"joined": "joined", "ambiguous": "ambiguous", "different": "not the same building"}
-
-
-class ComparedSessions(TypedDict):
-    """Two sessions that were compared. status: joined, ambiguous, or different: nothing says that they show
-    one building. accepted: the join counts; other pairs and labels do not contradict it. T_target_source:
-    null if the status is `different`; covariance: (3, 3) of its x, y, yaw. probability: that it is right.
-    agreement: of the walls where both know the ground, 0..1. common_m2: free ground that both know."""
-
-    target: str
-    source: str
-    status: JoinStatus
-    accepted: bool
-    T_target_source: SE2 | None
-    covariance: list[list[float]] | None
-    probability: float
-    agreement: float
-    common_m2: float
-
-
-class DbJoin(OfDatabase):
-    """`pc2grid db join --json`. stored: false with --dry-run. sessions: those that were joined. alone: the
-    names of the others."""
-
-    stored: bool
-    pairs: list[ComparedSessions]
-    sessions: list[JoinedSession]
-    alone: list[str]
 
 
 def join(given: options.DbJoin, terminal: console.Console) -> None:
@@ -195,7 +139,7 @@ def join(given: options.DbJoin, terminal: console.Console) -> None:
     if not given.dry_run:  # those that lie in no building are no longer in one
         maintenance.place(given.database, {name: found.frames.get(name) for name in names})
     alone = [name for name in names if name not in found.frames]
-    about: DbJoin = {
+    about = {
         "database": shown(given.database),
         "stored": not given.dry_run,
         "pairs": [_compared(pair) for pair in found.pairs],
@@ -203,7 +147,7 @@ def join(given: options.DbJoin, terminal: console.Console) -> None:
         "alone": alone,
     }
     if given.json:
-        console.print_result(plain(DbJoin, about))
+        console.print_result(plain(about))
     else:
         _report(found, alone, stored=not given.dry_run)
 
@@ -263,7 +207,8 @@ def _draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
     draw_building(path, name, {s: (database.grid(s), at) for s, at in known[name].items()})
 
 
-def _compared(pair: SessionPair) -> ComparedSessions:
+def _compared(pair: SessionPair) -> Document:
+    """Return the description of two sessions that were compared."""
     join = pair.join
     known = join.status != "different"
     return {

@@ -20,14 +20,14 @@ from pc2grid.geometry import wrap_angle
 from pc2grid.io.atomic import require_writable
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid, SensorKind
-from pc2grid.simulate import Building, SimulatedSession, SimulationConfig, load_building, simulate_session
+from pc2grid.simulate import Building, SimulationConfig, load_building, simulate_session
 from pc2grid.simulate.config import LidarConfig
 from pc2grid_cli import console, options
 from pc2grid_cli.output import make_folder
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.answer_json import plain
+from signature.localization.answer import plain
 from signature.localization.shown.page import write_report
 from signature.localization.shown.picture import draw_answer
 from signature.sessions import add_sessions, build_session, find
@@ -106,7 +106,7 @@ def simulate(given: options.Simulate, terminal: console.Console) -> None:
         f"{made.path}: {made.scans} {made.sensor} scans, {made.length_m:.1f} m in {made.duration_s:.1f} s\n"
         f"{made.truth_path}: {made.scans} true poses of base_link in the map frame"
     )
-    console.print_result(plain(SimulatedSession, made) if given.json else text)
+    console.print_result(plain(made) if given.json else text)
 
 
 def _building(files: list[Path], force: bool) -> OccupancyGrid | Building | None:

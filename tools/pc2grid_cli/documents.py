@@ -1,58 +1,42 @@
 """The JSON documents of the commands: their schemas (draft 2020-12), and how a session is described in them.
 
-A schema is made of the type of a document, which stands beside the command that fills it, so that mypy
-compares what is printed with what the schema says. It holds frozen types of the program as they are. Metres,
-radians, int64 nanoseconds, unless a name says otherwise.
+`schemas.json` holds the keys of all documents, with what they mean: a command prints no others, and leaves
+none out, which tests compare. Frozen types of the program are printed as they are. Metres, radians, int64
+nanoseconds, unless a name says otherwise.
 """
 
 from __future__ import annotations
 
 import json
-import pkgutil
+import re
 import statistics
 from collections import defaultdict
 from collections.abc import Mapping
+from importlib.resources import files
 from typing import Any
 
 from pc2grid.errors import ConfigError
-from pc2grid.geometry import SE2
-from pc2grid.model import (
-    Consistency,
-    OdometryCheck,
-    Precision,
-    ReadReport,
-    SessionMap,
-    ThreeDigits,
-    UncertainSegment,
-)
+from pc2grid.model import Precision, SessionMap
 from pc2grid.settings import dump_settings
 from pc2grid_cli import console, options
 from signature.config import Config
 from signature.database import Provenance, SessionInfo
-from signature.database.protocol import BuildingFrame, Covariance, largest_m
-from signature.localization.answer_json import SCHEMA_VERSION, Labelled, TypedDict, adapter
+from signature.database.protocol import BuildingFrame, largest_m
+from signature.localization.answer import SCHEMA_VERSION, adapter
 
-_WRITTEN = "pc2grid_cli.db:DbWrite"
-DOCUMENTS = {
-    "convert": "pc2grid_cli.convert:Convert",
-    "db-check": "pc2grid_cli.db:DbCheck",
-    "db-copy": _WRITTEN,
-    "db-info": "pc2grid_cli.db:DbInfo",
-    "db-join": "pc2grid_cli.db:DbJoin",
-    "db-merge": _WRITTEN,
-    "db-remove": _WRITTEN,
-    "db-rename": _WRITTEN,
-    "db-split": _WRITTEN,
-    "export": "pc2grid_cli.export:Export",
-    "info": "pc2grid_cli.info:Info",
-    "info-map": "pc2grid_cli.info:InfoMap",
-    "relocalize": "pc2grid_cli.relocalize:Relocalize",
-    "relocalize-check": "pc2grid_cli.known_pose:RelocalizeCheck",
-    "simulate": "pc2grid.simulate.session:SimulatedSession",
-    "watch": "pc2grid_cli.watch:Watch",
-    "watch-check": "pc2grid_cli.watch:WatchCheck",
-}
-"""By command, where the type of its document is: it is imported when its schema is asked for."""
+Document = dict[str, Any]
+"""Plain and frozen types, by key."""
+
+
+def _complete(about: Document) -> Document:
+    """Return the schema of an object, of which all keys are always there."""
+    return {**about, "required": [*about["properties"]]} if "properties" in about else about
+
+
+_SCHEMAS = files("pc2grid_cli").joinpath("schemas.json").read_text(encoding="utf-8")
+_TYPES: Document = json.loads(_SCHEMAS, object_hook=_complete)["$defs"]
+DOCUMENTS = tuple(name for name in _TYPES if name.islower())
+"""The commands that print documents; the other types of the file are parts of them."""
 
 
 def dump(given: options.ConfigDump, terminal: console.Console) -> None:
@@ -71,86 +55,23 @@ def print_schema(given: options.ConfigSchema, terminal: console.Console) -> None
         raise ConfigError(f"no schema {given.name!r}", hint=f"there are {', '.join(names)}")
 
 
-def schema(name: str) -> dict[str, Any]:
+def schema(name: str) -> Document:
     """Return the schema of a command's document, or of all `settings` as TOML holds them. Raises KeyError."""
+    draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     if name == "settings":
-        about = adapter(Config).json_schema()
-    else:
-        about = adapter(pkgutil.resolve_name(DOCUMENTS[name])).json_schema(mode="serialization")
-        about["properties"] = {"schema_version": {"const": SCHEMA_VERSION}, **about["properties"]}
-        about = json.loads(json.dumps(about), object_hook=_complete)
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **about}
+        return draft | adapter(Config).json_schema()
+    about = _TYPES[_TYPES[name].get("$ref", name).rpartition("/")[2]]
+    parts: Document = {}
+    waiting = [about]
+    while waiting:
+        named = re.findall(r"#/\$defs/(\w+)", json.dumps(waiting.pop()))
+        waiting += [_TYPES[part] for part in named if part not in parts]
+        parts |= {part: _TYPES[part] for part in named}
+    keys = {"schema_version": {"const": SCHEMA_VERSION}, **about["properties"]}
+    return draft | {"$defs": parts} | _complete({**about, "properties": keys})
 
 
-def _complete(about: dict[str, Any]) -> dict[str, Any]:
-    """Return the schema of an object whose keys are always there, also those with a default."""
-    return {**about, "required": [*about["properties"]]} if "properties" in about else about
-
-
-class OfDatabase(TypedDict):
-    """A document about a database: its path, or its URL without a password."""
-
-    database: str
-
-
-class PrecisionSummary(TypedDict):
-    """How exactly the places of a map lie to each other: standard deviations of a position in the least
-    certain direction. median_m: half of the places are known better. worst_m: the largest. loose: stretches
-    where it is too large to rely on, the least certain first."""
-
-    median_m: ThreeDigits
-    worst_m: ThreeDigits
-    loose: list[UncertainSegment]
-
-
-class Mapped(Labelled):
-    """A session. digest: sha256 of what it was made from, hex. area_m2: free space. consistency, odometry,
-    precision: null for an imported map."""
-
-    source: str
-    digest: str
-    sensor: str
-    scans: int
-    path_m: float
-    duration_s: float
-    area_m2: float
-    submaps: int
-    consistency: Consistency | None
-    odometry: OdometryCheck | None
-    precision: PrecisionSummary | None
-
-
-class Converted(Mapped):
-    """What became of one input."""
-
-    session: str
-    report: ReadReport
-
-
-class StoredInfo(Mapped):
-    """A session of a database, with the versions and settings that made it. points: how many in space."""
-
-    name: str
-    resolution_m: float
-    points: int
-    lossy: bool
-    warnings: list[str]
-    versions: dict[str, str]
-    config: dict[str, Any]
-
-
-class JoinedSession(TypedDict):
-    """Where a session lies in its building. frame: name of the building's frame. bent_m: how far the map is
-    bent there at most, where another session straightens it."""
-
-    session: str
-    frame: str
-    T_building_session: SE2
-    covariance: Covariance
-    bent_m: float
-
-
-def session_document(session: SessionMap, origin: Provenance) -> Converted:
+def session_document(session: SessionMap, origin: Provenance) -> Document:
     """Return the description of a session that was made of one input."""
     return {
         "session": session.session,
@@ -166,12 +87,12 @@ def session_document(session: SessionMap, origin: Provenance) -> Converted:
         "submaps": len(session.submaps),
         "consistency": session.consistency,
         "odometry": session.odometry,
-        "precision": precision_summary(session.precision),
+        "precision": _summary(session.precision),
         "report": session.report,
     }
 
 
-def stored_document(s: SessionInfo) -> StoredInfo:
+def stored_document(s: SessionInfo) -> Document:
     """Return the description of a session of a database."""
     return {
         "name": s.name,
@@ -190,14 +111,14 @@ def stored_document(s: SessionInfo) -> StoredInfo:
         "lossy": s.lossy,
         "consistency": s.consistency,
         "odometry": s.odometry,
-        "precision": precision_summary(s.precision),
+        "precision": _summary(s.precision),
         "warnings": list(s.warnings),
         "versions": dict(s.provenance.versions),
         "config": s.provenance.config.model_dump(mode="json"),
     }
 
 
-def joined_document(session: str, frame: BuildingFrame) -> JoinedSession:
+def joined_document(session: str, frame: BuildingFrame) -> Document:
     """Return the description of where a session lies in its building."""
     return {
         "session": session,
@@ -216,7 +137,7 @@ def buildings(frames: Mapping[str, BuildingFrame]) -> dict[str, dict[str, Buildi
     return found
 
 
-def precision_summary(precision: Precision | None) -> PrecisionSummary | None:
+def _summary(precision: Precision | None) -> Document | None:
     """Return how exactly the places of a map lie to each other, in a few numbers."""
     if precision is None:
         return None

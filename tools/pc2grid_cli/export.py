@@ -22,23 +22,14 @@ from pc2grid.io.maps import is_map_file, save_map
 from pc2grid.io.trajectory import write_trajectory
 from pc2grid.model import THING, MapOf, OccupancyGrid, Trajectory
 from pc2grid_cli import console, options, output
-from pc2grid_cli.documents import OfDatabase
 from signature.database import SubmapDatabase, open_database
 from signature.database.protocol import BuildingFrame, SessionInfo
-from signature.localization.answer import Answer
-from signature.localization.answer_json import plain
+from signature.localization.answer import Answer, plain
 from signature.localization.shown.page import write_report
 from signature.localization.shown.picture import draw_building, draw_session
 
 Frames = Mapping[str, BuildingFrame]
 """Of the buildings that sessions are joined in, by session."""
-
-
-class Export(OfDatabase):
-    """`pc2grid export --json`; session is null if only a report was written."""
-
-    session: str | None
-    written: list[str]
 
 
 SHOWN: dict[MapOf, str] = {
@@ -78,13 +69,13 @@ def run(given: options.Export, terminal: console.Console) -> None:
         if "report" in outputs:
             write_report(outputs["report"], opened)
         written = output.written_files(outputs)
-        about: Export = {"database": opened.location, "session": name, "written": [*map(str, written)]}
+        about = {"database": opened.location, "session": name, "written": [*map(str, written)]}
     if given.map_of not in (None, "everything"):
         terminal.note(f"--map-of {given.map_of}: {SHOWN[given.map_of]}")
     for path in written:
         terminal.note(f"wrote {path}")
     if given.json:
-        console.print_result(plain(Export, about))
+        console.print_result(plain(about))
 
 
 def _check(outputs: Mapping[str, Path], given: options.Export) -> None:

@@ -22,7 +22,7 @@ from pc2grid.io.robots import Namespaces, camera_info_topic
 from pc2grid.io.source import Choice, LogInfo
 from pc2grid.model import SENSOR_MODELS
 from pc2grid_cli import console, options
-from signature.localization.answer_json import TypedDict, plain
+from signature.localization.answer import plain
 
 if TYPE_CHECKING:
     from pc2grid.mapping.drawn import DrawnMap
@@ -49,25 +49,6 @@ class Info(LogInfo):
     bytes_lost: int
 
 
-class InfoMap(TypedDict):
-    """`pc2grid info MAP --json`. origin_m: x, y of the lower left corner; free_m2, occupied_m2: areas.
-    Of a cloud or mesh, voxels: points of which it was drawn, one a voxel, floor_z_m, tilt_deg: height and
-    tilt of the floor in the file; 0 for a nav2 map."""
-
-    path: str
-    format: str
-    warnings: list[str]
-    width: int
-    height: int
-    resolution_m: float
-    origin_m: list[float]
-    free_m2: float
-    occupied_m2: float
-    voxels: int
-    floor_z_m: float
-    tilt_deg: float
-
-
 def run(given: options.Info, terminal: console.Console) -> int | None:
     """Print what is in a recording, a map or a database. Return the exit code."""
     log, path = given.log, Path(given.log)
@@ -78,19 +59,19 @@ def run(given: options.Info, terminal: console.Console) -> int | None:
         return None
     if is_map_file(path) or is_building_file(path):
         of_map = describe_map(path, given.assignments)
-        console.print_result(plain(InfoMap, of_map) if given.json else one_line(_map_as_text(of_map)))
+        console.print_result(plain(of_map) if given.json else one_line(_map_as_text(of_map)))
         for warning in of_map["warnings"]:
             console.warn(warning)
         return None
     info = describe(path, topic=given.topic, recover=given.recover, assignments=given.assignments)
     if given.json:
-        console.print_result(plain(Info, info))
+        console.print_result(plain(info))
     else:
         _show(info)
     return console.LOSSY if info.bytes_lost else None
 
 
-def describe_map(path: Path, assignments: list[str] | None = None) -> InfoMap:
+def describe_map(path: Path, assignments: list[str] | None = None) -> dict[str, Any]:
     """Return the document of a map. Raises MapFileError if it cannot be read."""
     from pc2grid.mapping.drawn import load_drawn_map
 
@@ -121,7 +102,7 @@ def _floor_z_m(drawn: DrawnMap) -> float:
     return float(transform_points(invert_pose(drawn.T_map_file), np.array([[*middle, 0.0]]))[0, 2])
 
 
-def _map_as_text(d: InfoMap) -> str:
+def _map_as_text(d: dict[str, Any]) -> str:
     x, y = d["origin_m"]
     of_cloud = ""
     if d["voxels"]:

@@ -28,20 +28,13 @@ from pc2grid.io.map_pose import MapPose
 from pc2grid.model import Health, RegisteredScan
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console, options
+from pc2grid_cli.documents import Document
 from pc2grid_cli.options import KnownPose
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.localization.answer import Answer
-from signature.localization.answer_json import (
-    Labelled,
-    Pose,
-    QueryRecording,
-    StampedPose,
-    TypedDict,
-    plain,
-)
 from signature.localization.map_index import MapIndex
-from signature.localization.pose_check import CheckStatus, PoseCheck, check_pose
+from signature.localization.pose_check import PoseCheck, check_pose
 from signature.localization.posterior import Prior
 from signature.sessions import about_log, open_places, query_config, tracked
 
@@ -169,54 +162,9 @@ def read_pose(path: Path) -> MapPose:
         raise ConfigError(f"{path}: not a PoseWithCovarianceStamped message", hint=advice) from error
 
 
-class CheckedPose(Pose):
-    """The pose at the last scan, in the map frame."""
-
-    stamp_ns: int
-
-
-class BetterPlace(Labelled):
-    """Where the query is instead, with certainty."""
-
-    session: str | None
-    pose: StampedPose | None
-    confidence: float
-
-
-class CheckedAgainst(TypedDict):
-    """The database."""
-
-    path: str
-
-
-class CheckedPoseJudgement(TypedDict):
-    """What is said of a pose that the robot believes in.
-
-    status: fine, lost, or unsure. probability: that the pose is right; an upper bound unless it is fine.
-    off_m, off_rad: from the pose to the best fit near it, null if nothing fits there. comparable: false if
-    registration was lost after the time of the pose. better: null unless another place is certain.
-    """
-
-    status: CheckStatus
-    probability: float
-    session: str
-    pose: CheckedPose
-    off_m: float | None
-    off_rad: float | None
-    comparable: bool
-    better: BetterPlace | None
-    database: CheckedAgainst
-
-
-class RelocalizeCheck(CheckedPoseJudgement):
-    """`pc2grid relocalize --check` and `--check-topic`, with `--json`."""
-
-    query: QueryRecording
-
-
 def check_log(
     given: options.Relocalize, database: SubmapDatabase, config: Config, observer: Observer
-) -> tuple[PoseCheck, RelocalizeCheck]:
+) -> tuple[PoseCheck, Document]:
     """Check the pose at the end of a recording, or of the part of it that is named."""
     (path,), span = given.logs, given.span
     config = query_config(database, config)
@@ -233,8 +181,7 @@ def check_log(
             index = MapIndex.of(database, config)
             checked = check_pose(counted(), index, T_map_base, stamp_ns=stamp_ns, session=given.session)
         about = about_log(path, log, checked, span, health)
-        document: RelocalizeCheck = {**judgement(checked, database.location), "query": about}
-        return checked, plain(RelocalizeCheck, document)
+        return checked, {**judgement(checked, database.location), "query": about}
 
 
 def _believed(log: Log, given: options.Relocalize) -> tuple[SE2, int | None]:
@@ -247,7 +194,7 @@ def _believed(log: Log, given: options.Relocalize) -> tuple[SE2, int | None]:
     return SE2(x_m, y_m, math.radians(yaw_deg)), None
 
 
-def judgement(checked: PoseCheck, where: str) -> CheckedPoseJudgement:
+def judgement(checked: PoseCheck, where: str) -> Document:
     """Return what is said of a pose. where : the database."""
     pose, better = checked.T_map_base, checked.better
     return {

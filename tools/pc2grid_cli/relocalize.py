@@ -29,36 +29,18 @@ from pc2grid.mapping.quality import PRECISION
 from pc2grid.model import SENSOR_MODELS, Trajectory
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console, known_pose, options, output
+from pc2grid_cli.documents import Document
 from pc2grid_cli.export import write_answer, write_located_map
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.maintenance import is_database
 from signature.database.protocol import BuildingFrame
-from signature.localization.answer import Answer, answer_in_building
-from signature.localization.answer_json import AmbiguousLine, QueryRecording, Result, Sessions
+from signature.localization.answer import AmbiguousLine, Answer, answer_in_building, plain
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.page import Found, write_report
 from signature.localization.shown.picture import draw_answer, draw_answers
 from signature.sessions import find, query_config
-
-
-class Searched(Sessions):
-    """Where it was looked for. left_out: damage that was not used."""
-
-    path: str
-    left_out: list[str]
-
-
-class Relocalize(Result):
-    """`pc2grid relocalize --json`. T_map_odom puts the query's own frame into the map. confidence: the
-    probability that the best hypothesis is right. hypotheses: best first. map_sigma_m: standard deviation of
-    the map itself there, relative to the rest of it; the covariance of the pose is about the walls around."""
-
-    query: QueryRecording
-    database: Searched
-    map_sigma_m: float | None
-
 
 _FILES = ("trajectory", "csv", "initialpose", "output", "plot", "report")
 """Options that name what is written, in this order."""
@@ -79,8 +61,8 @@ def run(given: options.Relocalize, terminal: console.Console) -> int:
     with known_pose.searched(given) as (opened, left_out):
         if is_check:
             checked, document = known_pose.check_log(given, opened, settings, observer)
-            console.print_result(document if given.json else known_pose.as_text(checked))
-            for warning in document["query"]["warnings"]:
+            console.print_result(plain(document) if given.json else known_pose.as_text(checked))
+            for warning in document["query"].warnings:
                 console.warn(warning)
             return console.OK if checked.status == "fine" else console.UNSURE
         frames = opened.frames() if given.frame == "building" else {}
@@ -233,12 +215,12 @@ class Said:
         outputs = self._fillable(located=located is not None)
         if "csv" in outputs:
             write_csv(outputs["csv"], [(window, stated)])
-        _write(outputs, self.database, found, stated, located, force=self.given.force)
+        _write(outputs, self.database, found, stated, located, self.given.force)
         for path in outputs.values():
             self.terminal.note(f"wrote {path}")
         _warn_of_missing_points(found, self.database)
         _warn_of_unjoined(found, self.database)
-        for warning in found.about["warnings"]:
+        for warning in found.about.warnings:
             console.warn(warning)
         _warn_of_prior(stated)
         return self._code([found])
@@ -266,19 +248,19 @@ class Said:
         if "trajectory" in outputs:
             write_places(outputs["trajectory"], [(answer.poses, answer) for answer in answers])
         if "plot" in outputs:
-            drawn = [(found, found.poses, found.about["source"]) for found in all_found]
+            drawn = [(found, found.poses, found.about.source) for found in all_found]
             draw_answers(outputs["plot"], self.database, drawn)
         for path in outputs.values():
             self.terminal.note(f"wrote {path}")
-        warnings = [f"{f.about['source']}: {w}" for f in all_found for w in f.about["warnings"]]
+        warnings = [f"{f.about.source}: {w}" for f in all_found for w in f.about.warnings]
         for warning in dict.fromkeys(warnings):
             console.warn(warning)
         return self._code(all_found, failed=len(all_found) < len(rows))
 
-    def _document(self, found: Found, stated: Found) -> Relocalize:
+    def _document(self, found: Found, stated: Found) -> Document:
         """Return what `--json` prints. stated : the answer as it is given."""
         sigma_m = map_sigma_m(found, self.database)
-        return {
+        about = {
             **stated.to_json(),
             "query": stated.about,
             "database": {
@@ -288,6 +270,7 @@ class Said:
             },
             "map_sigma_m": None if sigma_m is None else round(sigma_m, 3),
         }
+        return plain(about)
 
     def _fillable(self, *, located: bool) -> Mapping[str, Path]:
         """Return the files that can be written, by option. Warn of those that lack an answer."""
@@ -298,7 +281,7 @@ class Said:
 
     def _code(self, all_found: Sequence[Found], *, failed: bool = False) -> int:
         """Return the exit code. Data that was lost is warned of. failed : a query could not be read."""
-        reports = [(found.about["source"], found.read) for found in all_found if found.read is not None]
+        reports = [(found.about.source, found.read) for found in all_found if found.read is not None]
         for source, report in reports:
             if report.lossy:
                 console.warn(f"{source}: {output.sentence(report)}")
@@ -316,7 +299,6 @@ def _write(
     found: Found,
     stated: Found,
     located: Trajectory | None,
-    *,
     force: bool,
 ) -> None:
     """Write the files.
@@ -390,7 +372,7 @@ def _warn_of_prior(answer: Answer) -> None:
 def _warn_of_missing_points(found: Found, database: SubmapDatabase) -> None:
     """Warn that points in space were not kept, where an answer is not certain."""
     in_space = {kind for kind, model in SENSOR_MODELS.items() if not model.planar}
-    if found.status == "located" or found.about["sensor"] not in in_space:
+    if found.status == "located" or found.about.sensor not in in_space:
         return
     infos = [info for info in database.sessions() if info.sensor in in_space]
     if infos and not any(info.points for info in infos):

@@ -43,6 +43,7 @@ from pc2grid_cli.console import json_text
 from pc2grid_cli.watch import feed
 from signature.config import Config
 from signature.database import SubmapDatabase
+from signature.localization.answer import plain
 from signature.localization.localizer import Estimate, Follower, Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.page import page
@@ -138,7 +139,7 @@ class Locator:
             raise
         told = {"status": found.status, "session": found.session, "confidence": found.confidence}
         events.publish("end", {"source": path.name, **told})
-        return {**found.to_json(), "query": found.about}
+        return plain({**found.to_json(), "query": found.about})
 
     def follow(self, source: str) -> None:
         """Show a running robot until its source ends.

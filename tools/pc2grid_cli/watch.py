@@ -33,77 +33,17 @@ from pc2grid.observer import Observer
 from pc2grid.pipeline import follow
 from pc2grid.settings import ReadConfig
 from pc2grid_cli import console, known_pose, options
+from pc2grid_cli.documents import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.protocol import BuildingFrame, SessionInfo
-from signature.localization.answer import answer_in_building
-from signature.localization.answer_json import (
-    Labelled,
-    OffMap,
-    PoseInSpace,
-    StampedPose,
-    Status,
-    TypedDict,
-    plain,
-)
-from signature.localization.belief import State
+from signature.localization.answer import answer_in_building, plain
 from signature.localization.joining.building import map_of
 from signature.localization.localizer import Estimate, Follower, Localizer, ResetPolicy
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch
 from signature.localization.posterior import Prior
 from signature.sessions import query_config
-
-
-class Live(TypedDict):
-    """How a running robot is followed. scans: used so far. dropped: left out because the computer is too
-    slow. reconnected: lost connections made again. lag_s, elapsed_s: seconds from a scan's arrival to its
-    use, and for this estimate."""
-
-    scans: int
-    dropped: int
-    reconnected: int
-    lag_s: float
-    elapsed_s: float
-
-
-class WatchedMap(Labelled):
-    """The map that a pose is in: its session, and the sha256 of what the session was made from, hex."""
-
-    database: str
-    session: str
-    digest: str
-
-
-class Watch(Live):
-    """A line of `pc2grid watch --json`: what one search of the database said. state: searching (not located
-    yet), located, off_map (the map does not show what it sees), doubtful (certain neither where it was nor
-    elsewhere), lost, recovered (located elsewhere or again). pose: of the base at `stamp_ns`; null unless the
-    status is `located`. The state is that only when a second search agrees, or beyond doubt; no other pose
-    is published. T_map_odom: of the robot's own odometry frame. frame: of the building, in which the pose is;
-    null: the map frame of the session. in_space: null if the map or the scans have no points. off_map: where
-    odometry says that it is; null unless the map shows too little there. confidence: the probability that
-    the best place is right. published: topics on which it was said."""
-
-    state: State
-    status: Status
-    stamp_ns: int
-    path_m: float
-    map: WatchedMap | None
-    frame: str | None
-    pose: StampedPose | None
-    T_map_odom: SE2 | None
-    in_space: PoseInSpace | None
-    off_map: OffMap | None
-    confidence: float
-    published: list[str]
-
-
-class WatchCheck(known_pose.CheckedPoseJudgement, Live):
-    """A line of `pc2grid watch --check-topic --json`. path_m: travel that the judgement rests on."""
-
-    path_m: float
-
 
 EstimateT = TypeVar("EstimateT")
 
@@ -207,12 +147,12 @@ def _check(following: Following, topic: str) -> bool:
     def use(checked: PoseCheck, lock: threading.Lock) -> bool:
         nonlocal fine
         fine = checked.status == "fine"
-        document: WatchCheck = {
+        document = {
             **known_pose.judgement(checked, following.database.location),
             **live(drive, checked.elapsed_s),
             "path_m": checked.path_m,
         }
-        said = plain(WatchCheck, document) if given.json else known_pose.as_text(checked)
+        said = plain(document) if given.json else known_pose.as_text(checked)
         console.print_result(said, indent=None)
         return False
 
@@ -357,7 +297,7 @@ def as_text(estimate: Estimate, published: list[str]) -> str:
 
 def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: list[str]) -> Any:
     answer, session = estimate.answer, estimate.answer.session
-    watched: WatchedMap | None = None
+    watched = None
     if session is not None:
         watched = {
             "database": robot.following.database.location,
@@ -366,7 +306,7 @@ def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: lis
             "floor": answer.label.floor,
             "digest": robot.sessions[session].digest,
         }
-    document: Watch = {
+    document = {
         "state": estimate.state,
         "status": answer.status,
         "stamp_ns": answer.stamp_ns,
@@ -381,7 +321,7 @@ def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: lis
         "published": published,
         **live(drive, estimate.elapsed_s),
     }
-    return plain(Watch, document)
+    return plain(document)
 
 
 @contextlib.contextmanager
@@ -481,7 +421,7 @@ def feed(
     poll()
 
 
-def live(drive: Followed, elapsed_s: float) -> Live:
+def live(drive: Followed, elapsed_s: float) -> Document:
     """Return how it is followed so far. elapsed_s : time that the estimate took."""
     return {
         "scans": drive.report().scans_read,

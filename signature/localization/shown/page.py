@@ -42,8 +42,7 @@ from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_edges, boundary_p
 from signature.config import SignatureConfig
 from signature.database import SessionInfo, SubmapDatabase, open_database
 from signature.freespace import PATH_BINS, freespace_nodes, freespace_seen, visibility_graph
-from signature.localization.answer import Answer
-from signature.localization.answer_json import QueryRecording
+from signature.localization.answer import Answer, QueryRecording, adapter
 from signature.localization.shown.picture import (
     FURNITURE,
     PALETTE,
@@ -311,7 +310,7 @@ def _bands(poses: Trajectory, precision: Precision | None) -> list[list[float]]:
 
 
 def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dict[str, Any]:
-    document = answer.to_json()
+    document, query = answer.to_json(), adapter(QueryRecording).dump_python(answer.about, mode="json")
     pose = document["pose"]
     compared = agreements(answer, database)
     # The wall points are the same for all hypotheses; only what the map says about them differs.
@@ -324,7 +323,7 @@ def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dic
         "confidence": round(answer.confidence, 4),
         "accept": answer.accept,
         "space": document["in_space"],
-        "query": {**answer.about, "is_map": answer.about["sensor"] == "map"},
+        "query": {**query, "is_map": answer.about.sensor == "map"},
         "walls": _short(np.ravel(walls_m), 2),
         "hypotheses": [
             {
