@@ -1,15 +1,25 @@
-"""The newest pose of the base in the map by the robot's own localization."""
+"""The pose of the base in the map by the robot's own localization: the newest on a topic, or in a file.
+
+Files are as nav2 takes a pose for /initialpose.
+"""
 
 from __future__ import annotations
 
+import dataclasses
+import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import yaml
 
-from pc2grid.errors import FrameError, NoScans, TopicError
+from pc2grid.errors import ConfigError, FrameError, NoScans, TopicError
 from pc2grid.geometry import F64, SE2, pose_from_xyz_quat
-from pc2grid.io import topics
+from pc2grid.io import export, topics
+from pc2grid.io.atomic import replace_file
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, PoseStamped, Seven, valid_pose
@@ -191,3 +201,60 @@ def _planar(pose: Seven) -> SE2:
 def _covariance(found: Odometry | PoseStamped) -> F64 | None:
     values = found.covariance if isinstance(found, PoseStamped) else None
     return None if values is None else np.asarray(np.reshape(values, (6, 6))[_PLANAR], np.float64)
+
+
+_MOST_BYTES = 1 << 20
+"""A file above this is no single message."""
+
+
+def write_initialpose(path: Path, stamp_ns: int, T_map_base: SE2, covariance: F64) -> None:
+    """Write a pose as JSON that `ros2 topic pub --once /initialpose` takes.
+
+    covariance : (3, 3) of x, y, yaw.
+    """
+    message = initialpose(stamp_ns, T_map_base, covariance)
+    with replace_file(path) as temporary:
+        temporary.write_text(json.dumps(message, indent=1) + "\n", encoding="utf-8")
+
+
+def initialpose(stamp_ns: int, T_map_base: SE2, covariance: F64, frame: str = "map") -> dict[str, Any]:
+    """Return geometry_msgs/PoseWithCovarianceStamped in plain types.
+
+    covariance : (3, 3) of x, y, yaw; of these the variances, see `pc2grid.io.export.initialpose`.
+    """
+    found = export.initialpose(stamp_ns, T_map_base, covariance, frame)
+    # What rosbags keeps beside the fields of a message are their types.
+    message = dataclasses.asdict(
+        found, dict_factory=lambda items: {k: v for k, v in items if k != "__msgtype__"}
+    )
+    message["pose"]["covariance"] = message["pose"]["covariance"].tolist()
+    return message
+
+
+def read_pose(path: Path) -> MapPose:
+    """Read a pose with covariance from a file: JSON as `write_initialpose` writes it, or YAML as `ros2 topic
+    echo` prints it.
+
+    Raises ConfigError if the file cannot be read or holds no such message.
+    """
+    advice = "`pc2grid relocalize --initialpose OUT.json` writes one; --near X Y RADIUS needs none"
+    try:
+        if path.stat().st_size > _MOST_BYTES:
+            raise ConfigError(f"{path}: larger than one message can be", hint=advice)
+        # `ros2 topic echo` ends each message with "---".
+        message: Any = next(iter(yaml.safe_load_all(path.read_text(encoding="utf-8"))), None)
+        stamp, whole = message["header"]["stamp"], message["pose"]
+        position, q = whole["pose"]["position"], whole["pose"]["orientation"]
+        yaw = math.atan2(2.0 * (q["w"] * q["z"] + q["x"] * q["y"]), 1.0 - 2.0 * (q["y"] ** 2 + q["z"] ** 2))
+        covariance = np.asarray(whole["covariance"], np.float64).reshape(6, 6)
+        return MapPose(
+            stamp_ns=int(stamp["sec"]) * 1_000_000_000 + int(stamp["nanosec"]),
+            T_map_base=SE2(float(position["x"]), float(position["y"]), yaw),
+            covariance=covariance[_PLANAR],
+        )
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}", hint=advice) from error
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
+        raise ConfigError(f"{path}: neither JSON nor YAML", hint=advice) from error
+    except (KeyError, TypeError, ValueError, IndexError) as error:
+        raise ConfigError(f"{path}: not a PoseWithCovarianceStamped message", hint=advice) from error

@@ -104,8 +104,8 @@ def test_the_keys_of_a_document_stay(name: str) -> None:
 @pytest.mark.parametrize(
     "kind",
     [
-        SE2, Consistency, Contradiction, OdometryCheck, OdometryOutlier, ReadReport, UncertainSegment, TopicInfo, ChosenTopics,
-        Info, SimulatedSession, Problem, QueryRecording, AmbiguousLine, Point,
+        SE2, Consistency, Contradiction, OdometryCheck, OdometryOutlier, ReadReport, UncertainSegment,
+        TopicInfo, ChosenTopics, Info, SimulatedSession, Problem, QueryRecording, AmbiguousLine, Point,
     ],
 )  # fmt: skip
 def test_frozen_types_are_printed_as_the_schema_says(kind: Any) -> None:

@@ -16,10 +16,11 @@ from mcap.writer import Writer
 from typer.testing import CliRunner
 
 from pc2grid.geometry import SE2
+from pc2grid.io.map_pose import initialpose, read_pose
 from pc2grid.io.maps import save_map
 from pc2grid_cli.console import Console
 from pc2grid_cli.documents import schema
-from pc2grid_cli.known_pose import as_text, initialpose, read_pose
+from pc2grid_cli.known_pose import as_text
 from pc2grid_cli.main import app
 from signature.localization.pose_check import CheckStatus, PoseCheck
 from tests.helpers.field import field_log

@@ -142,7 +142,7 @@ def _summary(precision: Precision | None) -> Document | None:
     if precision is None:
         return None
     return {
-        "median_m": float(statistics.median(precision.sigma_m or (0.0,))),
-        "worst_m": precision.worst_m,
+        "median_m": round(statistics.median(precision.sigma_m or (0.0,)), 3),
+        "worst_m": round(precision.worst_m, 3),
         "loose": list(precision.loose),
     }

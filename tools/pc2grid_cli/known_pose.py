@@ -1,30 +1,20 @@
 """What is known of the robot's pose beforehand (--near, --near-pose), and the check of a pose (--check,
 --check-topic).
-
-A pose is read from a file or a topic as nav2 and AMCL write it, and written as nav2 takes it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
-import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-import yaml
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, one_line
-from pc2grid.geometry import F64, SE2
+from pc2grid.geometry import SE2
 from pc2grid.io import Log, open_log
-from pc2grid.io import export as ros
-from pc2grid.io.atomic import replace_file
-from pc2grid.io.map_pose import MapPose
+from pc2grid.io.map_pose import read_pose
 from pc2grid.model import Health, RegisteredScan
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console, options
@@ -32,7 +22,6 @@ from pc2grid_cli.documents import Document
 from pc2grid_cli.options import KnownPose
 from signature.config import Config
 from signature.database import SubmapDatabase
-from signature.localization.answer import Answer
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, check_pose
 from signature.localization.posterior import Prior
@@ -104,62 +93,6 @@ def searched(given: options.Places) -> Iterator[tuple[SubmapDatabase, list[str]]
         for damage in left_out:
             console.warn(f"{opened.location}: damaged and left out: {damage}")
         yield opened, left_out
-
-
-_MOST_BYTES = 1 << 20
-"""A file above this is no single message."""
-
-
-def write_initialpose(path: Path, answer: Answer) -> None:
-    """Write the pose as JSON that `ros2 topic pub --once /initialpose` takes. The answer must be located."""
-    assert answer.T_map_base is not None
-    assert answer.covariance is not None
-    message = initialpose(answer.stamp_ns, answer.T_map_base, answer.covariance)
-    with replace_file(path) as temporary:
-        temporary.write_text(json.dumps(message, indent=1) + "\n", encoding="utf-8")
-
-
-def initialpose(stamp_ns: int, T_map_base: SE2, covariance: F64, frame: str = "map") -> dict[str, Any]:
-    """Return geometry_msgs/PoseWithCovarianceStamped in plain types.
-
-    covariance : (3, 3) of x, y, yaw; of these the variances, see `ros_messages.initialpose`.
-    """
-    found = ros.initialpose(stamp_ns, T_map_base, covariance, frame)
-    # What rosbags keeps beside the fields of a message are their types.
-    message = dataclasses.asdict(
-        found, dict_factory=lambda items: {k: v for k, v in items if k != "__msgtype__"}
-    )
-    message["pose"]["covariance"] = message["pose"]["covariance"].tolist()
-    return message
-
-
-def read_pose(path: Path) -> MapPose:
-    """Read a pose with covariance from a file: JSON as `write_initialpose` writes it, or YAML as `ros2 topic
-    echo` prints it.
-
-    Raises ConfigError if the file cannot be read or holds no such message.
-    """
-    advice = "`pc2grid relocalize --initialpose OUT.json` writes one; --near X Y RADIUS needs none"
-    try:
-        if path.stat().st_size > _MOST_BYTES:
-            raise ConfigError(f"{path}: larger than one message can be", hint=advice)
-        # `ros2 topic echo` ends each message with "---".
-        message: Any = next(iter(yaml.safe_load_all(path.read_text(encoding="utf-8"))), None)
-        stamp, whole = message["header"]["stamp"], message["pose"]
-        position, q = whole["pose"]["position"], whole["pose"]["orientation"]
-        yaw = math.atan2(2.0 * (q["w"] * q["z"] + q["x"] * q["y"]), 1.0 - 2.0 * (q["y"] ** 2 + q["z"] ** 2))
-        covariance = np.asarray(whole["covariance"], np.float64).reshape(6, 6)
-        return MapPose(
-            stamp_ns=int(stamp["sec"]) * 1_000_000_000 + int(stamp["nanosec"]),
-            T_map_base=SE2(float(position["x"]), float(position["y"]), yaw),
-            covariance=covariance[np.ix_((0, 1, 5), (0, 1, 5))],
-        )
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}", hint=advice) from error
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError) as error:
-        raise ConfigError(f"{path}: neither JSON nor YAML", hint=advice) from error
-    except (KeyError, TypeError, ValueError, IndexError) as error:
-        raise ConfigError(f"{path}: not a PoseWithCovarianceStamped message", hint=advice) from error
 
 
 def check_log(

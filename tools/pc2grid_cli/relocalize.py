@@ -22,6 +22,7 @@ from pc2grid.errors import ConfigError, LogError, NotALog, one_line
 from pc2grid.geometry import F64
 from pc2grid.io import open_log
 from pc2grid.io.atomic import replace_file
+from pc2grid.io.map_pose import write_initialpose
 from pc2grid.io.maps import is_map_file
 from pc2grid.io.trajectory import stamp_text, write_trajectory
 from pc2grid.mapping.drawn import is_drawn_map
@@ -308,8 +309,8 @@ def _write(
     """
     if "trajectory" in outputs and located is not None:
         write_trajectory(outputs["trajectory"], in_map(found.poses, stated) or located)
-    if "initialpose" in outputs:
-        known_pose.write_initialpose(outputs["initialpose"], stated)
+    if "initialpose" in outputs and stated.T_map_base is not None and stated.covariance is not None:
+        write_initialpose(outputs["initialpose"], stated.stamp_ns, stated.T_map_base, stated.covariance)
     if "output" in outputs and found.drawn is not None:
         write_located_map(outputs["output"], database, found, found.drawn, force)
     elif "output" in outputs and located is not None:
