@@ -1,4 +1,4 @@
-"""The commands of `pc2grid compare` as they are typed; see `pc2grid_cli.commands`."""
+"""The commands of `pc2grid compare` as they are typed; see `pc2grid_cli.options`."""
 
 from __future__ import annotations
 
