@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import doctest
 import functools
+import html
 import importlib
 import inspect
 import json
@@ -23,7 +24,7 @@ from types import ModuleType
 from typing import Any
 
 import cv2
-import matplotlib.pyplot
+import matplotlib
 import numpy as np
 import pytest
 import yaml
@@ -39,23 +40,21 @@ from pc2grid_cli import demo
 from pc2grid_cli.main import app
 from signature.localization.shown.picture import MISSED_LABEL, SUPPORT_LABELS
 from tests.helpers import doc_files
+from tests.helpers.browser import DESK, PHONE, Browser
 from tests.helpers.nav2_map import nav2_map
+from tests.helpers.shared_folders import shared_folder
 
 ROOT = Path(__file__).resolve().parent.parent
 FLAGS = doctest.NORMALIZE_WHITESPACE
 
 
-@pytest.fixture(scope="module")
-def furnished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("furnished")
-    doc_files.furnish(folder)
-    return folder
+furnished = shared_folder()(doc_files.furnish)
 
 
 @pytest.fixture
-def folder(furnished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(furnish: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The user's folder, and the working directory."""
-    monkeypatch.chdir(doc_files.copy(furnished, tmp_path))
+    monkeypatch.chdir(doc_files.copy(furnish, tmp_path))
     return tmp_path
 
 
@@ -576,3 +575,213 @@ def test_every_row_of_what_was_tried_names_a_test_that_exists() -> None:
         assert len(named) == 1, row
         (file, name), *_ = named
         assert re.search(rf"^def {name}\(", (ROOT / file).read_text("utf-8"), re.MULTILINE), row
+
+
+# --- The documentation site is built without a warning, and says what the program says ---
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("material", reason="needs the extra docs (mkdocs-material)")
+    pytest.importorskip("mkdocstrings", reason="needs the extra docs (mkdocstrings)")
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", folder],
+        cwd=ROOT, capture_output=True, text=True, check=False, env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert "WARNING" not in done.stderr, done.stderr
+    return folder
+
+
+def text_of(page: Path) -> str:
+    return html.unescape(re.sub(r"<[^>]+>", "", page.read_text("utf-8")))
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize("command", ["", "convert", "relocalize", "db merge", "compare sensors"])
+def test_commands_are_described_as_by_help(site: Path, command: str) -> None:
+    said = CliRunner().invoke(app, [*command.split(), "--help"], prog_name="pc2grid").stdout
+    page = f"commands/{command.replace(' ', '_')}" if command else "commands"
+    assert said.strip() in text_of(site / "reference" / f"{page}.html")
+
+
+@pytest.mark.nightly
+def test_every_setting_and_every_public_name_has_its_place(site: Path) -> None:
+    settings = text_of(site / "reference" / "settings.html")
+    assert "radius_m = 5.0" in settings and "[relocalize]" in settings
+    for package in (pc2grid, signature):
+        page = site / "reference" / f"{package.__name__}.html"
+        linked = dict(re.findall(r'<a href="([^"]*/(\w+)\.html)"><code>\2<', page.read_text("utf-8")))
+        places = {name: path for path, name in linked.items()}
+        for name in package.__all__:
+            thing = getattr(package, name)
+            if name[0] != "_":
+                own = (page.parent / places[name]).read_text("utf-8")
+                assert f'id="{thing.__module__}.{thing.__qualname__}"' in own, name
+
+
+@pytest.mark.nightly
+def test_docstrings_are_set_as_text_lists_and_code(site: Path) -> None:
+    scan, convert = (site / "reference" / "pc2grid" / f"{name}.html" for name in ("Scan", "convert"))
+    assert "stamp_ns: when the scan was taken" in text_of(scan) and "stamp_ns : when" not in text_of(scan)
+    assert ">>> monday = pc2grid.convert(" in text_of(convert)
+    raw = convert.read_text("utf-8")
+    assert "&gt;&gt;&gt; " not in re.sub(r"<pre.*?</pre>", "", raw, flags=re.DOTALL)
+
+
+def test_what_people_need_has_a_short_example() -> None:
+    """That it runs, test_docs.py shows."""
+    pytest.importorskip("mkdocs", reason="needs the extra docs (mkdocs-material)")
+    needed = runpy.run_path(str(ROOT / "tools" / "docs_site.py"))["NEEDED"]
+    assert len(needed) == 12
+    for name in needed:
+        text = inspect.getdoc(getattr(pc2grid, name)) or ""
+        assert 1 <= len(re.findall(r"^(?:>>>|\.\.\.)", text, re.MULTILINE)) <= 10, name
+
+
+@pytest.mark.nightly
+def test_what_people_need_is_on_the_first_page_of_the_reference(site: Path) -> None:
+    first = (site / "reference" / "pc2grid.html").read_text("utf-8").partition('id="all-others"')[0]
+    shown = {
+        "convert": "overwrite: ",
+        "relocalize": "pc2grid.relocalize(",
+        "Answer": "answer.plot()",
+        "Localizer": "Localizer(",
+    }
+    for name, words in shown.items():
+        assert f'href="pc2grid/{name}.html"' in first
+        assert words in text_of(site / "reference" / "pc2grid" / f"{name}.html")
+
+
+@pytest.mark.nightly
+def test_the_notebook_and_the_pictures_are_there(site: Path) -> None:
+    notebook = (site / "examples" / "from_log_to_answer.html").read_text("utf-8")
+    assert notebook.count("data:image/png;base64,") > 4 and "session lidar" in notebook
+    assert (site / "docs" / "signatures.png").is_file() and (site / "examples" / "demo.png").is_file()
+
+
+@pytest.mark.nightly
+def test_nothing_is_loaded_from_elsewhere(site: Path) -> None:
+    for page in site.rglob("*.html"):
+        tags = re.findall(r"<(?:script|link|img)\b[^>]*>", page.read_text("utf-8"))
+        assert [tag for tag in tags if re.search(r"(?:src|href)=\"?https?:", tag)] == [], page.name
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="chromium is not installed")
+def test_the_site_can_be_searched_without_a_server(site: Path, tmp_path: Path) -> None:
+    page = (site / "docs" / "method.html").read_text("utf-8")
+    typed = (
+        'addEventListener("load", () => setTimeout(() => {'
+        'const box = document.querySelector("[data-md-component=search-query]");'
+        'box.focus(); box.value = "MapClosures"; box.dispatchEvent(new Event("keyup")); }, 500));'
+    )
+    (site / "docs" / "searched.html").write_text(page.replace("</body>", f"<script>{typed}</script></body>"))
+    done = subprocess.run(
+        ["chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path}",
+         "--virtual-time-budget=20000", "--dump-dom", f"file://{site / 'docs' / 'searched.html'}"],
+        capture_output=True, text=True, check=True, timeout=120,
+    )  # fmt: skip
+    found = re.findall(r'<a href="([^"]*)" class="md-search-result__link"', done.stdout)
+    assert any("examples/comparisons.html" in link for link in found), found
+
+
+@pytest.mark.nightly
+@pytest.mark.parametrize(
+    "page", ["index", "examples/recordings", "reference/pc2grid", "reference/pc2grid/convert"]
+)
+def test_pages_can_be_read_in_light_in_dark_and_on_a_phone(site: Path, browser: Browser, page: str) -> None:
+    behind = []
+    for size, dark in ((DESK, False), (DESK, True), (PHONE, False)):
+        browser.show((site / f"{page}.html").as_uri(), size, dark=dark)
+        behind.append(browser.evaluate("getComputedStyle(document.body).backgroundColor"))
+        assert browser.evaluate("document.documentElement.scrollWidth") == size[0]
+        assert browser.complaints == []
+    assert behind[0] == behind[2] != behind[1]
+
+
+def test_every_page_is_in_the_navigation() -> None:
+    navigation = (ROOT / "mkdocs.yml").read_text("utf-8")
+    missing = [path.name for path in ROOT.glob("examples/*.md") if f"examples/{path.name}" not in navigation]
+    assert not missing, f"not in the nav of mkdocs.yml: {missing}"
+
+
+def test_how_to_cite() -> None:
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert citation["cff-version"] == "1.2.0"
+    assert {"message", "title", "authors"} <= citation.keys()  # what the format demands
+
+
+# --- The figures of README are those of the pages that they come from ---
+
+
+README = (ROOT / "README.md").read_text("utf-8")
+FLAT = " ".join(README.split())
+
+Row = dict[str, str]
+
+
+def tables(page: str) -> list[list[Row]]:
+    """The tables of a page: of each row the cells by their heads. An empty first cell repeats that above."""
+    found = []
+    text = README if page == "README.md" else (ROOT / "examples" / page).read_text("utf-8")
+    for block in re.findall(r"^\|.*(?:\n\|.*)+", text, re.MULTILINE):
+        lines = [line.strip()[1:-1].split("|") for line in block.splitlines()]
+        head, _, *body = [[cell.strip(" *") for cell in line] for line in lines]
+        rows: list[Row] = []
+        for cells in body:
+            first = cells[0] or (rows[-1][head[0]] if rows else "")
+            rows.append(dict(zip(head, [first, *cells[1:]], strict=False)))
+        found.append(rows)
+    return found
+
+
+def table(page: str, *head: str) -> list[Row]:
+    """The only table of a page that has these heads."""
+    (found,) = [rows for rows in tables(page) if rows and set(head) <= rows[0].keys()]
+    return found
+
+
+def test_the_table_of_real_sensors_is_that_of_the_page() -> None:
+    head = ("query by", "in a map by lidar")
+    assert table("README.md", *head) == table("real.md", *head)
+
+
+def test_elsewhere_is_what_the_page_counts() -> None:
+    (total,) = [
+        one
+        for one in table("real.md", "building", "elsewhere: wrong of asked")
+        if one["building"] == "all queries"
+    ]
+    wrong, _, asked, *_ = total["elsewhere: wrong of asked"].split()
+    verb = "was" if wrong == "1" else "were"
+    assert f"In the map of another building, {wrong} of {asked} queries {verb} located." in FLAT
+
+
+def test_robots_that_are_carried_away_are_those_of_the_page() -> None:
+    page = " ".join((ROOT / "examples" / "real.md").read_text("utf-8").split())
+    (found,) = re.findall(
+        r"Of (\d+) kidnaps of a robot that knew where it was, (\d+) are noticed, (\S+) s and (\S+) m after "
+        r"it was put down, in the median. In (\d+) of them the map shows what it sees there; it is located "
+        r"again (\d+) times, (\S+) s and (\S+) m after, in the median;.*? what it sees: (\d+) in (\d+) rows. "
+        r"Of (\d+) places that can be judged, (\d+) are wrong.",
+        page,
+    )
+    kidnaps, noticed, s, m, shown, again, again_s, again_m, alarms, rows, judged, wrong = found
+    said = (
+        f"Of {kidnaps} such robots, {noticed} noticed it, {s} s and {m} m after they were put down (median). "
+        f"At {shown} of the new places the map shows what the robot sees: {again} robots were located again, "
+        f"after {again_s} s and {again_m} m. There were {alarms} false alarms in {rows} drives, and of "
+        f"{judged} poses {wrong} were wrong."
+    )
+    assert said in FLAT
+
+
+MEASURED = ("comparisons", "paper", "real")
+
+
+@pytest.mark.parametrize("page", MEASURED)
+def test_a_page_of_figures_names_the_program_that_made_them(page: str) -> None:
+    head = "\n".join((ROOT / "examples" / f"{page}.md").read_text("utf-8").splitlines()[:8])
+    assert re.search(r"of commit [0-9a-f]{7}|\([0-9a-f]{7}\)", head)

@@ -3,7 +3,7 @@
 The containers of recordings are mutated in tests/pc2grid/io/test_fuzz.py, where checksums catch most of it.
 Here the container stays sound and its content is wrong, so that decoders behind the checksums are reached.
 Whatever is changed, the result is whole and possible, or a Pc2GridError; never another exception.
-PC2GRID_FUZZ is the number of mutations of each kind: at least 100, so that every outcome occurs.
+PC2GRID_FUZZ is the number of mutations of each kind; from 100 on, every outcome must occur.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from signature.database.maintenance import check, copy, store
 from tests.helpers import foxglove_messages as foxglove
 from tests.helpers.databases import digests_of, make_entry
 from tests.helpers.memory import bounded_memory
-from tests.helpers.mutations import MOST_BYTES, PARTS, mutated, patiently, put
+from tests.helpers.mutations import ENOUGH, MOST_BYTES, PARTS, ROUNDS, mutated, patiently, put
 from tests.helpers.recordings import STEP, T0, Message, drive, read, ros, write_mcap
 
 RECORDINGS = ["lidar", "lidar ros1", "laser", "depth", "foxglove protobuf", "foxglove json", "lidar timed"]
@@ -164,7 +164,7 @@ def test_fuzz_content_of_recordings(tmp_path: Path, kind: str, part: int) -> Non
             raise AssertionError(f"{kind}, mutation {number}: {error!r}") from error
         else:
             outcomes["read"] += 1
-    assert min(outcomes.values()) > 0, outcomes
+    assert min(outcomes.values()) > 0 or ROUNDS < ENOUGH, outcomes
 
 
 # --- databases ----------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_fuzz_databases(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: i
         except DatabaseError:
             assert path.read_bytes() == content
         assert set(tmp_path.iterdir()) <= {path, saved}
-    assert min(outcomes.values()) > 0, outcomes
+    assert min(outcomes.values()) > 0 or ROUNDS < ENOUGH, outcomes
 
 
 # --- maps ---------------------------------------------------------------------------------------------
@@ -258,4 +258,4 @@ def test_fuzz_maps(tmp_path: Path, image_format: str, part: int) -> None:
         assert loaded.resolution_m > 0
         assert np.isfinite([loaded.resolution_m, *loaded.origin_m]).all()
         outcomes["loaded"] += 1
-    assert min(outcomes.values()) > 0, outcomes
+    assert min(outcomes.values()) > 0 or ROUNDS < ENOUGH, outcomes

@@ -30,6 +30,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.config import Config
 from signature.sessions import add_sessions, build_session
 from tests.helpers.robot import Recorded
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import office
 
 PACKAGE = Path(__file__).resolve().parent.parent / "examples" / "ros2" / "pc2grid_ros"
@@ -210,16 +211,14 @@ def node_module(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     assert not [thread for thread in threading.enumerate() if thread.name == "pc2grid"]
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder()
+def folder(folder: Path) -> None:
     """plan.submaps of the office, and tuesday.mcap of a laser in it."""
-    folder = tmp_path_factory.mktemp("robot")
     save_map(office(), folder / "plan")
     built = build_session(folder / "plan.yaml", "plan", Config())
     add_sessions(folder / "plan.submaps", [built], Config(), keep=False)
     config = SimulationConfig(length_m=3.0, seed=7, clutter=0, start_m=(10.0, 7.0))
     simulate_session(folder / "tuesday.mcap", sensor="laser", grid=office(), config=config)
-    return folder
 
 
 def activated(module: Any, **given: Any) -> Any:

@@ -14,7 +14,9 @@ from numpy.typing import NDArray
 from tests.helpers.memory import Peak
 
 # Mutations of each kind of file (`make fuzz`: 20,000); in parts of at most 5000 for several processes.
-ROUNDS = int(os.environ.get("PC2GRID_FUZZ", "100"))
+ROUNDS = int(os.environ.get("PC2GRID_FUZZ", "10"))
+ENOUGH = 100
+"""So many show every outcome."""
 PARTS = -(-ROUNDS // 5000)
 
 # A round takes milliseconds; an endless loop or a huge allocation in a decoder takes far longer.

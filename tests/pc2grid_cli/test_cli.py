@@ -22,6 +22,7 @@ from pc2grid.model import OccupancyGrid
 from pc2grid_cli.console import Console
 from pc2grid_cli.main import app
 from tests.helpers.interruptible import interruptible
+from tests.helpers.shared_folders import shared_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -63,10 +64,9 @@ def python(code: str, *arguments: object, cwd: Path, **environment: str) -> subp
     )
 
 
-@pytest.fixture(scope="module")
-def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder()
+def house(folder: Path) -> None:
     """A folder with the map of a small house and a laser recording made in it."""
-    folder = tmp_path_factory.mktemp("house")
     cells = np.full((180, 240), 0, np.int8)
     cells[:3], cells[-3:], cells[:, :3], cells[:, -3:] = 100, 100, 100, 100
     cells[88:91, :100], cells[88:91, 120:], cells[:60, 150:153], cells[120:, 80:83] = 100, 100, 100, 100
@@ -75,7 +75,6 @@ def house(tmp_path_factory: pytest.TempPathFactory) -> Path:
     words = "simulate house.yaml drive.mcap --sensor laser --length 8 --seed 5 --clutter 0"
     made = pc2grid(*words.split(), cwd=folder)
     assert made.returncode == 0, made.stderr
-    return folder
 
 
 def assert_says(result: subprocess.CompletedProcess[str], code: int, *words: str) -> None:

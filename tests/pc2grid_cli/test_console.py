@@ -2,23 +2,36 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import re
+import select
+import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import pytest
 from rich.progress import Progress
+from typer.main import get_command
 
 import pc2grid
 from pc2grid.io.maps import save_map
 from pc2grid.observer import Observer, ProgressBars
-from pc2grid_cli import console, main
+from pc2grid_cli import console, demo, main
+from pc2grid_cli.console import Console
+from pc2grid_cli.output import show, table
+from pc2grid_cli.view import ViewServer
+from pc2grid_lab import sensors
+from pc2grid_lab.paper import scale
 from tests.helpers.interruptible import interruptible
+from tests.helpers.rooms import grid_of, rectangle
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import office
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -277,3 +290,150 @@ def command():
     )
     assert done.returncode == code, done.stderr
     assert "Exception ignored" not in done.stderr
+
+
+# --- Tables of all commands look alike, and nothing in them is cut off ---
+
+
+def test_a_narrow_terminal_cuts_nothing_off(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "40")
+    made = table("wide", ["map"], [f"number {k}" for k in range(30)])
+    made.add_row("lidar", *(f"{k}.000" for k in range(30)))
+    show(made)
+    out = capsys.readouterr().out
+    assert "…" not in out
+    assert all(f"number {k}" in out and f"{k}.000" in out for k in range(30))
+
+
+# --- Standard output is the result of a command: the same bytes whether somebody watches the progress or
+# not ---
+
+
+COMMANDS = (
+    "info drive.mcap",
+    "info office.yaml --json",
+    "convert drive.mcap -o out.submaps",
+    "convert drive.mcap office.yaml -o out.submaps --jobs 2",
+    "convert office.yaml part.yaml -o out.submaps --join --json",
+    "relocalize drive.mcap -d b.submaps",
+    "relocalize drive.mcap -d b.submaps --check 99 99 0 --json",
+    "relocalize drive.mcap -d b.submaps --every 0.5",
+    "relocalize drive.mcap -d b.submaps --every 0.5 --json",
+    "relocalize drive.mcap office.yaml -d b.submaps --json",
+    "watch drive.mcap -d b.submaps",
+    "watch drive.mcap -d b.submaps --json",
+    "export two.submaps --session part --map out --json",
+    "simulate office.yaml out.mcap --sensor laser --length 0.5 --clutter 0",
+    "db info two.submaps",
+    "db check b.submaps",
+    "db join two.submaps",
+    "db merge b.submaps -o out.submaps",
+    "db copy b.submaps -o out.submaps",
+    "db split two.submaps part -o out.submaps",
+    "db rename b.submaps office plan",
+    "db remove two.submaps part",
+    "view b.submaps --port 0 --no-browser",
+    "config dump",
+    "config schema relocalize",
+)
+MEASURING = {
+    "demo": b"page to look into it: demo_out/report.html",
+    "compare paper --maps room.yaml --queries 1 --methods proposed --jobs 1": b"Table III",
+    "compare sensors office.yaml --queries 1 --map-length 3 --travel 1 --clutter 0 --rate 2 --jobs 1": (
+        b"matrix.json"
+    ),
+    "compare peers drive.mcap --of-base --queries 1 --travel 1": b"peers.json",
+    "compare scale --maps . --queries 1 --jobs 1": b"scale.png",
+    "compare recordings own": b"drive.mcap",
+}
+"""Print how long it took, so their bytes differ from run to run; with some of these bytes."""
+_NIGHTLY = [command for command in MEASURING if {"paper", "scale", "recordings"} & {*command.split()}]
+
+
+@shared_folder("metre_folder")
+def folder(folder: Path) -> None:
+    """Also a small room, and a folder with the recording alone."""
+    save_map(grid_of(rectangle(8.0, 5.0)), folder / "room")
+    (folder / "own").mkdir()
+    shutil.copy(folder / "drive.mcap", folder / "own")
+
+
+@contextlib.contextmanager
+def terminal() -> Iterator[TextIO]:
+    """A terminal that somebody looks at."""
+    ours, theirs = pty.openpty()
+
+    over = threading.Event()
+
+    def look() -> None:
+        while not over.is_set():
+            if select.select([ours], [], [], 0.05)[0]:
+                os.read(ours, 65536)
+
+    looker = threading.Thread(target=look)
+    looker.start()
+    with os.fdopen(theirs, "w") as stream:
+        yield stream
+        over.set()
+        looker.join()
+    os.close(ours)
+
+
+def stdout_of(command: str, stderr: TextIO, folder: Path) -> bytes:
+    """What the program writes to a file as its stdout, run in this process in a copy of a folder."""
+    with pytest.MonkeyPatch.context() as patch, (folder.parent / f"{folder.name}.out").open("w+b") as out:
+        patch.chdir(folder)
+        patch.setattr("sys.stderr", stderr)
+        patch.setattr("sys.stdout", open(out.fileno(), "w", closefd=False))  # noqa: SIM115
+        console = Console()
+        code = console.run(
+            lambda: main.app(command.split(), prog_name="pc2grid", standalone_mode=False, obj=console)
+        )
+        assert code in (0, 4)
+        out.seek(0)
+        return out.read()
+
+
+@pytest.fixture
+def work(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the folder; there, commands do not take long, and tell no times."""
+    for name, value in {"TERM": "xterm-256color", "COLUMNS": "60", "PC2GRID_CONFIG": ""}.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.delenv("NO_COLOR", raising=False)
+    monkeypatch.setattr(time, "perf_counter", lambda: 0.0)
+    monkeypatch.setattr(demo, "MAP_LENGTH_M", 2.0)
+    monkeypatch.setattr(demo, "QUERY_LENGTH_M", 1.0)
+    monkeypatch.setattr(ViewServer, "serve_forever", lambda server: None)
+    monkeypatch.setattr(ViewServer, "url", "http://localhost/")
+    monkeypatch.setattr(scale, "FLOORS", 0)
+    monkeypatch.setattr(sensors, "SENSORS", ("laser",))
+    return shutil.copytree(folder, tmp_path / "work")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_terminal_changes_nothing(command: str, work: Path, tmp_path: Path) -> None:
+    again = shutil.copytree(work, tmp_path / "again")
+    with terminal() as stderr:
+        seen = stdout_of(command, stderr, work)
+    with (tmp_path / "err").open("w") as stderr:
+        assert seen == stdout_of(command, stderr, again) != b""
+
+
+@pytest.mark.parametrize(
+    "command", [pytest.param(c, marks=[pytest.mark.nightly] if c in _NIGHTLY else []) for c in MEASURING]
+)
+def test_a_terminal_takes_nothing_away(command: str, work: Path) -> None:
+    with terminal() as stderr:
+        assert MEASURING[command] in stdout_of(command, stderr, work)
+
+
+def test_no_command_is_left_out() -> None:
+    app = get_command(main.app)
+    groups = {name: getattr(command, "commands", {}) for name, command in app.commands.items()}
+    names = {" ".join((name, *inner)) for name, of in groups.items() for inner in ([n] for n in of or [""])}
+    tried = [command.split() for command in (*COMMANDS, *MEASURING)]
+    assert {name.strip() for name in names} == {
+        " ".join(words[: 1 + bool(groups[words[0]])]) for words in tried
+    }

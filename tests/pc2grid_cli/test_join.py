@@ -18,6 +18,7 @@ from pc2grid.io.maps import save_map
 from pc2grid.io.trajectory import read_tum
 from pc2grid_cli.main import app
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
+from tests.helpers.shared_folders import shared_folder
 
 
 def run(command: str, code: int = 0) -> str:
@@ -30,17 +31,15 @@ def document(command: str, code: int = 0) -> Any:
     return json.loads(run(f"{command} --json", code))
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder()
+def folder(folder: Path) -> None:
     """west.yaml, east.yaml, both in b.submaps; joined.submaps, the same joined; drive.mcap in the east."""
-    folder = tmp_path_factory.mktemp("join")
     save_map(part(WEST), folder / "west")
     save_map(in_frame(part(EAST), T_OFFICE_EAST), folder / "east")
     run(f"convert {folder}/west.yaml {folder}/east.yaml -o {folder}/b.submaps")
     shutil.copy(folder / "b.submaps", folder / "joined.submaps")
     run(f"db join {folder}/joined.submaps")
     run(f"simulate {folder}/east.yaml {folder}/drive.mcap --sensor laser --length 3 --seed 1 --clutter 0")
-    return folder
 
 
 @pytest.fixture(autouse=True)

@@ -39,23 +39,17 @@ from signature.config import Config
 from signature.database import Problem
 from signature.localization.answer import AmbiguousLine, Point, QueryRecording, adapter
 from tests.helpers.json_schema import closed, keys
+from tests.helpers.shared_folders import shared_folder
 
 
-@pytest.fixture(scope="module")
-def folder(office_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The office, with a laser's metre, databases of the whole and of a part, and one that is damaged."""
-    folder = shutil.copytree(office_folder, tmp_path_factory.mktemp("documents"), dirs_exist_ok=True)
-    laser = ("--sensor", "laser", "--length", "1.5", "--seed", "4", "--clutter", "0", "--force")
-    for arguments in (
-        ("simulate", folder / "office.yaml", folder / "drive.mcap", *laser),
-        ("convert", folder / "office.yaml", folder / "part.yaml", "-o", folder / "two.submaps"),
-        ("convert", folder / "office.yaml", folder / "part.yaml", "-o", folder / "joined.submaps", "--join"),
-    ):
-        assert CliRunner().invoke(app, [*map(str, arguments)], catch_exceptions=False).exit_code == 0
+@shared_folder("metre_folder")
+def folder(folder: Path) -> None:
+    """Also a database of joined sessions, and one that is damaged."""
+    join = f"convert {folder}/office.yaml {folder}/part.yaml -o {folder}/joined.submaps --join"
+    assert CliRunner().invoke(app, join.split(), catch_exceptions=False).exit_code == 0
     data = bytearray((folder / "b.submaps").read_bytes())
     data[len(data) // 2] ^= 1
     (folder / "damaged.submaps").write_bytes(data)
-    return folder
 
 
 COMMANDS = [

@@ -27,6 +27,7 @@ from tests.helpers.field import field_log
 from tests.helpers.json_schema import closed
 from tests.helpers.recordings import ros
 from tests.helpers.rooms import RESOLUTION_M
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import plan
 
 BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
@@ -42,23 +43,20 @@ def quaternion(yaw_rad: float) -> tuple[float, float]:
     return math.sin(yaw_rad / 2), math.cos(yaw_rad / 2)
 
 
-@pytest.fixture(scope="module")
-def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SE2]:
+@shared_folder()
+def twins(folder: Path) -> None:
     """twins.submaps: two rooms that are alike; drive.mcap, a laser in the left one, with what its
-    localization believed on /initialpose (right, at the start) and /amcl_pose (wrong, at the end). And the
-    true pose at the end."""
-    folder = tmp_path_factory.mktemp("rooms")
+    localization believed on /initialpose (right, at the start) and /amcl_pose (wrong, at the end)."""
     save_map(TWINS, folder / "twins")
     save_map(LEFT_ROOM, folder / "left")
     assert pc2grid("convert", folder / "twins.yaml", "-o", folder / "twins.submaps").exit_code == 0
     laser = ("--sensor", "laser", "--length", 4, "--seed", 3, "--clutter", 0)
     assert pc2grid("simulate", folder / "left.yaml", folder / "plain.mcap", *laser).exit_code == 0
-    poses = np.loadtxt(folder / "plain.tum")
-    first, last = (SE2(p[1], p[2], 2.0 * math.atan2(p[6], p[7])) for p in (poses[0], poses[-1]))
+    (start_ns, first), *_, (end_ns, last) = true_poses(folder)
     covariance = np.diag([0.25, 0.25, 0, 0, 0, 0.07])
     believed = [
-        ("/initialpose", round(poses[0][0] * 1e9), first),
-        ("/amcl_pose", round(poses[-1][0] * 1e9), last @ SE2(0.8, 0.0, 0.0)),
+        ("/initialpose", start_ns, first),
+        ("/amcl_pose", end_ns, last @ SE2(0.8, 0.0, 0.0)),
     ]
     with (folder / "plain.mcap").open("rb") as source, (folder / "drive.mcap").open("wb") as target:
         writer = Writer(target)
@@ -85,7 +83,18 @@ def rooms(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, SE2]:
             data = ros().message(topic, stamp_ns, make(kind, ros().header(stamp_ns, "map"), full)).data
             writer.add_message(writer.register_channel(topic, "cdr", number), stamp_ns, data, stamp_ns)
         writer.finish()
-    return folder, last
+
+
+def true_poses(folder: Path) -> list[tuple[int, SE2]]:
+    """Stamp and pose of each scan of drive.mcap."""
+    rows = np.loadtxt(folder / "plain.tum")
+    return [(round(p[0] * 1e9), SE2(p[1], p[2], 2.0 * math.atan2(p[6], p[7]))) for p in rows]
+
+
+@pytest.fixture
+def rooms(twins: Path) -> tuple[Path, SE2]:
+    """The folder, and the true pose at the end of drive.mcap."""
+    return twins, true_poses(twins)[-1][1]
 
 
 def relocalize(folder: Path, *words: object) -> Result:

@@ -16,11 +16,11 @@ from pc2grid.errors import ConfigError
 from pc2grid.io.export import write_cloud
 from pc2grid.io.maps import load_map, save_map
 from pc2grid.model import THING, OccupancyGrid
-from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from signature.database import open_database
 from tests.helpers.building_clouds import room_cloud
 from tests.helpers.nav2_map import AMCL, RVIZ, STATIC_LAYER, as_mapped, known_at, nav2_map, valid_for_nav2
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import cut, office
 
 BLACK, WHITE, NEITHER = (0, 0, 0), (255, 255, 255), (112, 137, 134)
@@ -34,17 +34,13 @@ TOLD = {
 }
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """b.submaps of the office with a table, mapped with doubt; a part of it; a laser's drive there."""
-    folder = tmp_path_factory.mktemp("told")
+@shared_folder("office_folder")
+def folder(folder: Path) -> None:
+    """b.submaps of the office with a table, mapped with doubt, and a part of it."""
     plan = as_mapped(office())
     save_map(plan, folder / "office", mode="raw")
     save_map(cut(plan, 8.0, 8.0, 14.5, 14.0), folder / "part", mode="raw")
-    run("convert", folder / "office.yaml", "-o", folder / "b.submaps")
-    drive = SimulationConfig(length_m=8.0, seed=4, clutter=0)
-    simulate_session(folder / "drive.mcap", sensor="laser", grid=office(), config=drive)
-    return folder
+    run("convert", folder / "office.yaml", "-o", folder / "b.submaps", "--force")
 
 
 def run(*words: object) -> str:

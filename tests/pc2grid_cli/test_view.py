@@ -10,7 +10,6 @@ import os
 import queue
 import random
 import re
-import shutil
 import signal
 import socket
 import subprocess
@@ -37,19 +36,18 @@ from signature.database import open_database
 from tests.helpers.browser import DESK, PHONE, Browser
 from tests.helpers.interruptible import interruptible
 from tests.helpers.rooms import RESOLUTION_M
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import office
 
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="module")
-def desk(office_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder("office_folder")
+def desk(folder: Path) -> None:
     """office.submaps, and drive.mcap, a laser's 3 m in the office."""
-    folder = tmp_path_factory.mktemp("view")
-    shutil.copy(office_folder / "b.submaps", folder / "office.submaps")
+    (folder / "b.submaps").rename(folder / "office.submaps")
     config = SimulationConfig(length_m=3.0, seed=4, clutter=0)
-    simulate_session(folder / "drive.mcap", sensor="laser", grid=office(), config=config)
-    return folder
+    simulate_session(folder / "drive.mcap", sensor="laser", grid=office(), config=config, overwrite=True)
 
 
 class Served:

@@ -27,21 +27,20 @@ from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
 from tests.helpers.nav2_map import as_mapped, valid_for_nav2
 from tests.helpers.robot import LONG_S, Recorded, Robot
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import office
 
 START_M = (10.0, 7.0)
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder()
+def folder(folder: Path) -> None:
     """plan.submaps of the office, and tuesday.mcap of a laser that drives 3 m in it."""
-    folder = tmp_path_factory.mktemp("watch")
     save_map(as_mapped(office()), folder / "plan", mode="raw")
     arguments = ["convert", str(folder / "plan.yaml"), "-o", str(folder / "plan.submaps")]
     assert CliRunner().invoke(app, arguments, catch_exceptions=False).exit_code == 0
     config = SimulationConfig(length_m=3.0, seed=7, clutter=0, start_m=START_M)
     simulate_session(folder / "tuesday.mcap", sensor="laser", grid=office(), config=config)
-    return folder
 
 
 @pytest.fixture

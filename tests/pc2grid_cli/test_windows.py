@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import shutil
 import signal
 import subprocess
 import sys
@@ -31,18 +30,17 @@ from signature.localization.map_index import MapIndex
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
 from tests.helpers.session_maps import way
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import office
 
 
-@pytest.fixture(scope="module")
-def folder(office_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder("office_folder")
+def folder(folder: Path) -> None:
     """The office, and a.mcap and b.mcap of a laser that drives in it."""
-    folder = shutil.copytree(office_folder, tmp_path_factory.mktemp("windows"), dirs_exist_ok=True)
     for name, seed in (("a", 3), ("b", 5)):
         config = SimulationConfig(length_m=4.0, seed=seed, clutter=0)
         simulate_session(folder / f"{name}.mcap", sensor="laser", grid=office(), config=config)
     (folder / "text.mcap").write_text("no recording")
-    return folder
 
 
 def run(*words: object, code: int = 0) -> Result:

@@ -30,22 +30,21 @@ from signature.database import maintenance, open_database
 from signature.sessions import build_sessions
 from tests.helpers import postgresql
 from tests.helpers.interruptible import interruptible
+from tests.helpers.shared_folders import shared_folder
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 NAMES = ("kitchen", "hall", "cellar", "attic")
 
 
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder()
+def folder(folder: Path) -> None:
     """Maps of a few rooms, and a file that is not a map."""
-    folder = tmp_path_factory.mktemp("rooms")
     for number, name in enumerate(NAMES):
         cells = np.zeros((70, 80 + 10 * number), np.int8)
         cells[:3], cells[-3:], cells[:, :3], cells[:, -3:] = 100, 100, 100, 100
         cells[30:33, : 20 + 10 * number] = 100
         save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), folder / name)
     (folder / "ruin.yaml").write_text("resolution: 0.05\norigin: [0, 0, 0]\n")
-    return folder
 
 
 @pytest.fixture(scope="module")

@@ -20,6 +20,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from signature.config import Config
 from signature.database import Label, open_database
 from signature.sessions import convert, query_config, relocalize
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import cut, office
 
 
@@ -28,15 +29,13 @@ def names(path: Path) -> list[str]:
         return [session.name for session in database.sessions()]
 
 
-@pytest.fixture(scope="module")
-def building(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder()
+def building(folder: Path) -> None:
     """The folder of an office plan, a part of it, and the database of the plan."""
-    folder = tmp_path_factory.mktemp("building")
     save_map(office(), folder / "plan")
     save_map(cut(office(), 4.0, 3.0, 15.0, 12.0), folder / "part")
     made = convert(folder / "plan.yaml", folder / "plan.submaps", label=Label(floor="2"))
     assert (made.session, made.sensor) == ("plan", "map") and len(made.submaps) > 10
-    return folder
 
 
 def test_a_map_is_found_in_a_map(building: Path) -> None:

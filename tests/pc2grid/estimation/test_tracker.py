@@ -1,8 +1,11 @@
 """Following a robot: pose, health, and what it costs to be wrong."""
 
+from __future__ import annotations
+
 import dataclasses
 import itertools
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,13 +15,13 @@ from pc2grid.clouds.cloud import deskew, random_subset
 from pc2grid.estimation.planar import MatchingMaps
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.spatial import begin
-from pc2grid.estimation.tracker import Tracker
+from pc2grid.estimation.tracker import Disagreement, Standstill, Tracker, check_odometry
 from pc2grid.geometry import SE2, invert_pose, motion_size, transform_points, wrap_angle
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.model import Health, Scan
-from pc2grid.settings import ProjectionConfig, RegistrationConfig
-from pc2grid.simulate import SimulationConfig, iter_session
+from pc2grid.model import Health, OdometryCheck, OdometryOutlier, Scan
+from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
+from pc2grid.simulate import SimulationConfig, iter_session, prepare_session
 from pc2grid.simulate.config import LidarConfig, OdometryConfig
 
 HALL = Path(
@@ -64,7 +67,7 @@ def carried_at_2_hz(turn_rad):
 
     It turns left, right or not at all by so much from scan to scan.
     """
-    config = SimulationConfig(length_m=12.0, seed=4, lidar=LidarConfig(beams=64, elevation_deg=35.0))
+    config = SimulationConfig(length_m=6.0, seed=4, lidar=LidarConfig(beams=64, elevation_deg=35.0))
     rng, yaw_rad, chosen, last = np.random.default_rng(2), 0.0, [], None
     for scan, pose in iter_session(sensor="lidar", config=config):
         if last is not None and np.hypot(pose.x - last.x, pose.y - last.y) < 0.7:
@@ -538,3 +541,99 @@ def test_all_walls_that_change_in_a_standstill_begin_a_new_part(laser, cabin_s):
 def test_what_passes_a_standing_robot_begins_no_new_part(laser, see):
     scans = [scan for scan, _ in laser]
     assert walls_changed(chained(scans[:40], standing(scans[40], 6.0, see), scans[41:])) == []
+
+
+# --- Health says where the scans overruled odometry ---
+
+
+SLIGHT, LARGE, LARGER = (
+    Disagreement(0.02, 0.01, False),
+    Disagreement(0.3, 0.1, True),
+    Disagreement(0.2, 0.7, True),
+)
+
+
+def test_scans_that_follow_closely_are_one_stretch() -> None:
+    stamps_ns = [k * 5 * 10**8 for k in range(8)]
+    found = check_odometry(stamps_ns, [None, SLIGHT, LARGE, SLIGHT, LARGER, None, None, LARGE])
+    assert found == OdometryCheck(
+        compared=5,
+        overruled=3,
+        stretches=(
+            OdometryOutlier(from_ns=10**9, to_ns=2 * 10**9, distance_m=0.3, turn_rad=0.7),
+            OdometryOutlier(from_ns=35 * 10**8, to_ns=35 * 10**8, distance_m=0.3, turn_rad=0.1),
+        ),
+    )
+    assert check_odometry([], []) == OdometryCheck()
+
+
+@pytest.fixture(scope="module")
+def scans() -> list[Scan]:
+    session = prepare_session(sensor="laser", config=SimulationConfig(length_m=6.0, seed=3, clutter=10))
+    return [scan for scan, _ in session.scans()]
+
+
+def checked(scans: list[Scan]) -> tuple[OdometryCheck, list[Health]]:
+    tracker = Tracker(Config().registration, in_hand=False)
+    tracked = [tracker.track(scan) for scan in scans]
+    check = check_odometry([scan.stamp_ns for scan in scans], [t.disagreement for t in tracked])
+    return check, [t.registered.health for t in tracked]
+
+
+def test_odometry_that_is_merely_inexact_is_not_overruled(scans: list[Scan]) -> None:
+    check, _ = checked(scans)
+    assert check.compared == len(scans) - 1 and check.overruled == 0
+
+
+def test_odometry_that_stalls_and_catches_up_in_one_step_is_overruled_there(scans: list[Scan]) -> None:
+    """As that of a real robot did: four scans without a motion, then half a turn at once."""
+    odometry = [SE2.from_matrix(scan.T_odom_base) for scan in scans if scan.T_odom_base is not None]
+    size = [
+        np.hypot(step.x, step.y) + abs(step.yaw)
+        for a, b in zip(odometry, odometry[4:], strict=False)
+        for step in [a.inverse() @ b]
+    ]
+    first = int(np.argmax(size)) + 1
+    stalled = [
+        replace(scan, T_odom_base=scans[first - 1].T_odom_base) if first <= k < first + 3 else scan
+        for k, scan in enumerate(scans)
+    ]
+    check, health = checked(stalled)
+    assert 1 <= check.overruled <= 5 and len(check.stretches) == 1
+    (stretch,) = check.stretches
+    assert scans[first].stamp_ns <= stretch.from_ns <= stretch.to_ns <= scans[first + 3].stamp_ns
+    assert Health.LOST not in health
+
+
+def test_without_odometry_there_is_nothing_to_overrule(scans: list[Scan]) -> None:
+    check, _ = checked([replace(scan, T_odom_base=None) for scan in scans[:30]])
+    assert check == OdometryCheck()
+
+
+# --- Walls that change for good while the base stands, and those that only seem to ---
+
+
+def at(second: float, x_m: float) -> Scan:
+    pose = np.eye(4)
+    pose[0, 3] = x_m
+    return Scan(
+        stamp_ns=int(second * 1e9),
+        points_m=np.zeros((1, 3), np.float32),
+        T_base_sensor=np.eye(4),
+        sensor="laser",
+        T_odom_base=pose,
+    )
+
+
+@pytest.mark.parametrize(
+    ("fits_before", "left"),
+    [
+        (True, True),
+        (False, False),  # a robot that stands from the start, and of which no scan ever fitted well
+    ],
+)
+def test_walls_have_changed_only_where_they_were_known(fits_before: bool, left: bool) -> None:
+    standstill = Standstill()
+    assert not standstill.left(at(0.0, 0.0), sure=fits_before)
+    assert not any(standstill.left(at(0.1 * k, 0.0), sure=False) for k in range(1, 60))
+    assert standstill.left(at(6.0, 0.3), sure=False) == left

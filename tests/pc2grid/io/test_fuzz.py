@@ -9,7 +9,7 @@ with the time and memory of a small file. What cannot be noticed:
   section. Whole chunks can be missing without a trace in a file that was not closed; the warning that the
   recorder was killed stands for that.
 
-PC2GRID_FUZZ is the number of mutations of each kind: at least 100, so that every outcome occurs.
+PC2GRID_FUZZ is the number of mutations of each kind; from 100 on, every outcome must occur.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pc2grid.io.trajectory import write_tum
 from pc2grid.model import ReadReport, Scan
 from tests.helpers.cloud_folders import POINTS, trajectory, write_cloud
 from tests.helpers.memory import bounded_memory
-from tests.helpers.mutations import MOST_BYTES, PARTS, mutated, patiently, put
+from tests.helpers.mutations import ENOUGH, MOST_BYTES, PARTS, ROUNDS, mutated, patiently, put
 from tests.helpers.recordings import (
     STEP,
     T0,
@@ -159,7 +159,7 @@ def test_fuzz_recordings(tmp_path: Path, kind: str, part: int) -> None:
                 assert news(report, usual) or len(found) == len(clean), f"{what}: silent"
         if len(files) > 1:
             put(files[victim], whole[victim])
-    assert outcomes["clean"] and outcomes["refused"], outcomes
+    assert (outcomes["clean"] and outcomes["refused"]) or ROUNDS < ENOUGH, outcomes
 
 
 def test_fuzz_leaves_something_to_find() -> None:

@@ -1,10 +1,17 @@
-"""Rare cases in recordings: every number type, limits met exactly, and the words of refusals."""
+"""What is read is refused by name, and before anything is allocated for what it only claims to hold.
+
+Each row is a number of the catalogue (tests/test_faults_catalogue.py), an error, words of its message, what
+is done with an empty folder, and how much memory that may take.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 import json
+import math
+import os
 import struct
+import zlib
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,241 +19,381 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import (
-    DatabaseError,
-    LogCorrupt,
+    ConfigError,
+    LimitExceeded,
+    LogNotFound,
+    MapFileError,
+    NotALog,
+    Pc2GridError,
     PointCloudError,
+    TrajectoryFileError,
     UnsupportedSchema,
 )
 from pc2grid.io import open_log
-from pc2grid.io.messages import foxglove
-from pc2grid.io.messages import ros as ros_messages
-from pc2grid.io.messages.clouds import parser
-from pc2grid.io.messages.types import Header, PointCloud2
-from pc2grid.io.source import TopicInfo, guarded, guarded_stream
+from pc2grid.io.maps import load_map
+from pc2grid.io.messages import clouds, foxglove
+from pc2grid.io.messages.ros import decoder_for
+from pc2grid.io.messages.types import Header, LaserScan
+from pc2grid.io.sensors import decode
+from pc2grid.io.sensors.depth import MAGIC
+from pc2grid.io.source import TopicInfo
+from pc2grid.io.trajectory import read_tum
 from pc2grid.settings import ReadConfig
+from tests.helpers import foxglove_messages
 from tests.helpers.cloud_folders import folder_of
-from tests.helpers.recordings import T0
+from tests.helpers.memory import peak_memory
+from tests.helpers.recordings import T0, Message, drive, raw_log, read, ros, write_bag, write_mcap
 
-HEADER = Header(T0, "lidar")
-NUMPY = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
-
-
-def values_of(cloud: PointCloud2) -> dict[str, np.ndarray]:
-    """Each field (points, count), read by nothing but its description."""
-    found = {}
-    order = ">" if cloud.is_bigendian else "<"
-    raw = np.frombuffer(bytes(cloud.data), np.uint8)[: cloud.width * cloud.point_step]
-    table = raw.reshape(cloud.width, cloud.point_step)
-    for name, offset, datatype, count in cloud.fields:
-        kind = np.dtype(order + NUMPY[datatype])
-        part = np.ascontiguousarray(table[:, offset : offset + count * kind.itemsize])
-        found[name] = part.view(kind)
-    return found
+INFO, DEPTH = "/camera/depth/camera_info", "/camera/depth/image_raw"
+CLOUD = "sensor_msgs/PointCloud2"
+Act = Callable[[Path], object]
+ROWS: list[Any] = []
 
 
-# --- every type of number -----------------------------------------------------------------------------
+def refused(number: int, error: type[Pc2GridError], words: str, act: Act, most_mib: int = 64) -> None:
+    """Add a row to the table."""
+    name, mark = f"{number} {len(ROWS)} {words[:40]}", pytest.mark.fault(number)
+    ROWS.append(pytest.param(error, words, act, most_mib, marks=mark, id=name))
 
 
-def columns(types: list[str], counts: list[int]) -> list[np.ndarray]:
-    """Four points whose numbers fill their type."""
-    rng = np.random.default_rng(3)
-    made = []
-    for kind, count in zip(types, counts, strict=True):
-        if kind[0] == "f":
-            made.append(rng.normal(size=(4, count)).astype(kind))
-        else:
-            low, high = np.iinfo(kind).min, np.iinfo(kind).max
-            made.append(rng.integers(low, high, (4, count), dtype=kind, endpoint=True))
-    return made
+# --- files --------------------------------------------------------------------------------------------
 
 
-PCD_TYPES = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "i8", "u8"]
-PCD_COUNTS = [1, 3, 2, 1, 4, 1, 2, 1, 1, 2]
+def opened(head: bytes) -> Act:
+    def act(folder: Path) -> None:
+        (folder / "a.mcap").write_bytes(head)
+        open_log(folder / "a.mcap")
+
+    return act
 
 
-def pcd(kind: str, made: list[np.ndarray]) -> bytes:
-    names = [f"n{i}" for i in range(len(made))]
-    lines = [
-        "# .PCD v.7",
-        "",
-        "FIELDS " + " ".join(names),
-        "SIZE " + " ".join(str(m.dtype.itemsize) for m in made),
-        "TYPE " + " ".join(m.dtype.kind.upper() for m in made),
-        "COUNT " + " ".join(str(m.shape[1]) for m in made),
-        "WIDTH 2",
-        "HEIGHT 2",
-        f"DATA {kind}",
-    ]
-    head = ("\n".join(lines) + "\n").encode()
-    if kind == "ascii":
-        rows = (" ".join(repr(v.item()) for m in made for v in m[i]) for i in range(4))
-        return head + "\n".join(rows).encode() + b"\n"
-    return head + b"".join(m[i].tobytes() for i in range(4) for m in made)
+for _head, _words in (
+    (b"\xff\xfe\xfd" * 30, "binary data of another kind"),
+    (b"\x1f\x8b" + bytes(90), "a gzip archive.*unpack it first"),
+    (b"PK\x03\x04" + bytes(90), "a zip archive.*unpack it first"),
+    (b"\x28\xb5\x2f\xfd" + bytes(90), "a zstd-compressed file.*unpack it first"),
+    (b"\x04\x22\x4d\x18" + bytes(90), "an lz4-compressed file.*unpack it first"),
+    (b"#ROSBAG V1.2\n" + bytes(90), "a ROS 1 bag of an old format.*rosbag migrate"),
+    (b"ply\nformat" + bytes(90), "a PLY cloud.*one file per scan"),
+    (b"\0\1\2\3", "binary data of another kind"),
+    (b"plain", "text"),
+):
+    refused(4, NotALog, rf"a\.mcap: not a recording; looks like {_words}", opened(_head))
 
 
-@pytest.mark.parametrize("kind", ["ascii", "binary"])
-def test_pcd_of_every_type_and_count(kind: str) -> None:
-    made = columns(PCD_TYPES, PCD_COUNTS)
-    found = values_of(parser("pcd")(pcd(kind, made), HEADER))
-    assert list(found) == [f"n{i}" for i in range(len(made))]
-    for values, wanted in zip(found.values(), made, strict=True):
-        assert values.shape == wanted.shape
-        if kind == "ascii":  # all numbers of a text are float64
-            np.testing.assert_array_equal(values, wanted.astype("f8"))
-        else:
-            assert values.dtype == wanted.dtype
-            np.testing.assert_array_equal(values, wanted)
+def pipe(folder: Path) -> Path:
+    os.mkfifo(folder / "pipe.mcap")
+    return folder / "pipe.mcap"
 
 
-PLY_TYPES = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
-    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4",
-    "float32": "f4", "double": "f8", "float64": "f8",
+def loop(folder: Path) -> Path:
+    (folder / "loop").symlink_to("loop")
+    return folder / "loop"
+
+
+def below_a_file(folder: Path) -> Path:
+    (folder / "file").touch()
+    return folder / "file" / "a.mcap"
+
+
+refused(1, LogNotFound, r"pipe\.mcap: not a regular file", lambda folder: open_log(pipe(folder)))
+refused(1, LogNotFound, r"file/a\.mcap: (Not a dir|no such)", lambda folder: open_log(below_a_file(folder)))
+refused(1, LogNotFound, "loop: ", lambda folder: open_log(loop(folder)))
+
+
+def part(*seconds: Any) -> Act:
+    def act(folder: Path) -> None:
+        with open_log(write_mcap(folder / "a.mcap", drive())) as log:
+            log.scans(*seconds)
+
+    return act
+
+
+for _part in ((-1.0, None), (math.nan, None), (0.0, 0.0), (0.0, -1.0), (0.0, math.nan)):
+    refused(46, ConfigError, "expected seconds", part(*_part))
+
+
+def sidecar(**files: str) -> Act:
+    def act(folder: Path) -> None:
+        of_clouds = folder_of(folder, "bin", count=3)
+        for name, content in files.items():
+            (of_clouds / name.replace("_", ".")).write_text(content)
+        read(of_clouds)
+
+    return act
+
+
+POSE = "1 0 0 0 0 0 0 1\n"
+for _files, _words in (
+    ({"times_txt": "1 2 2"}, r"times\.txt: time does not increase"),
+    ({"times_txt": "1 2"}, r"times\.txt: 2 times for 3 clouds"),
+    ({"times_txt": "1 two 3"}, r"times\.txt: not seconds, one per line"),
+    ({"a_tum": POSE}, r"a \.tum of 1 poses for 3 clouds"),
+    ({"a_tum": POSE, "b_tum": POSE}, r"several \.tum files: a\.tum, b\.tum"),
+):
+    refused(46, TrajectoryFileError, _words, sidecar(**_files))
+
+
+def tum(content: bytes, size: int = 0) -> Act:
+    def act(folder: Path) -> None:
+        (folder / "t.txt").write_bytes(content)
+        if size:
+            os.truncate(folder / "t.txt", size)
+        read_tum(folder / "t.txt")
+
+    return act
+
+
+refused(1, TrajectoryFileError, r"t\.txt: No such file", lambda folder: read_tum(folder / "t.txt"))
+refused(46, TrajectoryFileError, r"t\.txt: not a text file", tum(b"\xff\xfe\x00"))
+refused(46, TrajectoryFileError, "line 2: time does not increase", tum(2 * POSE.encode()))
+refused(46, TrajectoryFileError, r"t\.txt: larger than \d+ bytes", tum(b"", 1 << 40))
+
+
+def bag_with_large_records(folder: Path) -> Path:
+    return write_bag(folder / "a.bag", drive("ros1"), chunk_bytes=2000)
+
+
+def bag_of_a_hole(folder: Path) -> Path:
+    """A record of 2 GB, in which nothing stands."""
+    path = bag_with_large_records(folder)
+    path.write_bytes(path.read_bytes()[:13] + struct.pack("<I", 1 << 31))
+    os.truncate(path, 1 << 32)
+    return path
+
+
+refused(
+    12, LimitExceeded, r"a record has \d+ bytes; the limit is 1000 .*max_record",
+    lambda folder: read(bag_with_large_records(folder), ReadConfig(max_record_bytes=1000)),
+)  # fmt: skip
+refused(12, LimitExceeded, "2147483648 bytes", lambda folder: read(bag_of_a_hole(folder)), most_mib=16)
+
+
+# --- images of maps, and of depths --------------------------------------------------------------------
+
+
+def chunk(kind: bytes, body: bytes) -> bytes:
+    """With the right checksum: damage is caught by it, a liar is not."""
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
+
+
+def lying_png(width: int, height: int, bits: int = 8, colour: int = 0, data: bytes = b"") -> bytes:
+    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0))
+    return MAGIC + header + chunk(b"IDAT", data or zlib.compress(bytes(64))) + chunk(b"IEND", b"")
+
+
+def loaded(image: bytes, name: str = "m.png", size: int = 0) -> Act:
+    """A map with this image, or one of another name, which may be made larger."""
+
+    def act(folder: Path) -> None:
+        (folder / "m.png").write_bytes(image)
+        if size:
+            os.truncate(folder / "m.png", size)
+        if name == "pipe":
+            os.mkfifo(folder / "pipe")
+        keys = f"image: {name}\nresolution: 0.05\norigin: [0, 0, 0]\n"
+        (folder / "m.yaml").write_text(keys + "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n")
+        load_map(folder / "m.yaml")
+
+    return act
+
+
+for _image, _words in (
+    (lying_png(60_000, 60_000), "cannot hold 60000 x 60000 pixels"),
+    (lying_png(2**31, 2**31), "cannot hold"),
+    (lying_png(0, 5), "0 x 5 pixels"),
+    (lying_png(20_000, 20_000, 1, data=zlib.compress(bytes(2501 * 20_000))), "the limit is 100000000"),
+    (lying_png(6, 6, bits=16), "a damaged image"),
+    (lying_png(4, 4, colour=5), "its header makes no sense"),
+    (MAGIC + struct.pack(">I", 2**31) + b"IHDR", "it is cut off"),
+    (b"\xff\xd8\xff\xe0 a photo", "not the image of a map"),
+    (b"BM" + bytes(100), "0 x 0 pixels"),
+    (b"BM" + bytes(16) + struct.pack("<iiHHI", 9000, 9000, 1, 24, 0), "cannot hold 9000 x 9000"),
+    (b"P5 90000 90000 255\n" + bytes(99), "cannot hold"),
+    (b"P2 9000 9000 255\n1 2 3", "cannot hold"),
+    (b"P2 2 2 255\n1 2 3 -4\n", "a damaged image"),
+    (b"P2 2 2 255\n1 2 3\n", "a damaged image"),
+    (b"P2 2 2 99999\n1 2 3 9\n", "its white is 99999"),
+):
+    refused(46, MapFileError, rf"/m\.png: .*{_words}", loaded(_image))
+refused(
+    46, MapFileError, r"m\.png: larger than \d+ bytes: not the image of a map", loaded(b"P5", size=1 << 40)
+)
+for _name in ("/dev/zero", "pipe"):
+    refused(46, MapFileError, "not a regular file", loaded(b"", _name))
+
+
+def seen(image: Message, config: ReadConfig | None = None, **camera: Any) -> Act:
+    info = ros().camera(INFO, T0, 6, 4, 100.0, **camera)
+    return lambda folder: read(write_mcap(folder / "a.mcap", [info, image]), config)
+
+
+for _image, _words in (
+    (lying_png(60_000, 60_000, 16), "cannot hold 60000 x 60000"),
+    (lying_png(300, 300, 16, data=zlib.compress(bytes(601 * 300))), "max_points"),
+    (lying_png(6, 4, 8), "not one channel of 16 bits"),
+    (lying_png(6, 4, 16, data=zlib.compress(bytes(20))), "damaged"),
+):
+    _depths = ros().compressed(DEPTH, T0, bytes(12) + _image, "16UC1; compressedDepth png")
+    refused(37, PointCloudError, _words, seen(_depths, ReadConfig(max_points=50_000)))
+_wall = ros().image(DEPTH, T0, np.full((4, 6), 2000, np.uint16), "16UC1")
+refused(
+    37, UnsupportedSchema, "the distortion model 'double_sphere' is not read",
+    seen(_wall, model="double_sphere", d=np.array([0.1])),
+)  # fmt: skip
+
+
+# --- messages, and their definitions ------------------------------------------------------------------
+
+
+def topic(kind: str = CLOUD, encoding: str = "cdr", schema: str = "ros2msg", text: bytes = b"") -> TopicInfo:
+    return TopicInfo(
+        topic="/points", type=kind, encoding=encoding, schema_encoding=schema, schema=text, message_count=1
+    )
+
+
+for _topic, _words in (
+    (topic("std_msgs/String"), "messages of type std_msgs/String are not read"),
+    (topic(""), "messages of type unknown are not read"),
+    (topic(encoding="cbor"), "message encoding 'cbor' is not read"),
+    (topic(schema="omgidl", text=b"x"), "schema encoding 'omgidl' is not read"),
+    (topic(text=b"(("), ".*(differently from ROS|is not readable)"),
+):
+    refused(18, UnsupportedSchema, f"^/points: {_words}", lambda _, topic=_topic: decoder_for(topic))
+for _topic, _words in (
+    (topic("foxglove.Log", "json"), "json messages of type foxglove.Log are not read"),
+    (topic("foxglove.PointCloud", "protobuf", "flatbuffer"), "'flatbuffer' is not read"),
+):
+    refused(18, UnsupportedSchema, _words, lambda _, topic=_topic: foxglove.decoder_for(topic))
+for _kind, _data in (
+    (CLOUD, b"\0\1"),
+    ("tf2_msgs/TFMessage", b"\0\1\0\0" + struct.pack("<I", 100_001)),
+    (CLOUD, b"\0\1\0\0\1\0\0\0"),
+):
+    refused(
+        20, PointCloudError, f"no whole {_kind}",
+        lambda _, kind=_kind, data=_data: decoder_for(topic(kind))(data),
+    )  # fmt: skip
+refused(
+    37, PointCloudError, "a CameraInfo with 101 numbers of distortion",
+    lambda _: decoder_for(topic("sensor_msgs/CameraInfo"))(
+        ros().camera(INFO, T0, 6, 4, 100.0, d=np.zeros(101)).data
+    ),
+)  # fmt: skip
+CALIBRATION = {
+    "timestamp": {"sec": 1, "nsec": 0}, "frame_id": "c", "width": 4, "height": 3, "D": [], "K": [1.0] * 8,
+    "R": [], "P": [], "distortion_model": "",
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("kind", ["binary_little_endian", "binary_big_endian", "ascii"])
-def test_ply_of_every_type_behind_another_element(kind: str) -> None:
-    made = columns(list(PLY_TYPES.values()), [1] * len(PLY_TYPES))
-    order = ">" if "big" in kind else "<"
-    head = ["ply", f"format {kind} 1.0", "element camera 3", "property float a", "property uchar b"]
-    head += ["element vertex 4", *(f"property {name} {name}_" for name in PLY_TYPES), "end_header"]
-    if kind == "ascii":
-        rows = ["0.5 7"] * 3 + [" ".join(repr(m[i, 0].item()) for m in made) for i in range(4)]
-        body = "\n".join(rows).encode()
-    else:
-        body = struct.pack(order + "fB", 0.5, 7) * 3
-        body += b"".join(m[i].astype(m.dtype.newbyteorder(order)).tobytes() for i in range(4) for m in made)
-    found = values_of(parser("ply")(("\n".join(head) + "\n").encode() + body, HEADER))
-    assert list(found) == [f"{name}_" for name in PLY_TYPES]
-    for values, wanted in zip(found.values(), made, strict=True):
-        np.testing.assert_array_equal(values.astype("f8"), wanted.astype("f8"))
+def in_json(kind: str, data: bytes) -> Act:
+    return lambda _: foxglove.decoder_for(topic(kind, "json"))(data)
 
 
-# --- refused with words -------------------------------------------------------------------------------
+refused(
+    37, PointCloudError, "a camera matrix K of 8 numbers",
+    in_json("foxglove.CameraCalibration", json.dumps(CALIBRATION).encode()),
+)  # fmt: skip
+for _data in (b"[" + b"0," * 2_000_001 + b"0]", b'"' + bytes(1 << 26) + b'"'):
+    refused(
+        12,
+        LimitExceeded,
+        r"a JSON message of \d+ bytes and \d+ values",
+        in_json("foxglove.PointCloud", _data),
+    )
+
+HEAD = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 30000\nHEIGHT 1\nDATA "
+refused(
+    24, PointCloudError, "not a line of numbers",
+    lambda _: clouds.parser("pcd")(HEAD + b"ascii\n" + b"1 2 3\n" * 29_999 + b"1 2", Header(1, "lidar")),
+)  # fmt: skip
+_packed = HEAD + b"binary_compressed\n" + struct.pack("<II", 9, 360_000) + bytes(9)
+refused(10, UnsupportedSchema, "is not read", lambda _: clouds.parser("pcd")(_packed, Header(1, "lidar")))
 
 
-def topic(kind: str = "sensor_msgs/PointCloud2", encoding: str = "cdr", **more: Any) -> TopicInfo:
-    entries = {"schema_encoding": "ros2msg", "schema": b"", "message_count": 1, **more}
-    return TopicInfo(topic="/points", type=kind, encoding=encoding, **entries)
+def nested(levels: int, width: int, leaf: str = "int32 a\n") -> str:
+    """A definition of width ** levels fields."""
+    parts = ["".join(f"p/L0 f{i}\n" for i in range(width))]
+    parts += [
+        f"MSG: p/L{n}\n" + "".join(f"p/L{n + 1} f{i}\n" for i in range(width)) for n in range(levels - 1)
+    ]
+    return ("=" * 80 + "\n").join([*parts, f"MSG: p/L{levels - 1}\n{leaf}"])
 
 
-@pytest.mark.parametrize(
-    ("channel", "words"),
-    [
-        (topic("std_msgs/String"), "messages of type std_msgs/String are not read"),
-        (topic(""), "messages of type unknown are not read"),
-        (topic(encoding="cbor"), "message encoding 'cbor' is not read"),
-        (topic(schema_encoding="omgidl", schema=b"x"), "schema encoding 'omgidl' is not read"),
-        (topic(schema=b"(("), "differently from ROS|is not readable"),
-    ],
-)
-def test_ros_topics_that_are_not_read(channel: TopicInfo, words: str) -> None:
-    with pytest.raises(UnsupportedSchema, match=words) as caught:
-        ros_messages.decoder_for(channel)
-    assert caught.value.message.startswith("/points: ")
+def defined(text: str) -> Act:
+    record = ("/points", "sensor_msgs/msg/PointCloud2", "ros2msg", text.encode())
+    data = ros().cloud("/points", T0, [[1, 2, 3]]).data
+    return lambda folder: read(
+        raw_log(folder / "a.mcap", [(*record, data)]), ReadConfig(assume_identity=True)
+    )
 
 
-@pytest.mark.parametrize(
-    ("channel", "words"),
-    [
-        (topic("foxglove.Log", "json"), "json messages of type foxglove.Log are not read"),
-        (topic("foxglove.PointCloud", "protobuf", schema_encoding="flatbuffer"), "'flatbuffer' is not read"),
-    ],
-)
-def test_foxglove_topics_that_are_not_read(channel: TopicInfo, words: str) -> None:
-    with pytest.raises(UnsupportedSchema, match=words):
-        foxglove.decoder_for(channel)
+for _text in (
+    nested(14, 12),
+    nested(14, 12, leaf=""),
+    nested(2, 5000),
+    "sensor_msgs/PointCloud2 again\n",
+    "int32 a\n" * 200_000,
+):
+    refused(12, UnsupportedSchema, "/points", defined(_text))
 
 
-@pytest.mark.parametrize(
-    ("kind", "data", "words"),
-    [
-        ("sensor_msgs/PointCloud2", b"\0\1", "no whole sensor_msgs/PointCloud2"),
-        ("tf2_msgs/TFMessage", b"\0\1\0\0" + struct.pack("<I", 100_001), "no whole tf2_msgs/TFMessage"),
-        ("sensor_msgs/PointCloud2", b"\0\1\0\0\1\0\0\0", "no whole sensor_msgs/PointCloud2"),
-    ],
-)
-def test_messages_that_are_too_short_or_too_large(kind: str, data: bytes, words: str) -> None:
-    with pytest.raises(PointCloudError, match=words):
-        ros_messages.decoder_for(topic(kind))(data)
+# --- lasers -------------------------------------------------------------------------------------------
 
 
-def test_a_camera_matrix_of_other_sizes() -> None:
-    decode = foxglove.decoder_for(topic("foxglove.CameraCalibration", "json"))
-    message = {
-        "timestamp": {"sec": 1, "nsec": 0}, "frame_id": "c", "width": 4, "height": 3, "D": [], "K": [1.0] * 8,
-        "R": [], "P": [], "distortion_model": "",
-    }  # fmt: skip
-    with pytest.raises(PointCloudError, match="a camera matrix K of 8 numbers"):
-        decode(json.dumps(message).encode())
+def laser(start: float = -0.2, step: float = 0.1, count: int = 5) -> Act:
+    scan = LaserScan(
+        Header(T0, "laser"), angle_min=start, angle_max=start + (count - 1) * step, angle_increment=step,
+        time_increment=0.0, scan_time=0.1, range_min=0.1, range_max=30.0, ranges=np.ones(count, np.float32),
+    )  # fmt: skip
+    return lambda _: decode.decode(scan, max_points=100)
 
 
-def test_a_cloud_that_may_not_be_read_or_went_away(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path, "bin")
-    with open_log(folder) as log:
-        (folder / "scan_3.bin").unlink()
-        (folder / "scan_3.bin").mkdir()
-        with pytest.raises(LogCorrupt, match=r"scan_3\.bin: cannot be read: Is a directory"):
-            list(log.scans())
-    (folder / "scan_3.bin").rmdir()
-    with pytest.raises(LogCorrupt, match=r"cannot be read: No such file"), open_log(folder) as log:
-        (folder / "scan_5.bin").unlink()
-        list(log.scans())
+refused(25, PointCloudError, "angles that are not finite", laser(start=math.nan))
+refused(25, PointCloudError, "field angle_increment: 0", laser(step=0.0))
+refused(12, LimitExceeded, "a scan of 200 beams; the limit is 100", laser(count=200))
 
 
-def test_a_part_of_a_folder_of_clouds(tmp_path: Path) -> None:
-    folder = folder_of(tmp_path, "bin")
-    with open_log(folder) as log:
-        whole = [scan.stamp_ns for scan in log.scans()]
-        part = [scan.stamp_ns for scan in log.scans(start_s=0.25, duration_s=0.5)]
-    begin = whole[0] + 250_000_000
-    assert part == [t for t in whole if begin <= t < begin + 500_000_000]
+@pytest.mark.parametrize("encoding", ["json", "protobuf"])
+def test_a_laser_of_too_many_beams(tmp_path: Path, encoding: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pc2grid.io.messages.foxglove.MOST_BEAMS", 1000)
+    fields = foxglove_messages.stamped(
+        T0, frame_id="laser", pose=foxglove_messages.IDENTITY, start_angle=0.0, end_angle=6.0,
+        ranges=[0.0] * 1001, intensities=[],
+    )  # fmt: skip
+    path = foxglove_messages.write(tmp_path / "a.mcap", [("/scan", "LaserScan", T0, fields)], encoding)
+    with pytest.raises(LimitExceeded, match="a scan of 1001 beams; the limit is 1000"):
+        read(path, ReadConfig(assume_identity=True))
 
 
-def test_what_others_raise_becomes_ours_but_for_memory() -> None:
-    path = Path("log.mcap")
-
-    def raising(error: BaseException) -> Any:
-        def action() -> Any:
-            raise error
-
-        return action
-
-    def stream(error: BaseException) -> Any:
-        yield 1
-        raise error
-
-    for error, words in (
-        (PermissionError(13, "Permission denied"), "log.mcap: cannot be read: Permission denied"),
-        (KeyError("x\n\n y"), "log.mcap: damaged .KeyError: 'x"),
-        (PointCloudError("odd"), "^log.mcap: odd$"),
-        (PointCloudError("log.mcap: odd"), "^log.mcap: odd$"),
-    ):
-        with pytest.raises((LogCorrupt, PointCloudError), match=words):
-            guarded(path, raising(error))
-        with pytest.raises((LogCorrupt, PointCloudError), match=words):
-            list(guarded_stream(path, stream(error)))
-    strange = DatabaseError("busy")
-    with pytest.raises(DatabaseError) as caught:
-        guarded(path, raising(strange))
-    assert caught.value is strange
-    with pytest.raises(MemoryError):
-        guarded(path, raising(MemoryError()))
-    with pytest.raises(MemoryError):
-        list(guarded_stream(path, stream(MemoryError())))
+# --- running them -------------------------------------------------------------------------------------
 
 
-def test_an_origin_that_is_nowhere() -> None:
-    from pc2grid.io.sensors.decode import ScanDecoder
+@pytest.fixture(scope="module", autouse=True)
+def libraries(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """What is loaded at the first reading counts for no row."""
+    read(write_mcap(tmp_path_factory.mktemp("first") / "a.mcap", drive()))
+    yield
 
-    cloud = parser("bin")(struct.pack("<8f", 1, 2, 3, 0, 2, 3, 4, 0), HEADER)
-    decoder = ScanDecoder("/points", "lidar", ReadConfig())
-    moved = dataclasses.replace(cloud, origin=(1.0, 0.0, 0.5, 0.0, 0.0, 0.0, 1.0))
-    scan = decoder.scan(moved, T0, np.eye(4), None)
-    np.testing.assert_allclose(scan.points_m, [[2, 2, 3.5], [3, 3, 4.5]])
-    nowhere = dataclasses.replace(cloud, origin=(float("nan"), 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-    with pytest.raises(PointCloudError, match="the origin of the points is not finite"):
-        decoder.scan(nowhere, T0, np.eye(4), None)
-    with pytest.raises(PointCloudError, match="every point is farther than 1 m"):
-        ScanDecoder("/points", "lidar", ReadConfig(max_range_m=1.0)).scan(cloud, T0, np.eye(4), None)
+
+@pytest.mark.parametrize(("error", "words", "act", "most_mib"), ROWS)
+def test_refused_by_name_and_before_much_is_allocated(
+    tmp_path: Path, error: type[Pc2GridError], words: str, act: Act, most_mib: int
+) -> None:
+    with peak_memory() as peak, pytest.raises(error, match=words):
+        act(tmp_path)
+    assert peak.grown_bytes() < most_mib << 20
+
+
+@pytest.mark.parametrize("target", ["/dev/zero", "pipe"])
+def test_clouds_without_end(tmp_path: Path, target: str) -> None:
+    if target == "pipe":
+        target = str(pipe(tmp_path))
+    folder = tmp_path / "clouds"
+    folder.mkdir()
+    (folder / "2.bin").symlink_to(target)
+    (folder / "poses.tum").symlink_to(target)
+    with pytest.raises(LogNotFound, match="a folder without a recording"):
+        read(folder)
+    (folder / "1.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())
+    assert len(read(folder)[0]) == 1

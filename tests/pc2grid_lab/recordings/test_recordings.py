@@ -21,6 +21,7 @@ from pc2grid_lab.recordings import catalogue, run
 from pc2grid_lab.recordings.catalogue import Drive, Pair, Recording
 from pc2grid_lab.recordings.run import Followed
 from tests.helpers.rooms import RESOLUTION_M
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import plan
 
 RECORDINGS = (
@@ -66,10 +67,9 @@ def rooms() -> OccupancyGrid:
     return plan(14.0, 9.0, [*inner, *things])
 
 
-@pytest.fixture(scope="module")
-def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder()
+def data(folder: Path) -> None:
     """Two drives of a laser through an office; its 3D scan; no recording; the map of another building."""
-    folder = tmp_path_factory.mktemp("data")
     for name, seed, length_m in (("a", 3, 40.0), ("b", 5, 30.0)):
         slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": length_m, "seed": seed, "clutter": 0}
         config = SimulationConfig.model_validate(slow)
@@ -82,7 +82,6 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     open3d.io.write_triangle_mesh(str(folder / "floor.obj"), mesh)
     (folder / "broken.mcap").write_bytes(b"no recording")
     save_map(plan(12.0, 9.0, [(0, 4, 7, 4), (7, 6, 7, 9), (3, 6, 3, 9)]), folder / "hall")
-    return folder
 
 
 @pytest.fixture

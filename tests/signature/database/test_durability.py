@@ -38,16 +38,16 @@ from signature.database import open_database
 from signature.database.maintenance import store
 from tests.helpers.databases import MONDAY, assert_holds, make_entry
 from tests.helpers.rooms import small_house
+from tests.helpers.shared_folders import shared_folder
 
 ROOT = Path(__file__).resolve().parents[3]
 FUZZ = int(os.environ.get("PC2GRID_FUZZ", "0"))
 WRITER = tuple(str(ROOT / name) for name in ("signature/database/", "pc2grid/io/atomic.py"))
 
 
-@pytest.fixture(scope="module")
-def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+@shared_folder()
+def inputs(folder: Path) -> None:
     """A folder with a map, a laser recording of a few metres, and the databases of both."""
-    folder = tmp_path_factory.mktemp("inputs")
     save_map(small_house(), folder / "house")
     config = SimulationConfig(length_m=1.5, seed=5, clutter=0)
     simulate_session(folder / "drive.mcap", sensor="laser", grid=small_house(), config=config)
@@ -56,7 +56,6 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
         assert done == 0
     shutil.copyfile(folder / "drive.submaps", folder / "both.submaps")
     assert Convert(folder / "house.yaml", "-o", "both.submaps", "--add", cwd=folder).wait() == 0
-    return folder
 
 
 # A server that has the libraries loaded forks each of them, so that kills meet the work and not the start.

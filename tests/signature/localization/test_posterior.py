@@ -1,6 +1,10 @@
 """The masses of places, and what moves them: fit, lead, prior, slips."""
 
+from __future__ import annotations
+
+import functools
 import itertools
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import cast
@@ -8,16 +12,26 @@ from typing import cast
 import numpy as np
 import pytest
 
+from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.errors import ConfigError
+from pc2grid.geometry import SE2
 from pc2grid.matching.score import Fit
+from pc2grid.model import Health, RegisteredScan
+from signature.config import Config, RelocalizeConfig
+from signature.localization.answer import Answer
+from signature.localization.localizer import Localizer
+from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
     NO_EVIDENCE,
     POSTERIOR,
     Evidence,
+    Prior,
     evidence_of,
     masses,
     tempered,
 )
 from signature.localization.query import QueryMap
+from tests.helpers.simulated_drives import building, drive, office, plan
 
 AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
 WALLS = [5.0, 30.0, 100.0, 300.0, 2000.0]
@@ -131,3 +145,229 @@ def test_what_differs_between_equal_places_is_chance() -> None:
     """Their scores are equal, as the one that agrees less lies on more known ground."""
     twins = evidence_of([found(0.9, 0.85), found(0.9, 0.95)], QUERY)
     assert twins[0] == twins[1] and twins[0].forward == 0.95
+
+
+# --- What is known of the pose beforehand excludes places, and nothing else ---
+
+
+BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
+TWINS = plan(12, 6, [(6, 0, 6, 6), *BENT, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in BENT]])
+"""Two rooms side by side that are alike: (x, y) of the one is (x + 6, y) of the other."""
+IN_ROOM = [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)]
+AT_ONCE = Config(relocalize=RelocalizeConfig(step_m=100.0))
+"""The database is asked once, at the end: what is tested here does not depend on the looks before."""
+ALIKE = building({"twins": TWINS}, AT_ONCE)
+OFFICE = building({"office": office()}, AT_ONCE)
+ROUTE = [(1.5, 7.0), (9.5, 7.0), (9.5, 4.0)]
+
+
+@functools.cache
+def driven(in_office: bool) -> list[tuple[RegisteredScan, PlanarScan, SE2]]:
+    return list(drive(office(), ROUTE) if in_office else drive(TWINS, IN_ROOM))
+
+
+def ask(index: MapIndex, *, in_office: bool = True) -> tuple[Answer, SE2]:
+    localizer = Localizer(index)
+    for registered, planar_scan, truth in driven(in_office):
+        localizer.add(registered, planar_scan)
+        end = truth
+    return localizer.answer(), end
+
+
+def distance(a: SE2 | None, b: SE2) -> float:
+    assert a is not None
+    return math.dist((a.x, a.y), (b.x, b.y))
+
+
+@pytest.mark.parametrize("room", [0.0, 6.0])
+def test_of_two_rooms_that_are_alike_the_prior_names_one(room: float) -> None:
+    """The robot is in the left one; whoever says it is in the right one is believed."""
+    assert ask(ALIKE, in_office=False)[0].status == "ambiguous"
+    answer, truth = ask(ALIKE.within(Prior.around(3.0 + room, 2.0, radius_m=3.0)), in_office=False)
+    assert answer.status == "located" and answer.confidence >= 0.9 and answer.prior == "used"
+    assert distance(answer.T_map_base, SE2(truth.x + room, truth.y, truth.yaw)) < 0.1
+    assert answer.excluded is None
+    inside = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    assert all(math.dist((p.x, p.y), (3.0 + room, 2.0)) <= 3.0 for p in inside)
+
+
+def test_where_the_robot_is_not_it_is_not_found_and_the_place_is_named() -> None:
+    answer, truth = ask(OFFICE.within(Prior.around(17.0, 2.0, radius_m=2.0)))
+    assert answer.status == "not_found" and answer.T_map_base is None
+    assert answer.excluded is not None and answer.excluded.status == "located"
+    assert distance(answer.excluded.pose, truth) < 0.1
+    for h in answer.hypotheses:
+        pose = h.fit.T_map_query @ answer.T_odom_base
+        assert distance(pose, SE2(17.0, 2.0)) <= 2.0
+
+
+def test_a_prior_that_holds_changes_no_right_answer() -> None:
+    free, truth = ask(OFFICE)
+    for prior in (Prior.around(9.0, 5.0, radius_m=3.0), Prior.around(9.0, 5.0, radius_m=100.0)):
+        answer, _ = ask(OFFICE.within(prior))
+        assert answer.status == "located" and distance(answer.T_map_base, truth) < 0.1
+        assert answer.confidence >= free.confidence - 1e-9
+
+
+def test_a_pose_of_the_first_scan_is_carried_along_by_the_travel() -> None:
+    """1 m and 20 degrees off at the start, 11 m before the answer."""
+    covariance = np.diag([0.5, 0.5, 0.1])
+    start = SE2(2.3, 6.5, math.radians(20.0))
+    answer, truth = ask(OFFICE.within(Prior.of_pose(start, covariance, stamp_ns=0)))
+    assert answer.status == "located" and distance(answer.T_map_base, truth) < 0.1
+    # The end of the travel is far outside the region: without its time it would be excluded.
+    answer, _ = ask(OFFICE.within(Prior.of_pose(start, covariance)))
+    assert answer.status == "not_found"
+    turned = Prior.of_pose(SE2(1.5, 7.0, math.pi), covariance, stamp_ns=0)
+    assert ask(OFFICE.within(turned))[0].status == "not_found"
+
+
+def test_a_prior_from_before_registration_was_lost_is_not_used() -> None:
+    localizer = Localizer(OFFICE.within(Prior.around(17.0, 2.0, 1.0)))
+    timed = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=0)
+    localizers = [localizer, Localizer(OFFICE.within(timed))]
+    for k, (registered, planar_scan, _) in enumerate(driven(in_office=True)):
+        if k == 10:
+            registered = RegisteredScan(
+                scan=registered.scan, T_session_base=registered.T_session_base, health=Health.LOST
+            )
+        for each in localizers:
+            each.add(registered, planar_scan)
+    always, at_start = (each.answer() for each in localizers)
+    assert (always.status, always.prior) == ("not_found", "used")
+    assert (at_start.status, at_start.prior) == ("located", "lapsed")
+
+
+def estimates(index: MapIndex) -> tuple[list[tuple[int, str, float]], Answer]:
+    """Stamp, status and confidence of each estimate in the left room, and the answer at the end."""
+    localizer, found = Localizer(index), []
+    for registered, planar_scan, _ in driven(in_office=False):
+        estimate = localizer.add(registered, planar_scan)
+        if estimate is not None:
+            found.append((registered.scan.stamp_ns, estimate.answer.status, estimate.answer.confidence))
+    return found, localizer.answer()
+
+
+@functools.cache
+def alike_step_by_step() -> MapIndex:
+    """The two rooms, asked after each metre."""
+    return building({"twins": TWINS}, Config(relocalize=RelocalizeConfig(accept=0.95)))
+
+
+def test_a_prior_acts_at_its_time_and_never_before() -> None:
+    """The robot is 3 m from the region at first."""
+    free, undecided = estimates(alike_step_by_step())
+    registered, _, then = driven(in_office=False)[20]
+    prior = replace(Prior.around(then.x, then.y, 1.0), stamp_ns=registered.scan.stamp_ns)
+    found, answer = estimates(alike_step_by_step().within(prior))
+    assert undecided.status == "ambiguous" and answer.status == "located" and answer.prior == "used"
+    assert distance(answer.T_map_base, driven(in_office=False)[-1][2]) < 0.1
+    before = [k for k, (stamp_ns, _, _) in enumerate(found) if stamp_ns < registered.scan.stamp_ns]
+    assert len(before) >= 3 and found[: len(before)] == free[: len(before)]
+    assert all(status == "located" for _, status, _ in found[len(before) :])
+
+
+def test_a_prior_of_a_time_after_the_last_scan_says_nothing_yet() -> None:
+    registered, _, end = driven(in_office=False)[-1]
+    later = replace(Prior.around(end.x, end.y, 1.0), stamp_ns=registered.scan.stamp_ns + 1)
+    found, answer = estimates(alike_step_by_step().within(later))
+    assert found == estimates(alike_step_by_step())[0]
+    assert (answer.status, answer.prior) == ("ambiguous", "ahead")
+
+
+def test_a_prior_without_a_time_is_about_the_scan_at_which_the_answer_is_asked() -> None:
+    end = driven(in_office=False)[-1][2]
+    found, answer = estimates(alike_step_by_step().within(Prior.around(end.x, end.y, 1.0)))
+    assert found == estimates(alike_step_by_step())[0]
+    assert (answer.status, answer.prior) == ("located", "used")
+    assert distance(answer.T_map_base, end) < 0.1
+
+
+def test_registration_that_is_lost_before_the_time_of_a_prior_takes_nothing_from_it() -> None:
+    """But while it is lost, nothing connects the time with what comes after."""
+    scans = driven(in_office=True)
+    prior = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=scans[17][0].scan.stamp_ns)
+    for lost, became in ((range(8, 12), "used"), (range(12, 19), "lapsed"), (range(17, 18), "lapsed")):
+        localizer = Localizer(OFFICE.within(prior))
+        for k, (registered, planar_scan, _) in enumerate(scans):
+            health = Health.LOST if k in lost else Health.FINE
+            localizer.add(replace(registered, health=health), planar_scan)
+        assert localizer.answer().prior == became, lost
+
+
+def test_a_restart_takes_nothing_from_a_prior_of_a_later_time() -> None:
+    scans = driven(in_office=True)
+    for number, became in ((5, "lapsed"), (20, "used")):
+        prior = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=scans[number][0].scan.stamp_ns)
+        localizer = Localizer(OFFICE.within(prior))
+        for k, (registered, planar_scan, _) in enumerate(scans):
+            if k == 10:
+                localizer.restart()
+            localizer.add(registered, planar_scan)
+        assert localizer.answer().prior == became
+
+
+def test_a_prior_that_contradicts_where_the_robot_was_located_is_not_taken_for_lapsed() -> None:
+    scans, index = driven(in_office=True), building({"office": office()})
+    prior = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=scans[-8][0].scan.stamp_ns)
+    localizer, located = Localizer(index.within(prior)), 0
+    for registered, planar_scan, _ in scans:
+        estimate = localizer.add(registered, planar_scan)
+        located += estimate is not None and estimate.state == "located"
+    answer = localizer.answer()
+    assert located and (answer.status, answer.prior) == ("not_found", "used")
+    assert answer.excluded is not None and distance(answer.excluded.pose, scans[-1][2]) < 0.1
+
+
+def test_the_frame_of_the_prior_is_that_of_one_session() -> None:
+    both = building({"twins": TWINS, "office": office()}, AT_ONCE)
+    with pytest.raises(ConfigError, match="2 sessions") as caught:
+        both.within(Prior.around(1.0, 1.0, 1.0))
+    assert "--session" in (caught.value.hint or "") and "office" in (caught.value.hint or "")
+    with pytest.raises(ConfigError, match="'attic'"):
+        both.within(Prior.around(1.0, 1.0, 1.0, session="attic"))
+    answer, truth = ask(both.within(Prior.around(9.0, 5.0, 3.0, session="office")))
+    assert answer.session == "office" and distance(answer.T_map_base, truth) < 0.1
+    answer, _ = ask(both.within(Prior.around(9.0, 5.0, 3.0, session="twins")))
+    assert answer.status == "not_found"
+    assert answer.excluded is not None and answer.excluded.session == "office"
+
+
+def test_regions() -> None:
+    disc = Prior.around(1.0, 2.0, 3.0)
+    assert disc.allows(SE2(3.9, 2.0, 2.0)) and not disc.allows(SE2(4.1, 2.0, 2.0))
+    assert disc.allows(SE2(4.1, 2.0, 0.0), since_m=40.0)
+    pose = Prior.of_pose(SE2(0, 0, 3.1), np.diag([4.0, 0.01, 0.01]))
+    assert pose.allows(SE2(6.0, 0.0, -3.1)) and not pose.allows(SE2(0.0, 1.0, 3.1))
+    assert not pose.allows(SE2(0.0, 0.0, 2.0)) and pose.radius_m > 6.0
+    assert Prior.of_pose(SE2(), np.diag([1.0, 1.0, 0.0])).allows(SE2(0, 0, 3.0))
+    rng = np.random.default_rng(0)
+    turn = SE2(0, 0, 0.7).matrix()[:2, :2]
+    spread = turn @ np.diag([1.0, 0.2]) @ turn.T
+    draws = rng.multivariate_normal((0, 0), spread, 2000)
+    tilted = Prior.of_pose(SE2(), np.block([[spread, np.zeros((2, 1))], [np.zeros((1, 2)), 0.01]]))
+    inside = np.mean([tilted.allows(SE2(x, y, 0.0)) for x, y in draws])
+    assert 0.985 < inside <= 1.0
+    squares = draws * 3.0
+    kept = tilted.may_hold(squares, 0.8, 0.0, 0.0)
+    assert all(kept[i] for i, (x, y) in enumerate(squares) if tilted.allows(SE2(x, y, 0.0)))
+    assert not kept.all()
+
+
+@pytest.mark.parametrize(
+    ("covariance", "words"),
+    [
+        (np.zeros((3, 3)), "zero"),
+        (np.diag([1.0, -1.0, 1.0]), "not a covariance"),
+        (np.diag([1.0, math.nan, 1.0]), "finite"),
+    ],
+)
+def test_a_covariance_that_names_no_region_is_refused(covariance: np.ndarray, words: str) -> None:
+    with pytest.raises(ConfigError, match=words):
+        Prior.of_pose(SE2(), covariance)
+
+
+@pytest.mark.parametrize("radius_m", [0.0, -1.0, math.nan, math.inf])
+def test_a_radius_that_is_none_is_refused(radius_m: float) -> None:
+    with pytest.raises(ConfigError, match="radius"):
+        Prior.around(0.0, 0.0, radius_m)

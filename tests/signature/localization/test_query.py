@@ -7,8 +7,11 @@ import math
 import numpy as np
 import pytest
 
+from pc2grid.geometry import SE2
+from pc2grid.model import UNKNOWN, OccupancyGrid
+from signature.localization.localizer import locate_map
 from signature.localization.query import Query
-from tests.helpers.simulated_drives import building, drive, office
+from tests.helpers.simulated_drives import RESOLUTION_M, building, cut, drive, office, plan
 
 OFFICE = building({"office": office()})
 
@@ -58,3 +61,55 @@ def test_standing_still_adds_nothing() -> None:
     for _ in range(50):
         seen.add(registered, planar_scan)
     assert len(seen.map().keyframes) == 2 and seen.path_m == 0.0  # the first one and the newest
+
+
+# --- A drawn map as the query: where does it lie in the building? ---
+
+
+def turned(grid: OccupancyGrid, quarters: int, origin_m: tuple[float, float]) -> tuple[OccupancyGrid, SE2]:
+    """The plan turned counterclockwise about its corner and moved; and T_plan_turned."""
+    height, width = (n * RESOLUTION_M for n in grid.cells.shape)
+    corner = [(0, 0), (height, 0), (width, height), (0, width)][quarters]
+    T_turned_plan = SE2(*origin_m) @ SE2(*corner, quarters * math.pi / 2)
+    cells = np.rot90(grid.cells, -quarters)  # rows count upwards
+    moved = OccupancyGrid(cells=cells.copy(), resolution_m=RESOLUTION_M, origin_m=origin_m)
+    return moved, T_turned_plan.inverse()
+
+
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+@pytest.mark.parametrize("origin_m", [(0.0, 0.0), (-40.0, 25.0)])
+def test_a_part_of_the_plan_is_located_wherever_its_frame_is(
+    quarters: int, origin_m: tuple[float, float]
+) -> None:
+    part, T_part_turned = turned(cut(office(), 4.0, 3.0, 15.0, 12.0), quarters, origin_m)
+    truth = SE2(4.0, 3.0) @ T_part_turned
+    answer = locate_map(part, OFFICE)
+    assert answer.status == "located" and answer.session == "office" and answer.confidence >= 0.9
+    assert answer.T_map_base is not None and answer.T_map_odom == answer.T_map_base
+    corners = np.array([(0, 0), (0, 9), (9, 0), (9, 9)]) + origin_m
+    error = np.abs(answer.T_map_odom.apply(corners) - truth.apply(corners)).max()
+    assert error < 0.15
+    assert answer.path_m == 0.0 and len(answer.history) == 1
+
+
+def test_the_covariance_is_that_of_the_map_s_own_frame() -> None:
+    near, _ = turned(cut(office(), 4.0, 3.0, 15.0, 12.0), 0, (0.0, 0.0))
+    far, _ = turned(near, 0, (-40.0, 0.0))
+    a, b = locate_map(near, OFFICE).covariance, locate_map(far, OFFICE).covariance
+    assert a is not None and b is not None
+    assert b[2, 2] == pytest.approx(a[2, 2], rel=0.05)
+    # 40 m of lever arm along x turn yaw into y, hardly into x.
+    assert b[1, 1] > 100 * a[2, 2] and b[0, 0] < b[1, 1] / 4
+    assert np.linalg.eigvalsh(b).min() > 0
+
+
+def test_the_plan_of_another_building_is_not_located() -> None:
+    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+    answer = locate_map(other, OFFICE)
+    assert answer.status != "located" and answer.T_map_base is None
+
+
+def test_a_map_of_nothing_is_not_found() -> None:
+    cells = np.full((50, 50), UNKNOWN, np.int8)
+    answer = locate_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), OFFICE)
+    assert answer.status == "not_found" and answer.hypotheses == () and answer.confidence == 0.0

@@ -10,6 +10,7 @@ import pytest
 
 from pc2grid.errors import (
     LimitExceeded,
+    LogCorrupt,
     LogNotFound,
     NoScans,
     NotALog,
@@ -196,3 +197,39 @@ def test_mixed_kinds_are_said(tmp_path: Path) -> None:
     scans, report = read(folder)
     assert len(scans) == 3
     assert any("only its .bin files are read" in w for w in report.warnings)
+
+
+# --- test_absurd_clouds ---
+
+
+@pytest.mark.parametrize("name", ["9999999999.5", "9999999999999999999"])
+def test_names_past_all_calendars_are_no_times(tmp_path: Path, name: str) -> None:
+    (tmp_path / f"{name}.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())
+    scans, report = read(tmp_path)
+    assert len(scans) == 1
+    assert any("10 clouds a second are assumed" in w for w in report.warnings)
+
+
+# --- test_refusals_clouds ---
+
+
+def test_a_cloud_that_may_not_be_read_or_went_away(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, "bin")
+    with open_log(folder) as log:
+        (folder / "scan_3.bin").unlink()
+        (folder / "scan_3.bin").mkdir()
+        with pytest.raises(LogCorrupt, match=r"scan_3\.bin: cannot be read: Is a directory"):
+            list(log.scans())
+    (folder / "scan_3.bin").rmdir()
+    with pytest.raises(LogCorrupt, match=r"cannot be read: No such file"), open_log(folder) as log:
+        (folder / "scan_5.bin").unlink()
+        list(log.scans())
+
+
+def test_a_part_of_a_folder_of_clouds(tmp_path: Path) -> None:
+    folder = folder_of(tmp_path, "bin")
+    with open_log(folder) as log:
+        whole = [scan.stamp_ns for scan in log.scans()]
+        part = [scan.stamp_ns for scan in log.scans(start_s=0.25, duration_s=0.5)]
+    begin = whole[0] + 250_000_000
+    assert part == [t for t in whole if begin <= t < begin + 500_000_000]

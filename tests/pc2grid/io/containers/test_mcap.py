@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import struct
 import zlib
 from collections.abc import Callable
@@ -13,10 +14,12 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 
-from pc2grid.errors import FrameError, LimitExceeded, LogError, LogTruncated
+from pc2grid.errors import FrameError, LimitExceeded, LogCorrupt, LogError, LogTruncated
 from pc2grid.io import open_log
+from pc2grid.io.containers.mcap import BoundedFile
 from pc2grid.settings import ReadConfig
-from tests.helpers.recordings import STEP, T0, check_drive, drive, read, ros, write_mcap
+from tests.helpers.memory import peak_memory
+from tests.helpers.recordings import STEP, T0, Message, check_drive, drive, read, ros, write_mcap
 
 SCANS = 30
 PLAIN = ReadConfig(assume_identity=True)
@@ -382,3 +385,48 @@ def test_records_of_users_are_passed_over(tmp_path: Path) -> None:
     at = 17 + int.from_bytes(whole[9:17], "little")
     path.write_bytes(whole[:at] + record(0x90, b"ours") + whole[at:])
     check_drive(read(path)[0])
+
+
+# --- A file that refuses to read more at once than is allowed, or than there is ---
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> BoundedFile:
+    path = tmp_path / "a"
+    path.write_bytes(bytes(range(100)))
+    return BoundedFile(io.FileIO(path), most_bytes=40)
+
+
+def test_what_is_allowed_is_read_and_no_more(file: BoundedFile) -> None:
+    assert file.read(40) == bytes(range(40))
+    with pytest.raises(LimitExceeded, match=r"a record has 41 bytes; the limit is 40 .*max_record_bytes"):
+        file.read(41)
+    file.seek(95)
+    with pytest.raises(LogTruncated, match="ends within"):
+        file.read(6)
+    assert file.read(5) == bytes(range(95, 100))
+
+
+@pytest.mark.parametrize("size", [-1, -5, None])
+def test_a_length_that_is_none_is_damage(file: BoundedFile, size: int | None) -> None:
+    with pytest.raises(LogCorrupt, match="where a record should begin"):
+        file.read(size)
+
+
+# --- test_absurd_mcap ---
+
+
+MIB = 1 << 20
+
+
+def test_small_messages_do_not_keep_large_chunks_in_memory(tmp_path: Path) -> None:
+    """16 chunks of 8 MB that overlap in time, each with one scan among images that are not read."""
+    image = Message("/other", "sensor_msgs/Image", T0, bytes(8 * MIB))
+    messages = []
+    for i in range(16):
+        messages += [image, ros().cloud("/points", T0 + i * STEP, [[1, 2, 3]])]
+    path = write_mcap(tmp_path / "a.mcap", messages, chunk_size=7 * MIB)
+    assert path.stat().st_size < MIB
+    with peak_memory() as peak:
+        assert len(read(path, ReadConfig(assume_identity=True))[0]) == 16
+    assert peak.grown_bytes() < 66 * MIB

@@ -234,3 +234,59 @@ def test_the_unit_that_a_realsense_bag_names(tmp_path: Path, name: str) -> None:
     (scan,), report = read(with_camera(tmp_path / "a.mcap", unit, image), EVERY_PIXEL)
     np.testing.assert_allclose(scan.points_m, EXPECTED, atol=1e-5)
     assert any("units of 0.0002 m" in w for w in report.warnings)
+
+
+# --- test_absurd_depth ---
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, 1e300])
+@pytest.mark.parametrize("place", range(5))
+def test_cameras_with_absurd_distortion(tmp_path: Path, value: float, place: int) -> None:
+    """Refused, or points that are possible: never NaN."""
+    camera = ros().camera(INFO, T0, 6, 4, 100.0)
+    at = camera.data.index(struct.pack("<d", 100.0)) - 40 + 8 * place  # d stands right before k
+    assert camera.data[at : at + 8] == bytes(8)
+    camera = camera._replace(data=camera.data[:at] + struct.pack("<d", value) + camera.data[at + 8 :])
+    image = ros().image(TOPIC, T0, np.full((4, 6), 1000, np.uint16), "16UC1")
+    try:
+        (scan,), _ = read(write_mcap(tmp_path / "a.mcap", [camera, image]))
+    except PointCloudError as error:
+        assert INFO in error.message
+    else:
+        assert np.isfinite(scan.points_m).all()
+
+
+# --- test_edges_depth ---
+
+
+def camera(model: str, d: list[float]) -> Message:
+    """A CameraInfo of 64 x 48 pixels, its axis in the middle."""
+    k, p = [40.0, 0, 32, 0, 40, 24, 0, 0, 1], [40.0, 0, 32, 0, 0, 40, 24, 0, 0, 0, 1, 0]
+    return ros().camera(INFO, T0, 64, 48, 40.0, d=np.array(d), k=np.array(k), p=np.array(p), model=model)
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "equidistant"])
+def test_a_distorted_image_projects_back_onto_its_pixels(tmp_path: Path, model: str) -> None:
+    """By OpenCV's projection, the inverse of what is used for reading."""
+    d = [-0.1, 0.02, 0.001, -0.001, 0.0] if model == "plumb_bob" else [0.01, -0.004, 0.002, 0.0]
+    image = ros().image(TOPIC, T0, np.full((48, 64), 2000, np.uint16), "16UC1")
+    path = write_mcap(tmp_path / "a.mcap", [camera(model, d), image])
+    (scan,), _ = read(path, ReadConfig(depth_stride=1))
+    optical = np.column_stack((-scan.points_m[:, 1], -scan.points_m[:, 2], scan.points_m[:, 0]))
+    k = np.array([[40.0, 0, 32], [0, 40, 24], [0, 0, 1]])
+    project = cv2.fisheye.projectPoints if model == "equidistant" else cv2.projectPoints
+    pixels = project(optical.astype(float)[:, None], np.zeros(3), np.zeros(3), k, np.array(d))[0][:, 0]
+    v, u = np.mgrid[:48, :64]
+    np.testing.assert_allclose(pixels, np.column_stack((u.ravel(), v.ravel())), atol=0.05)
+    rectified = write_mcap(
+        tmp_path / "b.mcap", [camera(model, d), image._replace(topic="/camera/depth/image_rect")]
+    )
+    (plain,), _ = read(rectified, ReadConfig(depth_stride=1))
+    np.testing.assert_allclose(plain.points_m[:, 1], -(u.ravel() - 32) / 40 * 2, atol=1e-5)
+
+
+def test_an_image_without_pixels_is_an_empty_scan(tmp_path: Path) -> None:
+    to = ros()
+    images = [to.image(TOPIC, T0 + i, np.ones((i, i), np.uint16), "16UC1") for i in (0, 2)]
+    (scan, _), _ = read(write_mcap(tmp_path / "a.mcap", [to.camera(INFO, T0, 0, 0, 40.0), *images]))
+    assert scan.points_m.shape == (0, 3)

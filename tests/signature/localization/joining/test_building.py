@@ -12,15 +12,17 @@ import pytest
 
 from pc2grid.errors import DatabaseError
 from pc2grid.geometry import SE2
-from pc2grid.model import UNKNOWN, OccupancyGrid, Precision, Trajectory
+from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, Precision, Trajectory
 from signature.config import Config
 from signature.database import Label, SubmapDatabase, maintenance, open_database
-from signature.database.protocol import BuildingFrame
-from signature.localization.joining.building import join_sessions, map_of
+from signature.database.protocol import BuildingFrame, Deformation
+from signature.localization.answer import answer_in_building, covariance_in_building
+from signature.localization.joining.building import building_map, join_sessions, map_of
+from signature.localization.localizer import locate_map
 from signature.sessions import add_sessions, provenance
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
 from tests.helpers.session_maps import session, way
-from tests.helpers.simulated_drives import office, plan
+from tests.helpers.simulated_drives import building, office, office_part, plan
 
 OTHER = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
 NONE: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
@@ -159,3 +161,123 @@ def test_the_map_of_a_building_holds_all_its_sessions(stored: Path) -> None:
     assert whole.free_m2 == pytest.approx(office_m2, rel=0.03)
     # A room of the east, where only that session was, and the corridor, in the frame of the west.
     assert whole.is_free(19.0, 7.0) and whole.is_free(1.0, 7.0) and not whole.is_free(14.5, 10.0)
+
+
+# --- One map of several: what the newest session that is sure of a cell says ---
+
+
+_ = UNKNOWN
+
+
+def grid(rows: list[list[int]]) -> OccupancyGrid:
+    """Rows from the top down, cells of 1 m, the lower left corner at (0, 0)."""
+    return OccupancyGrid(cells=np.array(rows[::-1], np.int8), resolution_m=1.0, origin_m=(0.0, 0.0))
+
+
+def at(x: float = 0.0, y: float = 0.0, yaw: float = 0.0, bend: Deformation = ()) -> BuildingFrame:
+    exact = ((0.0, 0.0, 0.0),) * 3
+    return BuildingFrame(name="old", T_building_session=SE2(x, y, yaw), covariance=exact, bend=bend)
+
+
+OLD = grid([[OCCUPIED, OCCUPIED, OCCUPIED], [FREE, FREE, OCCUPIED]])
+NEW = grid([[_, FREE, _], [_, OCCUPIED, _]])
+
+
+def test_the_newest_that_knows_a_cell_decides() -> None:
+    whole = building_map([(OLD, at()), (NEW, at())])
+    assert whole.cells[::-1].tolist() == [[OCCUPIED, FREE, OCCUPIED], [FREE, OCCUPIED, OCCUPIED]]
+
+
+def test_maps_are_moved_and_turned_into_one_frame() -> None:
+    """The new one, a quarter turn counterclockwise, stands left of the old one."""
+    whole = building_map([(OLD, at()), (NEW, at(0.0, 0.0, math.pi / 2))])
+    assert whole.origin_m == (-2.0, 0.0)
+    assert whole.cells[::-1].tolist() == [
+        [_, _, _, _, _],
+        [FREE, OCCUPIED, OCCUPIED, OCCUPIED, OCCUPIED],
+        [_, _, FREE, FREE, OCCUPIED],
+    ]
+
+
+def test_a_bent_map_is_straight_in_the_building() -> None:
+    """A wall of 30 m, drawn with a step for every 10 m: it leaves its line by 2 cells."""
+    cells = np.zeros((9, 300), np.int8)
+    for begin, row in ((0, 4), (100, 5), (200, 6)):
+        cells[row, begin : begin + 100] = OCCUPIED
+    drawn = OccupancyGrid(cells=cells, resolution_m=0.1, origin_m=(0.0, 0.0))
+    places = tuple((x, 0.45, 0.0, -0.1 * int(x / 10.0), 0.0) for x in np.arange(0.5, 30.0).tolist())
+    whole = building_map([(drawn, at(5.0, bend=places))])
+    rows, columns = np.nonzero(whole.occupied)
+    x, y = whole.to_point(np.column_stack((rows, columns))).T
+    # Where the bend changes, cells round to one beside the line.
+    assert np.abs(y - 0.45).max() < 0.1 + 1e-6 and (np.histogram(x, np.arange(5.0, 35.1))[0] >= 10).all()
+    # Nothing of the map was cut off that the bend moves beyond its edges.
+    assert whole.free_m2 == pytest.approx(drawn.free_m2, rel=0.02)
+
+
+# --- Poses in the maps of joined sessions, as they are in the frame of their building ---
+
+
+FRAME = BuildingFrame(
+    name="ground floor",
+    T_building_session=SE2(30.0, -10.0, math.pi / 2),
+    covariance=((4e-4, 1e-4, 0.0), (1e-4, 9e-4, 0.0), (0.0, 0.0, 1e-6)),
+)
+
+
+def test_an_answer_is_moved_with_all_its_poses() -> None:
+    answer = locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
+    assert answer.status == "located" and answer.T_map_base is not None and answer.frame is None
+    moved = answer_in_building(answer, {"monday": FRAME})
+    # A quarter turn: (9, 7) becomes (-7, 9), and then the shift.
+    assert moved.T_map_base is not None and moved.frame == "ground floor"
+    assert (moved.T_map_base.x, moved.T_map_base.y) == pytest.approx((23.0, -1.0), abs=0.1)
+    assert moved.T_map_base.yaw == pytest.approx(math.pi / 2, abs=0.02)
+    assert moved.T_map_odom == moved.T_map_base == moved.hypotheses[0].fit.T_map_query
+    assert moved.history[-1].pose == moved.T_map_base
+    document = moved.to_json()
+    assert document["frame"] == document["hypotheses"][0]["frame"] == "ground floor"
+    assert document["pose"] is not None and document["pose"]["x"] == moved.T_map_base.x
+
+
+def test_an_answer_in_a_bent_map_moves_as_its_place_does() -> None:
+    """East of x = 4 m the map lies 0.3 m too far north; in the west it is right."""
+    bend = tuple((x, y, 0.0, -0.3 * (x > 4.0), 0.0) for x in (0.0, 8.0) for y in (2.0, 7.0, 12.0))
+    answer = locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
+    straight, bent = (
+        answer_in_building(answer, {"monday": replace(FRAME, bend=rows)}) for rows in ((), bend)
+    )
+    assert straight.T_map_base is not None and bent.T_map_base is not None
+    # South in the map is east in the building, which is turned by a quarter.
+    assert bent.T_map_base.x - straight.T_map_base.x == pytest.approx(0.3, abs=0.02)
+    assert bent.T_map_base.y == pytest.approx(straight.T_map_base.y, abs=0.02)
+    assert bent.T_map_odom == bent.T_map_base == bent.hypotheses[0].fit.T_map_query
+    assert bent.history[-1].pose == bent.T_map_base
+
+
+def test_an_answer_in_a_session_that_was_not_joined_stays() -> None:
+    answer = locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
+    moved = answer_in_building(answer, {"tuesday": FRAME})
+    assert moved.T_map_base == answer.T_map_base and moved.covariance == pytest.approx(answer.covariance)
+    assert moved.to_json()["frame"] is moved.to_json()["hypotheses"][0]["frame"] is None
+
+
+def test_the_covariance_holds_how_exactly_the_session_lies_in_its_building() -> None:
+    """Against 20,000 draws of both, which give a standard deviation to half a percent."""
+    rng = np.random.default_rng(0)
+    own, pose = np.diag([1e-2, 1e-4, 1e-4]), SE2(20.0, 5.0, 0.3)
+    T = FRAME.T_building_session
+    draws = []
+    for off, frame_off in zip(
+        rng.multivariate_normal(np.zeros(3), own, 20_000),
+        rng.multivariate_normal(np.zeros(3), np.array(FRAME.covariance), 20_000),
+        strict=True,
+    ):
+        there = SE2(T.x + frame_off[0], T.y + frame_off[1], T.yaw + frame_off[2]) @ SE2(
+            pose.x + off[0], pose.y + off[1], pose.yaw + off[2]
+        )
+        draws.append((there.x, there.y, there.yaw))
+    expected = np.cov(np.array(draws).T)
+    found = covariance_in_building(own, pose, FRAME)
+    sigmas = np.sqrt(np.diag(expected))
+    assert found / np.outer(sigmas, sigmas) == pytest.approx(expected / np.outer(sigmas, sigmas), abs=0.03)
