@@ -73,10 +73,7 @@ def planar_scan(x_m: float) -> np.ndarray:
     """(1080, 3) float32: the walls of a room of 8 x 6 m, seen from (x_m, 0)."""
     angle = np.linspace(-3.1, 3.1, 360)
     c, s = np.cos(angle), np.sin(angle)
-    range_m = np.minimum(
-        np.maximum((5 - x_m) / c, (-3 - x_m) / c),
-        np.maximum(4 / s, -2 / s),
-    )
+    range_m = np.minimum(np.maximum((5 - x_m) / c, (-3 - x_m) / c), np.maximum(4 / s, -2 / s))
     ring = np.column_stack((range_m * c, range_m * s))
     return np.vstack([np.column_stack((ring, np.full(360, z))) for z in (-0.2, 0.1, 0.4)]).astype("f4")
 

@@ -89,53 +89,6 @@ def assert_says(result: subprocess.CompletedProcess[str], code: int, *words: str
         assert word in result.stderr, result.stderr
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        ("convert none.mcap -o x.submaps", 1, ["none.mcap"]),
-        ("convert text.mcap -o x.submaps", 1, ["text.mcap"]),
-        ("convert empty.mcap -o x.submaps", 1, ["empty.mcap", "empty"]),
-        ("convert . -o x.submaps", 1, ["."]),
-        ("convert none.yaml -o x.submaps", 1, ["none.yaml"]),
-        ("convert bad.yaml -o x.submaps", 1, ["bad.yaml", "image"]),
-        ("convert house.yaml -o missing/x.submaps", 1, ["no folder missing"]),
-        ("convert house.yaml house.yaml -o x.submaps", 2, ["'house'"]),
-        ("convert drive.mcap -o x.submaps --topic /scam", 1, ["/scam", "/scan"]),
-        ("convert drive.mcap -o x.submaps --start 1e6", 1, ["no scan", "the log lasts"]),
-        ("convert drive.mcap -o x.submaps --set partition.radios_m=5", 2, ["partition.radius_m"]),
-        ("convert drive.mcap -o x.submaps --set partition.radius_m=-5", 2, ["partition.radius_m", "greater"]),
-        ("convert drive.mcap -o x.submaps --set radius_m", 2, ["section.key=value"]),
-        ("convert drive.mcap -o x.submaps --config none.toml", 2, ["none.toml", "no such file"]),
-        ("convert drive.mcap -o x.submaps --config text.mcap", 2, ["text.mcap", "not TOML"]),
-        ("convert drive.mcap -o taken.submaps", 1, ["taken.submaps", "exists", "--force"]),
-        ("convert drive.mcap -o house.pgm", 1, ["house.pgm", "house.submaps"]),
-        ("convert", 2, ["--help"]),
-        ("convert drive.mcap", 2, ["output"]),
-        ("nonsense", 2, ["nonsense"]),
-        ("relocalize drive.mcap --database none.submaps", 1, ["none.submaps", "pc2grid convert"]),
-        ("relocalize drive.mcap --database text.mcap", 1, ["text.mcap", "not a pc2grid database"]),
-        ("relocalize drive.mcap --database empty.mcap", 1, ["empty.mcap", "empty file"]),
-        ("relocalize drive.mcap --database mongodb://h/d", 1, ["mongodb://"]),
-        ("export none.submaps --map m", 1, ["none.submaps"]),
-        ("export none.submaps", 2, ["nothing to export"]),
-        ("db check text.mcap", 1, ["not a pc2grid database"]),
-        ("db info .", 1, ["folder"]),
-        ("db merge none.submaps -o y.submaps", 1, ["none.submaps"]),
-        ("db copy none.submaps -o y.submaps", 1, ["none.submaps"]),
-    ],
-)
-def test_wrong_input_is_one_line_and_leaves_nothing(
-    house: Path, arguments: str, code: int, words: list[str]
-) -> None:
-    (house / "text.mcap").write_text("this is not a recording, nor = [ TOML\n")
-    (house / "empty.mcap").write_bytes(b"")
-    (house / "taken.submaps").write_text("something else\n")
-    (house / "bad.yaml").write_text("resolution: 0.05\norigin: [0, 0, 0]\n")
-    before = sorted(house.iterdir())
-    assert_says(pc2grid(*arguments.split(), cwd=house), code, *words)
-    assert sorted(house.iterdir()) == before
-
-
 def test_map_and_recording_become_databases_and_the_recording_is_found(house: Path, tmp_path: Path) -> None:
     database = tmp_path / "b.submaps"
     made = pc2grid("convert", house / "house.yaml", "-o", database, "--json", cwd=tmp_path)

@@ -111,10 +111,7 @@ def test_frozen_types_are_printed_as_the_schema_says(kind: Any) -> None:
 
 
 def test_every_document_is_validated_by_a_test() -> None:
-    elsewhere = {
-        "watch": "pc2grid_cli/test_watch.py",
-        "watch-check": "pc2grid_cli/test_known_pose.py",
-    }
+    elsewhere = {"watch": "pc2grid_cli/test_watch.py", "watch-check": "pc2grid_cli/test_known_pose.py"}
     for name, file in elsewhere.items():
         assert f'schema("{name}")' in (Path(__file__).parents[1] / file).read_text()
     assert {name for name, _, _ in COMMANDS} | set(elsewhere) == set(DOCUMENTS)

@@ -54,10 +54,7 @@ def twins(folder: Path) -> None:
     assert pc2grid("simulate", folder / "left.yaml", folder / "plain.mcap", *laser).exit_code == 0
     (start_ns, first), *_, (end_ns, last) = true_poses(folder)
     covariance = np.diag([0.25, 0.25, 0, 0, 0, 0.07])
-    believed = [
-        ("/initialpose", start_ns, first),
-        ("/amcl_pose", end_ns, last @ SE2(0.8, 0.0, 0.0)),
-    ]
+    believed = [("/initialpose", start_ns, first), ("/amcl_pose", end_ns, last @ SE2(0.8, 0.0, 0.0))]
     with (folder / "plain.mcap").open("rb") as source, (folder / "drive.mcap").open("wb") as target:
         writer = Writer(target)
         writer.start(profile="ros2")
@@ -186,43 +183,6 @@ def test_a_right_pose_is_fine_and_a_wrong_one_lost(rooms: tuple[Path, SE2]) -> N
     assert math.dist((document["pose"]["x"], document["pose"]["y"]), (truth.x, truth.y)) < 3 * RESOLUTION_M
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "told"),
-    [
-        ("--near 1 1 0", 2, "radius > 0"),
-        ("--near 1 1 nan", 2, "radius > 0"),
-        ("--near 1 1", 2, "3 arguments"),
-        ("--near 1 1 1 --check 1 1 0", 2, "do not go together"),
-        ("--near 1 1 1 --session attic", 2, "there is: twins"),
-        ("--session twins", 2, "--near X Y RADIUS"),
-        ("--near-pose none.json", 2, "none.json"),
-        ("--near-pose twins.yaml", 2, "not a PoseWithCovarianceStamped"),
-        ("--near-pose /scan", 1, "holds no pose"),
-        ("--near-pose /odom", 1, "frame odom"),
-        ("--check-topic /none", 1, "/amcl_pose"),
-        ("--check 1 nan 0", 2, "--check"),
-        ("--check 1 1 0 --plot out.png", 2, "--plot"),
-    ],
-)
-def test_mistakes_are_named(
-    words: str, code: int, told: str, rooms: tuple[Path, SE2], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(rooms[0])
-    console = Console()
-    arguments = ["relocalize", "drive.mcap", "-d", "twins.submaps", *words.split()]
-    runner = CliRunner()
-    done = runner.invoke(app, arguments, obj=console, standalone_mode=False)
-    assert done.exception is not None and done.stdout == ""
-    assert getattr(done.exception, "exit_code", 1) == code
-    message = getattr(done.exception, "message", str(done.exception))
-    assert told in f"{message} {getattr(done.exception, 'hint', '')}"
-
-
-def test_a_map_has_no_robot(rooms: tuple[Path, SE2], monkeypatch: pytest.MonkeyPatch) -> None:
-    done = pc2grid("relocalize", rooms[0] / "left.yaml", "-d", rooms[0] / "twins.submaps", "--near", 1, 1, 1)
-    assert done.exit_code != 0 and "no robot in a map" in str(done.exception)
-
-
 def test_a_pose_file_is_read_as_it_is_written_and_as_ros2_prints_it(tmp_path: Path) -> None:
     covariance = np.array([[0.2, 0.1, 0.0], [0.1, 0.3, 0.01], [0.0, 0.01, 0.05]])
     message = initialpose(12_000_000_345, SE2(1.0, -2.0, 2.5), covariance)
@@ -265,6 +225,8 @@ def test_a_missing_pose_of_a_robot_is_named(rooms: tuple[Path, SE2]) -> None:
         "watch", folder / "drive.mcap", "-d", folder / "twins.submaps", "--check-topic", "/amcl_pos"
     )
     assert done.exit_code == 1 and "did you mean /amcl_pose" in str(done.exception)
+    done = relocalize(folder, "--check-topic", "/none")
+    assert done.exit_code == 1 and "/amcl_pose" in str(done.exception)
     done = pc2grid(
         *("watch", folder / "drive.mcap", "-d", folder / "twins.submaps"),
         *("--check-topic", "/amcl_pose", "--publish", "tf"),

@@ -1,4 +1,4 @@
-"""What a user reads who mistook one thing for another: the error, and what to type next."""
+"""What a user reads who typed what cannot be done: the error, and what to type next."""
 
 from __future__ import annotations
 
@@ -15,13 +15,16 @@ from typer.testing import CliRunner
 from pc2grid.errors import (
     ConfigError,
     DatabaseError,
+    FrameError,
     LogNotFound,
+    LogTruncated,
     MapFileError,
     NoScans,
     NotADatabase,
     NotALog,
     OutputError,
     Pc2GridError,
+    TopicError,
 )
 from pc2grid.io.maps import save_map
 from pc2grid.model import MISSING_FILES, ReadReport
@@ -31,7 +34,191 @@ from pc2grid_cli.main import REMOVED, app
 from signature.database.maintenance import store
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import STEP, T0, drive, ros, write_mcap
+from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import office
+
+
+@shared_folder("office_folder")
+def desk(folder: Path) -> None:
+    """The office, and files of every other kind: a.mcap (a lidar), monday.submaps, maps without an image or
+    keys, text, an empty file, files and folders in the way of outputs."""
+    write_mcap(folder / "a.mcap", drive())
+    store(folder / "monday.submaps", [make_entry("monday")], keep=False)
+    (folder / "lost.yaml").write_text((folder / "office.yaml").read_text().replace("office.pgm", "x.pgm"))
+    (folder / "bad.yaml").write_text("resolution: 0.05\norigin: [0, 0, 0]\n")
+    (folder / "text.mcap").write_text("this is not a recording, nor = [ TOML\n")
+    (folder / "taken.submaps").write_text("something else\n")
+    for name in ("empty.mcap", "taken.png", "taken.tum"):
+        (folder / name).touch()
+    (folder / "folder").mkdir()
+
+
+EXPORT, LOCATE, WATCH = "export none.submaps", "relocalize none.mcap -d none.submaps", "watch -d b.submaps"
+MAKE, FIND = "convert drive.mcap -o x.submaps", "relocalize drive.mcap -d b.submaps"
+# fmt: off
+REFUSED: list[tuple[str, int, type[Exception] | None, tuple[str, ...]]] = [
+    # one thing mistaken for another
+    ("relocalize b.submaps -d a.mcap", 1, NotALog, (
+        "b.submaps: a submap database, where a recording or a map is expected",
+        "hint: are they swapped? pc2grid relocalize a.mcap -d b.submaps")),
+    ("convert b.submaps -o c.submaps", 1, NotALog, (
+        "b.submaps: a submap database, not a recording", "`pc2grid info b.submaps` shows what is in it")),
+    ("convert lost.yaml -o c.submaps", 1, MapFileError, (
+        "/x.pgm: cannot read the map's image: No such file or directory", "copy it to that place")),
+    ("convert office.pgm -o c.submaps", 1, NotALog, ("looks like a PGM image", "give the .yaml")),
+    ("relocalize ws://localhost:8765 -d b.submaps", 1, LogNotFound, ("no such file", "pc2grid watch")),
+    ("relocalize - -d b.submaps", 1, LogNotFound, ("-: no such file", "pc2grid watch")),
+    ("relocalize /dev/null -d b.submaps", 1, LogNotFound, ("not a regular file", "pc2grid watch")),
+    ("relocalize none.mcap -d b.submaps", 1, LogNotFound, ("none.mcap: no such file", "check the path")),
+    ("relocalize a.mcap -d a.mcap", 1, NotADatabase, (
+        "error: a.mcap: not a pc2grid database\n",
+        "hint: make one of it: pc2grid convert a.mcap -o a.submaps\n")),
+    ("relocalize a.mcap -d office.pgm", 1, NotADatabase, ("convert LOG -o",)),
+    # what is not there, or not what its name says
+    ("convert none.mcap -o x.submaps", 1, LogNotFound, ("none.mcap",)),
+    ("convert text.mcap -o x.submaps", 1, NotALog, ("text.mcap",)),
+    ("convert empty.mcap -o x.submaps", 1, LogTruncated, ("empty.mcap", "empty")),
+    ("convert folder -o x.submaps", 1, LogNotFound, ("folder",)),
+    ("convert none.yaml -o x.submaps", 1, MapFileError, ("none.yaml",)),
+    ("convert bad.yaml -o x.submaps", 1, MapFileError, ("bad.yaml", "image")),
+    ("convert office.yaml office.yaml -o x.submaps", 2, ConfigError, ("'office'",)),
+    ("relocalize drive.mcap --database none.submaps", 1, NotADatabase, ("none.submaps", "pc2grid convert")),
+    ("relocalize drive.mcap --database text.mcap", 1, NotADatabase, ("text.mcap: not a pc2grid database",)),
+    ("relocalize drive.mcap --database empty.mcap", 1, NotADatabase, ("empty.mcap: empty file",)),
+    ("relocalize drive.mcap --database mongodb://h/d", 1, DatabaseError, ("mongodb://",)),
+    ("export none.submaps --map m", 1, NotADatabase, ("none.submaps",)),
+    ("db check text.mcap", 1, NotADatabase, ("not a pc2grid database",)),
+    ("db info .", 1, NotADatabase, ("folder",)),
+    ("db merge none.submaps -o y.submaps", 1, NotADatabase, ("none.submaps",)),
+    ("db copy none.submaps -o y.submaps", 1, NotADatabase, ("none.submaps",)),
+    # options
+    (f"{MAKE} --topic /scam", 1, TopicError, ("/scam", "/scan")),
+    (f"{MAKE} --start 1e6", 1, NoScans, ("no scan", "the log lasts")),
+    (f"{MAKE} --set partition.radios_m=5", 2, ConfigError, ("partition.radius_m",)),
+    (f"{MAKE} --set partition.radius_m=-5", 2, ConfigError, ("partition.radius_m", "greater")),
+    (f"{MAKE} --set radius_m", 2, ConfigError, ("section.key=value",)),
+    (f"{MAKE} --set grid.x=1", 2, ConfigError, (
+        "--set: unknown setting grid.x\n", "hint: `pc2grid config dump` lists all settings\n")),
+    (f"{MAKE} --set grid.resolution_m=1", 2, ConfigError, (
+        "--set: unknown setting grid.resolution_m\n", "hint: did you mean projection.resolution_m?\n")),
+    (f"{MAKE} --set red.topic=/a", 2, ConfigError, (
+        "--set: unknown setting red.topic\n", "hint: did you mean read.topic?\n")),
+    (f"{MAKE} --set partition.radius=5", 2, ConfigError, (
+        "--set: unknown setting partition.radius\n", "hint: did you mean partition.radius_m?\n")),
+    (f"{MAKE} --config none.toml", 2, ConfigError, ("none.toml", "no such file")),
+    (f"{MAKE} --config text.mcap", 2, ConfigError, ("text.mcap", "not TOML")),
+    ("convert", 2, None, ("--help",)),
+    ("convert drive.mcap", 2, None, ("output",)),
+    ("nonsense", 2, None, ("nonsense",)),
+    ("simulate a.mcap", 2, None, ("Choose from: lidar, laser, depth",)),
+    ("export none.submaps", 2, ConfigError, ("nothing to export",)),
+    # what cannot be written: known before any work, as the recordings and databases do not exist
+    (f"{EXPORT} --trajectory way.csv", 1, OutputError, (
+        "way.csv: --trajectory does not write the format .csv",)),
+    (f"{EXPORT} --mcap map.bag", 1, OutputError, ("map.bag: --mcap does not write the format .bag",)),
+    (f"{EXPORT} --map plan.png", 1, OutputError, ("plan.png: --map writes STEM.yaml and STEM.pgm",)),
+    (f"{EXPORT} --cloud walls.las", 1, OutputError, ("walls.las: --cloud",)),
+    (f"{EXPORT} --cloud walls", 1, OutputError, ("(no suffix)",)),
+    (f"{EXPORT} --graph ways.dot", 1, OutputError, ("ways.dot: --graph",)),
+    (f"{EXPORT} --plot a.pdf", 1, OutputError, ("a.pdf: --plot",)),
+    (f"{EXPORT} --report a.pdf", 1, OutputError, ("a.pdf: --report",)),
+    (f"{EXPORT} --g2o nowhere/a.g2o", 1, OutputError, ("a.g2o: cannot write: no folder nowhere",)),
+    (f"{EXPORT} --map nowhere/a", 1, OutputError, ("a.yaml: cannot write: no folder nowhere",)),
+    (f"{EXPORT} --plot taken.png", 1, OutputError, ("taken.png: exists already",)),
+    (f"{EXPORT} --plot folder", 1, OutputError, ("folder: is a folder",)),
+    (f"{LOCATE} --trajectory way.csv", 1, OutputError, ("way.csv: --trajectory",)),
+    (f"{LOCATE} --csv answers.json", 1, OutputError, (
+        "answers.json: --csv does not write the format .json",)),
+    (f"{LOCATE} -o answer.bag", 1, OutputError, ("answer.bag: --output",)),
+    (f"{LOCATE} --initialpose pose.png", 1, OutputError, ("pose.png: --initialpose",)),
+    (f"{LOCATE} --plot nowhere/a.png", 1, OutputError, ("a.png: cannot write: no folder nowhere",)),
+    ("convert none.mcap -o x.mcap", 1, OutputError, (
+        "x.mcap: a submap database is not written as .mcap",)),
+    ("convert none.mcap -o nowhere/x.submaps", 1, OutputError, ("cannot write: no folder nowhere",)),
+    ("convert none.mcap -o /proc/x.submaps", 1, OutputError, ("/proc/x.submaps: cannot write: ",)),
+    ("simulate nowhere/x.mcap --sensor laser", 1, OutputError, ("x.mcap: cannot write: no folder nowhere",)),
+    ("simulate taken.mcap --sensor laser", 1, OutputError, ("taken.tum: exists already",)),
+    ("demo -o /proc/demo", 1, OutputError, ("/proc/demo: cannot make this folder: ",)),
+    ("compare sensors part.yaml -o /proc/out", 1, OutputError, ("/proc/out: cannot make this folder: ",)),
+    ("convert drive.mcap -o taken.submaps", 1, OutputError, ("taken.submaps", "exists", "--force")),
+    ("convert drive.mcap -o office.pgm", 1, OutputError, ("office.pgm", "office.submaps")),
+    # what is known of the pose
+    (f"{FIND} --near 1 1 0", 2, ConfigError, ("radius > 0",)),
+    (f"{FIND} --near 1 1 nan", 2, ConfigError, ("radius > 0",)),
+    (f"{FIND} --near 1 1", 2, None, ("3 arguments",)),
+    (f"{FIND} --near 1 1 1 --check 1 1 0", 2, ConfigError, ("do not go together",)),
+    (f"{FIND} --near 1 1 1 --session attic", 2, ConfigError, ("there is: office",)),
+    (f"{FIND} --session office", 2, ConfigError, ("--near X Y RADIUS",)),
+    (f"{FIND} --near-pose none.json", 2, ConfigError, ("none.json",)),
+    (f"{FIND} --near-pose office.yaml", 2, ConfigError, ("not a PoseWithCovarianceStamped",)),
+    (f"{FIND} --near-pose /scan", 1, TopicError, ("holds no pose",)),
+    (f"{FIND} --near-pose /odom", 1, FrameError, ("frame odom",)),
+    (f"{FIND} --check 1 nan 0", 2, ConfigError, ("--check",)),
+    (f"{FIND} --check 1 1 0 --plot out.png", 2, ConfigError, ("--plot",)),
+    ("relocalize office.yaml -d b.submaps --near 1 1 1", 2, ConfigError, ("no robot in a map",)),
+    # what is of one query, of a robot, or of a recording
+    ("relocalize drive.mcap drive.mcap -d b.submaps --report out.html", 2, ConfigError, ("--report",)),
+    (f"{FIND} --every 3 --initialpose out.json", 2, ConfigError, ("--initialpose",)),
+    (f"{FIND} --every 3 --check 1 1 0", 2, ConfigError, ("--check",)),
+    ("relocalize office.yaml -d b.submaps --every 3", 2, ConfigError, ("--every",)),
+    (f"{WATCH} rosbridge://robot", 1, LogNotFound, ("rosbridge:// cannot be followed", "hint: ")),
+    (f"{WATCH} zenoh://robot:7447", 1, LogNotFound, ("zenoh:// cannot be followed", "hint: ")),
+    (f"{WATCH} -", 1, LogNotFound, ("standard input cannot be followed", "hint: ")),
+    (f"{WATCH} drive.mcap --publish tf", 2, ConfigError, ("takes no messages", "hint: ")),
+    (f"{WATCH} drive.mcap --topic /points", 1, TopicError, ("no topic /points", "hint: ")),
+    (f"{WATCH} b.submaps", 1, NotALog, ("not a recording", "hint: ")),
+    (f"{WATCH} drive.mcap --first --check-topic /tf", 2, ConfigError, (
+        "--check-topic goes on until it is stopped", "hint: ")),
+    (f"{WATCH} ws://robot:1 --first --publish tf", 2, ConfigError, (
+        "--publish tf goes on until it is stopped", "hint: ")),
+    (f"{WATCH} drive.mcap --keep", 2, None, ("--first", "hint: ")),
+    (f"{WATCH} drive.mcap --real-time --publish tf", 2, ConfigError, ("takes no messages", "hint: ")),
+    # what was removed
+    *((old.removeprefix("pc2grid "), 2, None, ("error: No such ", f"\nhint: {new}\n"))
+      for old, new in REMOVED.items()),
+]
+# fmt: on
+
+
+def files(folder: Path) -> dict[Path, tuple[int, int]]:
+    """Size and time of change of all that is in a folder."""
+    return {path: (path.stat().st_size, path.stat().st_mtime_ns) for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize(("command", "code", "error", "words"), REFUSED)
+def test_a_refusal_is_one_line_and_one_of_advice_and_leaves_nothing(
+    command: str,
+    code: int,
+    error: type[Exception] | None,
+    words: tuple[str, ...],
+    desk: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    raised: list[BaseException] = []
+    report = console.Console.report_error
+    monkeypatch.setattr(
+        console.Console, "report_error", lambda self, e: (raised.append(e), report(self, e))[1]
+    )
+    monkeypatch.setenv("PC2GRID_CONFIG", "")
+    monkeypatch.chdir(desk)
+    before = files(desk)
+    terminal = console.Console()
+    found = terminal.run(
+        lambda: app(command.split(), prog_name="pc2grid", standalone_mode=False, obj=terminal)
+    )
+    out, err = capsys.readouterr()
+    assert (found, out) == (code, "")
+    said = [line for line in err.splitlines(keepends=True) if not line.startswith("pc2grid: warning")]
+    if command == "convert":  # without a word, the help is printed
+        assert words[0] in err
+    else:
+        assert said[0].startswith("pc2grid: error: ") and "\\n" not in said[0]
+        assert len(said) <= 2 and all(line.startswith("hint: ") for line in said[1:])
+        assert len(said) == 2 or error is not OutputError
+        assert all(word in "".join(said) for word in words), err
+    assert error is None or type(raised[0]) is error
+    assert files(desk) == before
 
 
 @pytest.fixture
@@ -40,70 +227,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     write_mcap(tmp_path / "a.mcap", drive())
     store(tmp_path / "b.submaps", [make_entry("monday")], keep=False)
     save_map(office(), tmp_path / "office")
-    (tmp_path / "lost.yaml").write_text((tmp_path / "office.yaml").read_text().replace("office.pgm", "x.pgm"))
     return tmp_path
-
-
-@pytest.mark.parametrize(
-    ("command", "kind", "words", "hint"),
-    [
-        (
-            "relocalize b.submaps -d a.mcap",
-            NotALog,
-            "b.submaps: a submap database, where a recording or a map is expected",
-            "are they swapped? pc2grid relocalize a.mcap -d b.submaps",
-        ),
-        (
-            "convert b.submaps -o c.submaps",
-            NotALog,
-            "b.submaps: a submap database, not a recording",
-            "`pc2grid info b.submaps` shows what is in it",
-        ),
-        (
-            "convert lost.yaml -o c.submaps",
-            MapFileError,
-            "/x.pgm: cannot read the map's image: No such file or directory",
-            "copy it to that place",
-        ),
-        ("convert office.pgm -o c.submaps", NotALog, "looks like a PGM image", "give the .yaml"),
-        ("relocalize ws://localhost:8765 -d b.submaps", LogNotFound, "no such file", "pc2grid watch"),
-        ("relocalize - -d b.submaps", LogNotFound, "-: no such file", "pc2grid watch"),
-        ("relocalize /dev/null -d b.submaps", LogNotFound, "not a regular file", "pc2grid watch"),
-        ("relocalize none.mcap -d b.submaps", LogNotFound, "none.mcap: no such file", "check the path"),
-    ],
-)
-def test_the_error_says_what_to_do(
-    command: str, kind: type[Pc2GridError], words: str, hint: str, folder: Path
-) -> None:
-    error = CliRunner().invoke(app, command.split()).exception
-    assert isinstance(error, kind), error
-    assert words in error.message
-    assert error.hint is not None and hint in error.hint
-
-
-def refused(words: list[str], capsys: pytest.CaptureFixture[str]) -> list[str]:
-    """What is said of words that are no command."""
-    terminal = console.Console()
-    code = terminal.run(lambda: app(words, prog_name="pc2grid", standalone_mode=False, obj=terminal))
-    assert code == console.USAGE
-    return capsys.readouterr().err.splitlines()
-
-
-@pytest.mark.parametrize(("removed", "instead"), REMOVED.items())
-def test_what_was_removed_says_what_to_use(
-    removed: str, instead: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    said = refused(removed.split()[1:], capsys)
-    assert said[0].startswith("pc2grid: error: No such ")
-    assert said[1:] == [f"hint: {instead}"]
-
-
-def test_a_recording_in_place_of_a_database_says_how_to_make_one(folder: Path) -> None:
-    error = CliRunner().invoke(app, ["relocalize", "a.mcap", "-d", "a.mcap"]).exception
-    assert isinstance(error, NotADatabase) and error.message == "a.mcap: not a pc2grid database"
-    assert error.hint == "make one of it: pc2grid convert a.mcap -o a.submaps"
-    other = CliRunner().invoke(app, ["relocalize", "a.mcap", "-d", "office.pgm"]).exception
-    assert isinstance(other, NotADatabase) and other.hint is not None and "convert LOG -o" in other.hint
 
 
 def test_depth_images_without_their_camera_info_say_so(folder: Path) -> None:
@@ -127,22 +251,6 @@ def test_scans_out_of_order_get_a_hint(folder: Path) -> None:
     error = CliRunner().invoke(app, ["convert", "s.mcap", "-o", "x.submaps"]).exception
     assert isinstance(error, Pc2GridError) and "stamp goes back in time" in error.message
     assert error.hint is not None and "must increase" in error.hint and "--start" in error.hint
-
-
-@pytest.mark.parametrize(
-    ("assignment", "hint"),
-    [
-        ("grid.x=1", "`pc2grid config dump` lists all settings"),
-        ("grid.resolution_m=1", "did you mean projection.resolution_m?"),
-        ("red.topic=/a", "did you mean read.topic?"),
-        ("partition.radius=5", "did you mean partition.radius_m?"),
-    ],
-)
-def test_a_setting_that_is_not_known(assignment: str, hint: str) -> None:
-    words = ["convert", "a.mcap", "-o", "b.submaps", "--set", assignment]
-    error = CliRunner().invoke(app, words).exception
-    assert isinstance(error, ConfigError) and error.hint == hint
-    assert error.message == f"--set: unknown setting {assignment.partition('=')[0]}"
 
 
 def test_the_last_session_is_not_removed_unasked(folder: Path) -> None:
@@ -179,14 +287,6 @@ def test_another_label_is_named(folder: Path) -> None:
     assert "exists already, 'office' made with building = 'fr079', not None" in error.message
 
 
-def test_a_usage_error_is_one_readable_line(capsys: pytest.CaptureFixture[str]) -> None:
-    terminal = console.Console()
-    code = terminal.run(lambda: app(["simulate", "a.mcap"], standalone_mode=False, obj=terminal))
-    assert code == console.USAGE
-    line = capsys.readouterr().err.splitlines()[0]
-    assert "Choose from: lidar, laser, depth" in line and "\\n" not in line
-
-
 def test_text_is_calm_and_json_exact(folder: Path) -> None:
     assert CliRunner().invoke(app, ["convert", "office.yaml", "-o", "c.submaps"]).exit_code == 0
     locate = ["relocalize", "office.yaml", "-d", "c.submaps"]
@@ -196,55 +296,6 @@ def test_text_is_calm_and_json_exact(folder: Path) -> None:
 
 
 # --- What options name for writing is checked before any work; the answer is printed before files are ---
-
-
-EXPORT, LOCATE = "export none.submaps", "relocalize none.mcap -d none.submaps"
-
-
-@pytest.mark.parametrize(
-    ("command", "words"),
-    [
-        (f"{EXPORT} --trajectory way.csv", "way.csv: --trajectory does not write the format .csv"),
-        (f"{EXPORT} --mcap map.bag", "map.bag: --mcap does not write the format .bag"),
-        (f"{EXPORT} --map plan.png", "plan.png: --map writes STEM.yaml and STEM.pgm"),
-        (f"{EXPORT} --cloud walls.las", "walls.las: --cloud"),
-        (f"{EXPORT} --cloud walls", "(no suffix)"),
-        (f"{EXPORT} --graph ways.dot", "ways.dot: --graph"),
-        (f"{EXPORT} --plot a.pdf", "a.pdf: --plot"),
-        (f"{EXPORT} --report a.pdf", "a.pdf: --report"),
-        (f"{EXPORT} --g2o nowhere/a.g2o", "a.g2o: cannot write: no folder nowhere"),
-        (f"{EXPORT} --map nowhere/a", "a.yaml: cannot write: no folder nowhere"),
-        (f"{EXPORT} --plot taken.png", "taken.png: exists already"),
-        (f"{EXPORT} --plot folder", "folder: is a folder"),
-        (f"{LOCATE} --trajectory way.csv", "way.csv: --trajectory"),
-        (f"{LOCATE} --csv answers.json", "answers.json: --csv does not write the format .json"),
-        (f"{LOCATE} -o answer.bag", "answer.bag: --output"),
-        (f"{LOCATE} --initialpose pose.png", "pose.png: --initialpose"),
-        (f"{LOCATE} --plot nowhere/a.png", "a.png: cannot write: no folder nowhere"),
-        ("convert none.mcap -o x.mcap", "x.mcap: a submap database is not written as .mcap"),
-        ("convert none.mcap -o nowhere/x.submaps", "cannot write: no folder nowhere"),
-        ("convert none.mcap -o /proc/x.submaps", "/proc/x.submaps: cannot write: "),
-        ("simulate nowhere/x.mcap --sensor laser", "x.mcap: cannot write: no folder nowhere"),
-        ("simulate taken.mcap --sensor laser", "taken.tum: exists already"),
-        ("demo -o /proc/demo", "/proc/demo: cannot make this folder: "),
-        ("compare sensors part.yaml -o /proc/out", "/proc/out: cannot make this folder: "),
-    ],
-)
-def test_what_cannot_be_written_is_refused_before_any_work(
-    command: str, words: str, office_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("taken.png", "taken.tum"):
-        (tmp_path / name).touch()
-    (tmp_path / "folder").mkdir()
-    (tmp_path / "part.yaml").write_bytes((office_folder / "part.yaml").read_bytes())
-    before = sorted(tmp_path.iterdir())
-    # The recordings and databases do not exist: whoever looked at them first would say so.
-    error = CliRunner().invoke(app, command.split()).exception
-    assert isinstance(error, OutputError), error
-    assert words in error.message
-    assert error.hint
-    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_the_file_of_a_map_may_be_named_instead_of_its_stem(office_folder: Path, tmp_path: Path) -> None:

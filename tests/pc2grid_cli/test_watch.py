@@ -232,30 +232,6 @@ def test_a_robot_that_was_carried_away_is_told_so_in_words(here: Path, tmp_path:
     assert said[lost + 2].startswith("recovered in plan: x ") and said[-1].startswith("located in plan: x ")
 
 
-@pytest.mark.parametrize(
-    ("words", "code", "said"),
-    [
-        (["rosbridge://robot"], 1, "rosbridge:// cannot be followed"),
-        (["zenoh://robot:7447"], 1, "zenoh:// cannot be followed"),
-        (["-"], 1, "standard input cannot be followed"),
-        (["tuesday.mcap", "--publish", "tf"], 2, "takes no messages"),
-        (["tuesday.mcap", "--topic", "/points"], 1, "no topic /points"),
-        (["plan.submaps"], 1, "not a recording"),
-        (["tuesday.mcap", "--first", "--check-topic", "/tf"], 2, "--check-topic goes on until it is stopped"),
-        (["ws://robot:1", "--first", "--publish", "tf"], 2, "--publish tf goes on until it is stopped"),
-        (["tuesday.mcap", "--keep"], 2, "--first"),
-        (["tuesday.mcap", "--real-time", "--publish", "tf"], 2, "takes no messages"),
-    ],
-)
-def test_mistakes(
-    here: Path, capsys: pytest.CaptureFixture[str], words: list[str], code: int, said: str
-) -> None:
-    found, looks, err = watch(capsys, *words)
-    assert (found, looks) == (code, [])
-    assert said in err
-    assert "hint: " in err
-
-
 def test_a_robot_that_is_silent_is_given_up(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Robot(Recorded.read(here / "tuesday.mcap")) as robot:
         code, looks, err = watch(capsys, robot.url, "--timeout", "0.5")

@@ -18,7 +18,6 @@ import pytest
 from click.testing import Result
 from typer.testing import CliRunner
 
-from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
 from pc2grid.io import open_log
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
@@ -160,20 +159,3 @@ def test_others_go_on_if_a_recording_cannot_be_read(folder: Path, tmp_path: Path
     assert "failed" in done.stdout and "located" in done.stdout
     assert "text.mcap" in done.stderr
     relocalize(folder, "text.mcap text.mcap", code=1)
-
-
-@pytest.mark.parametrize(
-    ("names", "words", "said"),
-    [
-        ("a.mcap b.mcap", ("--report", "out.html"), "--report"),
-        ("a.mcap", ("--every", 3, "--initialpose", "out.json"), "--initialpose"),
-        ("a.mcap", ("--every", 3, "--check", 1, 1, 0), "--check"),
-        ("office.yaml", ("--every", 3), "--every"),
-    ],
-)
-def test_what_is_of_one_query_is_refused(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, names: str, words: Any, said: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError, match=said):
-        relocalize(folder, names, *words)

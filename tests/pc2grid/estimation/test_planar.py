@@ -200,10 +200,7 @@ def hall() -> tuple[F64, F64]:
 def scan_of(points_m: F64, *, mounted_m: float) -> Scan:
     T_base_sensor = pose_from_rotation_vector(np.zeros(3), (0.0, 0.0, mounted_m))
     return Scan(
-        stamp_ns=0,
-        sensor="lidar",
-        points_m=np.asarray(points_m, np.float32),
-        T_base_sensor=T_base_sensor,
+        stamp_ns=0, sensor="lidar", points_m=np.asarray(points_m, np.float32), T_base_sensor=T_base_sensor
     )
 
 
@@ -269,10 +266,7 @@ def moved(scan: Scan, height_m: float, pitch_deg: float) -> Scan:
 )
 @pytest.mark.parametrize("standing", [0, 40])
 def test_the_scans_of_the_first_metres_decide_whether_a_robot_is_on_wheels(
-    standing: int,
-    height_m: Callable[[int], float],
-    pitch_deg: Callable[[int], float],
-    carried: bool,
+    standing: int, height_m: Callable[[int], float], pitch_deg: Callable[[int], float], carried: bool
 ) -> None:
     small = LidarConfig(rate_hz=5.0, columns=300)
     config = SimulationConfig(length_m=4.0, seed=3, clutter=0, lidar=small)

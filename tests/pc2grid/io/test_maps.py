@@ -656,8 +656,7 @@ def yaml_bomb() -> str:
 
 @pytest.mark.fault(46)
 @pytest.mark.parametrize(
-    "key",
-    ["image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"],
+    "key", ["image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"]
 )
 @pytest.mark.parametrize("value", ["*l9", "0x" + "f" * 9000, "[*l9, 0, 0]", "{a: *l9}"])
 def test_values_of_billions_of_items_are_not_written_out(tmp_path: Path, key: str, value: str) -> None:

@@ -39,11 +39,7 @@ def test_keyframes_come_back_as_they_were(monkeypatch: pytest.MonkeyPatch, in_me
         keyframes.append(keyframe)
         keyframes[k // 2]  # reading moves the file; the next goes to its end all the same
     for got, want in zip(keyframes, kept, strict=True):
-        assert (got.index, got.T_session_base, got.restart) == (
-            want.index,
-            want.T_session_base,
-            want.restart,
-        )
+        assert (got.index, got.T_session_base, got.restart) == (want.index, want.T_session_base, want.restart)
         for name in ("stamp_ns", "hits_m", "normal_rad", "origin_m", "free_m", "height_m"):
             assert np.array_equal(getattr(got.planar_scan, name), getattr(want.planar_scan, name))
     keyframes.close()

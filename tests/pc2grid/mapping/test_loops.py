@@ -228,11 +228,7 @@ def test_a_recognizer_closes_loops_beyond_the_search_window() -> None:
         known_way_m=0.0,  # the search window is narrow here: short ways drift out of it, too
     )
     settled, found = closed(
-        poses,
-        planar_scans,
-        parameters=narrow,
-        candidate_parameters=wide,
-        recognizer=KnowsTheTruth(truth),
+        poses, planar_scans, parameters=narrow, candidate_parameters=wide, recognizer=KnowsTheTruth(truth)
     )
     assert farthest(alone, truth) > 3.0
     assert farthest(settled, truth) < 0.5 and sum(loop.accepted for loop in found.loops) > 3

@@ -35,11 +35,7 @@ WITHOUT_LOOPS = LoopParameters(compared=0)
 def on_one_floor(trajectory: Trajectory) -> Track:
     """What tracking says of scans on one floor."""
     count = len(trajectory)
-    return Track(
-        trajectory=trajectory,
-        disagreements=[None] * count,
-        readings=np.full((count, 4, 4), np.nan),
-    )
+    return Track(trajectory=trajectory, disagreements=[None] * count, readings=np.full((count, 4, 4), np.nan))
 
 
 def keyframes_of(

@@ -147,8 +147,7 @@ def test_later_parts_are_judged_by_the_trajectory_of_the_whole(
 ) -> None:
     """The map of the first three seconds has a frame of its own."""
     begun = Trajectory(
-        stamps_ns=driven.stamps_ns[:3],
-        T_session_base=np.array([(T_A_B @ pose(k)).lift() for k in range(3)]),
+        stamps_ns=driven.stamps_ns[:3], T_session_base=np.array([(T_A_B @ pose(k)).lift() for k in range(3)])
     )
     monkeypatch.setattr(judging, "sessions", lambda *_: {"map": begun})
     pair = Pair(query="a", map="a", kind="later part", window_s=1.0, windows=2, until_s=3.0)

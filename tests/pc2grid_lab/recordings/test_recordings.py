@@ -26,13 +26,7 @@ from tests.helpers.simulated_drives import plan
 
 RECORDINGS = (
     Recording(
-        name="a",
-        file="a.mcap",
-        building="office",
-        sensor="laser",
-        truth="a.tum",
-        poses="a.tum",
-        of_base=True,
+        name="a", file="a.mcap", building="office", sensor="laser", truth="a.tum", poses="a.tum", of_base=True
     ),
     Recording(name="b", file="b.mcap", building="office", sensor="laser", same_place=(0, 1)),
     Recording(

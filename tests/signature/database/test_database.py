@@ -9,11 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.errors import (
-    DatabaseError,
-    NotADatabase,
-    OutputError,
-)
+from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from pc2grid.model import Trajectory
 from signature.config import Config
 from signature.database import Label, create_database, maintenance, open_database

@@ -173,10 +173,7 @@ PARTS: dict[str, tuple[Any, dict[str, tuple[str, tuple[int, ...]]]]] = {
             "symmetry": ("float32", (3, 2)),
         },
     ),
-    "seen": (
-        {},
-        {"at_m": ("float32", (3, 2)), "place": ("int64", (3,)), "signatures": ("uint8", (3, 199))},
-    ),
+    "seen": ({}, {"at_m": ("float32", (3, 2)), "place": ("int64", (3,)), "signatures": ("uint8", (3, 199))}),
     "frame": (None, {}),
 }
 """What a session consists of; a field that is added to one of the stored types changes the format."""

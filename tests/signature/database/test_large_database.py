@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
@@ -29,15 +30,23 @@ MAPS = {
     **{f"other{k}": plan(14, 12, [tuple(wall) for wall in walls]) for k, walls in enumerate(WALLS)},
     "office": office(),
 }
-ALL = building(MAPS)
 PART = MAPS["office"].crop((8.0, 7.0), 5.0)
-SEEN = {
-    name: SeenPlaces.of(
-        grid, ALL.places.table.center_m[ALL.places.table.session_index == number], ALL.places.sight_m
-    )
-    for number, (name, grid) in enumerate(MAPS.items())
-}
-"""What is seen from the places of each map, as a database stores it."""
+
+
+@functools.cache
+def whole() -> MapIndex:
+    """The index of all maps."""
+    return building(MAPS)
+
+
+@functools.cache
+def seen() -> dict[str, SeenPlaces]:
+    """What is seen from the places of each map, as a database stores it."""
+    table, sight_m = whole().places.table, whole().places.sight_m
+    return {
+        name: SeenPlaces.of(grid, table.center_m[table.session_index == number], sight_m)
+        for number, (name, grid) in enumerate(MAPS.items())
+    }
 
 
 class _Counted(Mapping[str, OccupancyGrid]):
@@ -68,12 +77,14 @@ def test_few_maps_are_read_and_the_answer_is_the_same(monkeypatch: pytest.Monkey
     areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
     monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 2 * max(areas_m2.values()))
     maps = _Counted()
-    large = MapIndex(maps, ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2, stored=SEEN.get)
+    large = MapIndex(
+        maps, whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
+    )
     assert maps.read == []
     answer = locate_map(PART, large)
     assert 1 <= len(maps.read) <= 3 and len(set(maps.read)) == len(maps.read) and "office" in maps.read
     monkeypatch.undo()
-    expected = locate_map(PART, ALL)
+    expected = locate_map(PART, whole())
     assert answer.status == expected.status == "located" and answer.session == expected.session == "office"
     assert answer.T_map_base is not None and expected.T_map_base is not None
     apart = expected.T_map_base.inverse() @ answer.T_map_base  # refined from another proposal
@@ -86,7 +97,7 @@ def test_a_map_larger_than_what_is_searched_at_once_is_still_searched(
     monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 1.0)
     areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
     index = MapIndex(
-        _Counted(), ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2, stored=SEEN.get
+        _Counted(), whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
     )
     assert locate_map(PART, index).session == "office"
     rows = index.places.order(query_views(), (0.0, 0.0), index.config).rows
@@ -98,7 +109,9 @@ def test_the_maps_that_were_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 1.0)
     monkeypatch.setattr(building_file, "AT_ONCE_M2", 0.25 * sum(areas_m2.values()))
     maps = _Counted()
-    index = MapIndex(maps, ALL.places.table, ALL.made_with, Config(), areas_m2=areas_m2, stored=SEEN.get)
+    index = MapIndex(
+        maps, whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
+    )
     for number in (0, 1, 0, 2, 0, 1):  # two of seven are kept
         assert index.grids[number] is not None
     assert maps.read == ["other0", "other1", "other2", "other1"]
@@ -120,22 +133,18 @@ class News(Observer):
 
 def store_maps(file: Path, maps: Mapping[str, OccupancyGrid]) -> None:
     """A database of drawn maps."""
-    config = ALL.made_with
+    config = whole().made_with
     still = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
     for name, grid in maps.items():
         made = SessionMap(
-            session=name,
-            sensor="map",
-            grid=grid,
-            submaps=partition(grid, config.partition),
-            trajectory=still,
+            session=name, sensor="map", grid=grid, submaps=partition(grid, config.partition), trajectory=still
         )
         add_session(file, made, config, provenance(Path(name), "0" * 64, config))
 
 
 def query_views() -> tuple[View, ...]:
     """The views of `PART`."""
-    made_with = ALL.made_with
+    made_with = whole().made_with
     return query_of(PART, np.empty((0, 2)), made_with, made_with.relocalize).views
 
 
@@ -162,7 +171,7 @@ def test_places_are_selected_by_what_is_stored_and_computed_where_it_is_not(tmp_
     for path in (file, copied):
         news[path] = News()
         with open_database(path) as database:
-            index = MapIndex.of(database, ALL.made_with, news[path])
+            index = MapIndex.of(database, whole().made_with, news[path])
             answers[path] = locate_map(PART, index)
     assert answers[file].session == answers[copied].session == "office"
     assert answers[file].T_map_base == answers[copied].T_map_base
@@ -180,6 +189,6 @@ def test_damage_to_what_is_seen_costs_no_answer(tmp_path: Path) -> None:
         with pytest.raises(DatabaseCorrupt, match="wrong checksum"):
             database.seen_places("office")
         news = News()
-        index = MapIndex.of(database, ALL.made_with, news)
+        index = MapIndex.of(database, whole().made_with, news)
         assert locate_map(PART, index).status == "located"
     assert len(news.warnings) == 1

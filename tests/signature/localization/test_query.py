@@ -31,10 +31,7 @@ def test_views_lie_apart_and_on_what_was_seen() -> None:
 
 def test_a_window_forgets_what_lies_farther_back() -> None:
     config = OFFICE.config.model_copy(update={"window_m": 3.0})
-    long, short = (
-        Query(OFFICE.made_with, OFFICE.config),
-        Query(OFFICE.made_with, config),
-    )
+    long, short = (Query(OFFICE.made_with, OFFICE.config), Query(OFFICE.made_with, config))
     for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
         for seen in (long, short):
             seen.add(registered, planar_scan)

@@ -310,10 +310,7 @@ def test_a_message_that_unpacks_without_end_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize("compression", ["", "message"])
 @pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
 def test_a_folder_of_every_kind(
-    tmp_path: Path,
-    storage: Literal["mcap", "sqlite3"],
-    compression: Literal["", "message"],
-    version: int,
+    tmp_path: Path, storage: Literal["mcap", "sqlite3"], compression: Literal["", "message"], version: int
 ) -> None:
     folder = write_rosbag2(tmp_path / "log", drive(), storage, compression, version)
     for path in (folder, folder / "metadata.yaml"):

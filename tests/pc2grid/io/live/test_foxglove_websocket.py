@@ -372,11 +372,7 @@ def test_a_websocket_that_sends_garbage(
     found: list[Scan] = []
     end_s = time.monotonic() + LONG_S
     recorded = Recorded.read(recording)
-    with (
-        bounded_memory(MOST_BYTES),
-        Robot(recorded) as robot,
-        Proxy(robot, Garbage(robot, "/scan")) as proxy,
-    ):
+    with bounded_memory(MOST_BYTES), Robot(recorded) as robot, Proxy(robot, Garbage(robot, "/scan")) as proxy:
         feed = FoxgloveWebsocket(proxy.url, ReadConfig(), QUICK, PATIENT)
         with LiveLog(feed, ReadConfig()) as live, robot.playing():
             live.on_poll = lambda: len(found) >= len(scans) or time.monotonic() > end_s

@@ -12,15 +12,7 @@ import pytest
 from pc2grid.errors import PointCloudError, TopicError, UnsupportedSchema
 from pc2grid.io import open_log
 from pc2grid.settings import ReadConfig
-from tests.helpers.foxglove_messages import (
-    IDENTITY,
-    Content,
-    cloud,
-    descriptors,
-    edge,
-    stamped,
-    write,
-)
+from tests.helpers.foxglove_messages import IDENTITY, Content, cloud, descriptors, edge, stamped, write
 from tests.helpers.recordings import STEP, T0, raw_log, read
 
 STAMPED = b'{"timestamp": {"sec": 1, "nsec": 0}, "frame_id": "a", '

@@ -127,10 +127,7 @@ def test_a_session_that_drifts_is_straightened_by_one_that_does_not(tmp_path: Pa
 
 def test_floors_stay_apart(tmp_path: Path) -> None:
     """The ground floor, and the same plan on the first: nothing but labels tells them apart."""
-    labels = {
-        "west": Label(building="A", floor="0"),
-        "east": Label(building="A", floor="1"),
-    }
+    labels = {"west": Label(building="A", floor="0"), "east": Label(building="A", floor="1")}
     store(tmp_path / "x.submaps", {name: MAPS[name] for name in labels}, labels)
     with open_database(tmp_path / "x.submaps") as opened:
         found = join_sessions(opened)

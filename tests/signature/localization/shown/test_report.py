@@ -151,10 +151,7 @@ def test_how_exactly_places_are_known_is_drawn_along_the_path(tmp_path: Path) ->
     stamps = way().stamps_ns
     loose = replace(
         session("office", office(), way()),
-        precision=Precision(
-            stamps_ns=tuple(int(stamps[k]) for k in (0, 4, 9)),
-            sigma_m=(0.01, 0.05, 0.75),
-        ),
+        precision=Precision(stamps_ns=tuple(int(stamps[k]) for k in (0, 4, 9)), sigma_m=(0.01, 0.05, 0.75)),
     )
     add_sessions(
         tmp_path / "loose.submaps", [(loose, provenance(Path("office.mcap"), "a" * 64, Config()))], Config()
