@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -23,11 +22,11 @@ from pc2grid.simulate import SimulationConfig, prepare_session, simulate_session
 from pc2grid.simulate.config import LaserConfig
 from pc2grid.simulate.session import Session
 from pc2grid_lab.truth import read_relations, relation_error
+from tests.helpers.field import DATA
 from tests.helpers.rooms import RESOLUTION_M
 
 Mapped = tuple[Session, list[tuple[Scan, SE2]], OccupancyGrid, Trajectory]
 
-DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="PC2GRID_DATA is not there")
 
 

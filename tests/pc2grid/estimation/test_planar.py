@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
-from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -25,6 +23,7 @@ from pc2grid.pipeline import follow
 from pc2grid.settings import Config, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, iter_session
 from pc2grid.simulate.config import LidarConfig
+from tests.helpers.field import DATA
 
 SCAN = Scan(stamp_ns=0, points_m=np.zeros((0, 3), np.float32), T_base_sensor=np.eye(4), sensor="laser")
 EXACT = np.diag([1e4, 1e4, 1e4])  # a centimetre
@@ -132,7 +131,6 @@ def test_what_fits_neither_here_nor_elsewhere_is_not_placed() -> None:
 
 
 ICP = Literal["kiss-icp", "none"]
-DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="PC2GRID_DATA is not there")
 
 

@@ -5,9 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-import os
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,10 +27,11 @@ from pc2grid.pipeline import follow, map_scans
 from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.scene import OPTICAL, Mesh, Scene, prism
+from tests.helpers.field import DATA
 from tests.helpers.flat_by_hand import CORRIDOR, carried, rising
 from tests.helpers.flat_by_hand import images as drifting_images
 
-ROOMS = Path(os.environ.get("PC2GRID_DATA", "../shared/data")) / "depth/room"
+ROOMS = DATA / "depth/room"
 T_BASE_CAMERA = np.eye(4)
 T_BASE_CAMERA[:3, :3] = OPTICAL
 TABLE = ((2.0, 1.2), (3.2, 2.8))  # its lowest and highest corner, m

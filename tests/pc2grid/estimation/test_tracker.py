@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import os
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,10 +21,9 @@ from pc2grid.model import Health, OdometryCheck, OdometryOutlier, Scan
 from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, iter_session, prepare_session
 from pc2grid.simulate.config import LidarConfig, OdometryConfig
+from tests.helpers.field import DATA
 
-HALL = Path(
-    os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data")
-) / ("lidar/hall.mcap")
+HALL = DATA / "lidar/hall.mcap"
 
 
 def session(sensor, *, length_m=6.0, seed=4):

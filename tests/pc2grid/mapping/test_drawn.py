@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -35,10 +34,9 @@ from tests.helpers.building_clouds import (
     rooms_cloud,
     turned,
 )
-from tests.helpers.field import field_file
+from tests.helpers.field import DATA, field_file
 from tests.helpers.rooms import RESOLUTION_M
 
-DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 FLOOR = DATA / "lidar" / "fr079_floor.ply"
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +26,10 @@ from pc2grid.simulate.drive import RATE_HZ, Drive, odometry_of
 from pc2grid.simulate.plan import clearance_m
 from pc2grid.simulate.scene import covered, depth, laser, lidar
 from pc2grid.simulate.session import EPOCH_NS
+from tests.helpers.field import DATA
 from tests.helpers.rooms import small_house
 
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
-DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 
 
 def brief(**changes: Any) -> SimulationConfig:

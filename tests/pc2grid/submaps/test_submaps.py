@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -42,10 +40,10 @@ from pc2grid.submaps.submaps import (
     visible_submap,
 )
 from signature.database.document import GraphArrays, graph_from_arrays, graph_to_arrays
+from tests.helpers.field import DATA
 from tests.helpers.rooms import RESOLUTION_M, canvas, cross, grid_of
 from tests.helpers.simulated_drives import plan
 
-DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 PAPER = PartitionConfig.paper()
 
 

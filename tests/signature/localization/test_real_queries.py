@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -25,10 +24,10 @@ from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import check_pose
+from tests.helpers.field import DATA
 from tests.helpers.simulated_drives import building
 
 CONFIG = Config()
-DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[3] / ".." / "shared" / "data"))
 
 
 def data(name: str) -> Path:

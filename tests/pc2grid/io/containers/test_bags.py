@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import bz2
-import os
 import sqlite3
 import struct
 from collections.abc import Callable
@@ -19,6 +18,7 @@ import yaml
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogNotFound, LogTruncated, NotALog
 from pc2grid.io import open_log
 from pc2grid.settings import ReadConfig
+from tests.helpers.field import DATA
 from tests.helpers.memory import bounded_memory
 from tests.helpers.recordings import (
     STEP,
@@ -31,8 +31,6 @@ from tests.helpers.recordings import (
     write_mcap,
     write_rosbag2,
 )
-
-DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[4] / ".." / "shared" / "data"))
 
 
 @pytest.mark.parametrize("compression", ["", "bz2", "lz4"])
