@@ -37,7 +37,7 @@ from pc2grid.submaps.submaps import divide
 from pc2grid_cli.main import app
 from signature.boundary import boundary_bins
 from signature.config import Config
-from signature.database import Label, Provenance, maintenance, open_database
+from signature.database import Label, Provenance, SubmapDatabase, maintenance, open_database
 from signature.database import document as validation
 from signature.database import postgres as server
 from signature.database import sqlite as atomic_update
@@ -216,28 +216,68 @@ def test_any_changed_value_of_any_row_is_found(path: Path, table: str, column: s
         everything(path)
 
 
-@pytest.mark.parametrize("what", ["session", "grid", "submaps"])
-@pytest.mark.parametrize("how", ["changed", "lost"])
-def test_damaged_session_is_left_out_and_the_others_answer(
-    place: maintenance.Place, what: str, how: str, tmp_path: Path
+PART: dict[str, Callable[[Any], object]] = {
+    **READ_PART,
+    "submaps": lambda database: list(database.submaps("monday")),
+}
+HOW = {
+    "lost": ("DELETE FROM {}", "is missing"),
+    "changed": ("UPDATE {} SET crc32 = crc32 + 1", "wrong checksum"),
+}
+
+
+@pytest.mark.fault(43)
+@pytest.mark.parametrize("part", PART)
+@pytest.mark.parametrize("how", HOW)
+def test_a_damaged_part_is_named_and_costs_as_little_as_it_can(
+    place: maintenance.Place, part: str, how: str, tmp_path: Path
 ) -> None:
-    if (what, how) == ("session", "lost") and isinstance(place, str):
+    """A search needs grids and submaps; a copy also poses and loops, and makes the rest again."""
+    (statement, what), where = HOW[how], f"{part} of session 'monday'"
+    sql(place, statement.format("part") + " WHERE session_id = 1 AND name = ?", part)
+    problems = check(place)
+    assert [(problem.where, problem.what) for problem in problems] == [(where, what)]
+    with open_database(place) as database:
+        assert len(database.sessions()) == 2
+        with pytest.raises(DatabaseCorrupt, match=f"{where}: {what}"):
+            PART[part](database)
+        needed = part in ("grid", "submaps")
+        assert database.leave_out_damaged() == (problems if needed else ())
+        assert_only(database, ["monday", "tuesday"][needed:])
+    assert check(place) == problems
+    good, target = tmp_path / "good.submaps", tmp_path / "target.submaps"
+    with pytest.raises(DatabaseCorrupt, match=f"damaged: {where}: {what}"):
+        merge([place], target)
+    assert not target.exists()
+    assert len(copy(place, good, recover=True)) == 1
+    assert check(good) == ()
+    with open_database(good) as database:
+        assert_only(database, ["monday", "tuesday"][part in ("grid", "trajectory", "loops") :])
+
+
+@pytest.mark.parametrize("how", HOW)
+def test_a_session_that_is_damaged_itself_is_left_out(place: maintenance.Place, how: str) -> None:
+    if how == "lost" and isinstance(place, str):
         pytest.skip("a server refuses it")
-    rows = "session WHERE id = 1" if what == "session" else f"part WHERE session_id = 1 AND name = '{what}'"
-    table, _, which = rows.partition(" ")
-    sql(place, f"DELETE FROM {rows}" if how == "lost" else f"UPDATE {table} SET crc32 = crc32 + 1 {which}")
+    sql(place, HOW[how][0].format("session") + " WHERE id = 1")
     before = check(place)
     with open_database(place) as database:
         (problem,) = database.leave_out_damaged()
-        assert what in problem.where and ("1" in problem.where or "monday" in problem.where)
-        assert problem.what in ("wrong checksum", "is missing", "belong to no session")
-        assert_holds(database, TUESDAY)
-        assert [info.name for info in database.sessions()] == ["tuesday"]
+        assert "session" in problem.where and ("1" in problem.where or "monday" in problem.where)
+        assert problem.what in ("wrong checksum", "belong to no session")
+        assert_only(database, ["tuesday"])
+    assert check(place) == before != ()
+
+
+def assert_only(database: SubmapDatabase, names: list[str]) -> None:
+    """These sessions are there, Tuesday as it was stored, and no other is."""
+    assert [info.name for info in database.sessions()] == names
+    assert_holds(database, TUESDAY)
+    assert database.config() == Config()
+    if names == ["tuesday"]:
         assert set(database.signatures().session_index) == {0}
-        assert database.config() == Config()
         with pytest.raises(Pc2GridError, match="no session 'monday'"):
             database.grid("monday")
-    assert check(place) == before != ()
 
 
 def test_a_wholly_damaged_database_is_refused(place: maintenance.Place) -> None:
@@ -416,33 +456,6 @@ def test_table_definitions_that_are_no_text(path: Path, before: bytes, after: by
 
 
 # --- what is lost as a whole, and what stands in a writer's way ---------------------------------------
-
-
-GONE: dict[str, Callable[[Any], object]] = {
-    **READ_PART,
-    "submaps": lambda database: list(database.submaps("monday")),
-}
-
-
-@pytest.mark.parametrize("part", GONE)
-def test_a_part_that_is_gone_is_missed_by_name(place: maintenance.Place, tmp_path: Path, part: str) -> None:
-    sql(place, "DELETE FROM part WHERE session_id = 1 AND name = ?", part)
-    (problem,) = check(place)
-    assert (problem.where, problem.what) == (f"{part} of session 'monday'", "is missing")
-    with open_database(place) as database:
-        assert len(database.sessions()) == 2
-        with pytest.raises(DatabaseCorrupt, match=f"{part} of session 'monday': is missing"):
-            GONE[part](database)
-    good, target = tmp_path / "good.submaps", tmp_path / "target.submaps"
-    with pytest.raises(DatabaseCorrupt, match=f"damaged: {part} of session 'monday': is missing"):
-        merge([place], target)
-    assert not target.exists()
-    assert len(copy(place, good, recover=True)) == 1
-    assert check(good) == ()
-    with open_database(good) as database:
-        lost = part in ("grid", "trajectory", "loops")
-        assert [info.name for info in database.sessions()] == ["monday", "tuesday"][lost:]
-        assert_holds(database, TUESDAY)
 
 
 def test_merging_does_not_mix_settings(path: Path, tmp_path: Path) -> None:
