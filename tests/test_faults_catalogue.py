@@ -619,7 +619,8 @@ def depth(
 
 
 fault(
-    37, 1, errors.NoScans, "/depth/image: a depth image without a CameraInfo topic",
+    37, 1, errors.NoScans, "log.mcap: /depth/image: a depth image without a CameraInfo topic",
+    "hint: record the camera_info topic next to the image",
     flags="--topic /depth/image", name="depth without camera",
 )(depth(camera=None))  # fmt: skip
 fault(

@@ -162,17 +162,6 @@ def test_a_map_without_free_space_is_stored_with_a_warning(tmp_path: Path) -> No
     assert "warning: rock: no free space" in made.stderr
 
 
-def test_truncated_recording_needs_recover_and_gives_exit_3(house: Path, tmp_path: Path) -> None:
-    data = (house / "drive.mcap").read_bytes()
-    (tmp_path / "cut.mcap").write_bytes(data[: int(len(data) * 0.7)])
-    assert_says(pc2grid("convert", "cut.mcap", "-o", "c.submaps", cwd=tmp_path), 1, "cut.mcap", "--recover")
-    assert [p.name for p in tmp_path.iterdir()] == ["cut.mcap"]
-    saved = pc2grid("convert", "cut.mcap", "-o", "c.submaps", "--recover", cwd=tmp_path)
-    assert saved.returncode == 3, saved.stderr
-    assert "warning" in saved.stderr
-    assert pc2grid("db", "check", "c.submaps", cwd=tmp_path).returncode == 0
-
-
 def test_config_dump_reads_back_and_flags_win(house: Path, tmp_path: Path) -> None:
     dumped = pc2grid("config", "dump", "--set", "partition.radius_m=5.5", cwd=tmp_path)
     assert dumped.returncode == 0

@@ -7,7 +7,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
@@ -228,17 +227,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     store(tmp_path / "b.submaps", [make_entry("monday")], keep=False)
     save_map(office(), tmp_path / "office")
     return tmp_path
-
-
-def test_depth_images_without_their_camera_info_say_so(folder: Path) -> None:
-    to, pixels = ros(), np.full((4, 6), 1000, np.uint16)
-    images = [to.image("/camera/depth/image", T0 + i * STEP, pixels, "16UC1") for i in range(3)]
-    write_mcap(folder / "d.mcap", images)
-    for topic in ((), ("--topic", "/camera/depth/image")):
-        error = CliRunner().invoke(app, ["convert", "d.mcap", "-o", "x.submaps", *topic]).exception
-        assert isinstance(error, NoScans)
-        assert error.message == "d.mcap: /camera/depth/image: a depth image without a CameraInfo topic"
-        assert error.hint == "record the camera_info topic next to the image"
 
 
 def test_scans_out_of_order_get_a_hint(folder: Path) -> None:
