@@ -953,7 +953,7 @@ def test_every_case_of_the_catalogue_has_a_test() -> None:
     marked = {
         int(number)
         for path in Path(__file__).parent.rglob("test_*.py")
-        for number in re.findall(r"^(?:@pytest\.mark\.|@| *)fault\((\d+)", path.read_text(), re.MULTILINE)
+        for number in re.findall(r"^(?:@pytest\.mark\.|@| *)fault\(\s*(\d+)", path.read_text(), re.MULTILINE)
     }
     assert sorted(set(range(1, 47)) - marked) == []
     listed = {int(number) for number in re.findall(r"(?:^ ?|  )(\d+) [a-zA-Z]", __doc__ or "", re.MULTILINE)}
