@@ -152,8 +152,8 @@ class _Compiled:
         self._function, self._options = function, options
         functools.update_wrapper(self, function)
 
-    def __call__(self, *args: Any) -> Any:
-        return self.dispatcher(*args)
+    def __call__(self, *args: Any, **named: Any) -> Any:
+        return self.dispatcher(*args, **named)
 
     @functools.cached_property
     def dispatcher(self) -> Any:

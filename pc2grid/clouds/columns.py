@@ -16,11 +16,11 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan, mean_per_cell, planar_normals
 from pc2grid.geometry import F32, F64, I64, SE2, U8
+from pc2grid.libraries import compiled
 from pc2grid.model import SENSOR_MODELS, SLICE_BORDERS_M, SLICES, SensorKind
 from pc2grid.settings import ProjectionConfig
 
@@ -206,7 +206,7 @@ class ColumnMap:
 # --- compiled functions -------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@compiled()
 def clear(evidence: NDArray[np.int8], sums: F32, low: I64, new: I64) -> None:
     """Forget the cells that leave the window when its lowest indices (3,) change from `low` to `new`."""
     size, layers = evidence.shape[0], evidence.shape[2]
@@ -220,7 +220,7 @@ def clear(evidence: NDArray[np.int8], sums: F32, low: I64, new: I64) -> None:
             evidence[:, :, k % layers] = 0
 
 
-@njit(cache=True)
+@compiled()
 def observe_points(
     evidence: NDArray[np.int8],
     seen: NDArray[np.uint8],
@@ -261,7 +261,7 @@ def observe_points(
             sums[a, b, 2] += 1.0
 
 
-@njit(cache=True)
+@compiled()
 def observe_rays(
     evidence: NDArray[np.int8],
     seen: NDArray[np.uint8],
@@ -301,7 +301,7 @@ def observe_rays(
                 touched[a, b] = stamp
 
 
-@njit(cache=True)
+@compiled()
 def classify(
     evidence: NDArray[np.int8],
     state: NDArray[np.uint8],
@@ -337,7 +337,7 @@ def classify(
                 )
 
 
-@njit(cache=True)
+@compiled()
 def _column(
     evidence: NDArray[np.int8],
     ground: tuple[int, int],
@@ -373,7 +373,7 @@ def _column(
     return FREE if free else UNKNOWN, 0
 
 
-@njit(cache=True)
+@compiled()
 def view(
     state: NDArray[np.uint8],
     sums: F32,
@@ -416,7 +416,7 @@ def view(
     return free_m, walls[:found].copy(), lows[:count].copy()
 
 
-@njit(cache=True)
+@compiled()
 def _first_wall(
     state: NDArray[np.uint8],
     low: I64,
@@ -461,7 +461,7 @@ def _first_wall(
     return free, -1.0, count
 
 
-@njit(cache=True)
+@compiled()
 def _wall(
     state: NDArray[np.uint8],
     sums: F32,
@@ -496,7 +496,7 @@ def _wall(
         r += 0.5 * edge
 
 
-@njit(cache=True)
+@compiled()
 def agreement_counts(
     evidence: NDArray[np.int8], low: I64, points: F64, cell: tuple[float, float]
 ) -> tuple[int, int, int]:
@@ -528,7 +528,7 @@ def agreement_counts(
     return met, against, inside
 
 
-@njit(cache=True)
+@compiled()
 def _within(low: I64, size: int, i: int, j: int) -> bool:
     """Return True if the column (i, j) of the map is in the window."""
     inside: bool = low[0] <= i < low[0] + size and low[1] <= j < low[1] + size

@@ -23,11 +23,11 @@ from dataclasses import dataclass, field, replace
 from functools import lru_cache
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from pc2grid.clouds.ground import CLOUD_PARAMETERS, CloudParameters, Ground
 from pc2grid.geometry import F32, F64, U8, BoolGrid
+from pc2grid.libraries import compiled
 from pc2grid.model import SENSOR_MODELS, SLICE_BORDERS_M, SLICES, SensorKind
 from pc2grid.settings import ProjectionConfig
 
@@ -256,7 +256,7 @@ class DepthLimit:
 # --- compiled functions -------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@compiled()
 def scan_bearings(
     points: F32,
     sensor: F64,
@@ -305,7 +305,7 @@ def scan_bearings(
     return nearest, reach, _surfaces(points, ranges, order, starts, depths)
 
 
-@njit(cache=True)
+@compiled()
 def _by_bearing(
     bearing_of: NDArray[np.int32], ranges: F64, bearings: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -334,7 +334,7 @@ def _by_bearing(
     return order, starts
 
 
-@njit(cache=True)
+@compiled()
 def _surfaces(
     points: F32,
     ranges: F64,
@@ -359,7 +359,7 @@ def _surfaces(
     return surfaces[:found].copy()
 
 
-@njit(cache=True)
+@compiled()
 def _compiled_normals(
     away: F64,
     order: NDArray[np.intp],
@@ -418,7 +418,7 @@ def _compiled_normals(
     return angles
 
 
-@njit(cache=True)
+@compiled()
 def _compiled_heights(
     at: F32,
     points: F32,
@@ -454,7 +454,7 @@ def _compiled_heights(
     return heights
 
 
-@njit(cache=True)
+@compiled()
 def _sorted(bearing_of: NDArray[np.int32], bearings: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Sort the points by bearing; returns their order and the start of each bearing."""
     starts = np.zeros(bearings + 1, dtype=np.int64)
@@ -471,7 +471,7 @@ def _sorted(bearing_of: NDArray[np.int32], bearings: int) -> tuple[NDArray[np.in
     return order, starts
 
 
-@njit(cache=True)
+@compiled()
 def _heights_along(
     order: NDArray[np.int64],
     points: F32,

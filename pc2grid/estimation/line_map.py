@@ -23,10 +23,10 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
 from pc2grid.geometry import F32, F64, SE2, SUBPIXEL_BITS, BoolGrid, polygon_corners, skew, wrap_angle
+from pc2grid.libraries import compiled
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -436,7 +436,7 @@ def _for_compiled(*arrays: F64) -> Iterator[F64]:
 _DAMPING = 1e-6  # so that directions that no point measures can be solved for
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def aligned(
     index: NDArray[np.int32],
     moments: F64,
@@ -500,7 +500,7 @@ def aligned(
     return pose, alone, information, found
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def normal_equations(
     index: NDArray[np.int32],
     moments: F64,
@@ -557,7 +557,7 @@ def normal_equations(
     return H, g, found
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _line_at(
     index: NDArray[np.int32], moments: F64, row: int, column: int, radius: int, sector: int, line: F64
 ) -> bool:
@@ -596,7 +596,7 @@ def _line_at(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@compiled(error_model="numpy")
 def _solve(A: F64, b: F64, x: F64) -> None:
     """Solve A x = b for a positive definite matrix A (3, 3) by its factors L D L^T, and write x."""
     l10, l20 = A[1, 0] / A[0, 0], A[2, 0] / A[0, 0]
@@ -609,7 +609,7 @@ def _solve(A: F64, b: F64, x: F64) -> None:
     x[0] = b[0] / A[0, 0] - l10 * x[1] - l20 * x[2]
 
 
-@njit(cache=True)
+@compiled()
 def placement_scores(
     field: F32, points: F64, origin: F64, yaws: F64, first: int, step: int, count: int
 ) -> F32:
@@ -639,7 +639,7 @@ def placement_scores(
     return scores / np.float32(max(points.shape[0], 1))
 
 
-@njit(cache=True)
+@compiled()
 def compiled_steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
     """Return the steps between poses (N, 4, 4) and their Jacobians, see `Steps`."""
     count = first.shape[0]
@@ -675,7 +675,7 @@ def compiled_steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
     return step, by_first, by_second
 
 
-@njit(cache=True)
+@compiled()
 def _compiled_moved(poses: F64, changes: F64) -> F64:
     """Return poses (N, 4, 4) after changes (N, 6) in their own axes, see `moved`."""
     result, turn = poses.copy(), np.empty((3, 3))

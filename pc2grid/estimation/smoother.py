@@ -27,12 +27,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv, dpotrs
 
 from pc2grid.estimation.line_map import compiled_steps, inverse_adjoint, moved, steps
 from pc2grid.geometry import F64, BoolGrid, invert_pose
+from pc2grid.libraries import compiled
 
 PLANAR: tuple[int, ...] = (0, 1, 5)
 """The free directions of a base on wheels: x, y, and the turn about z, in the base frame."""
@@ -404,7 +404,7 @@ def _without(H: F64, g: F64, first: int) -> tuple[F64, F64]:
 # --- compiled functions: the factors and their normal equations ---------------------------------------
 
 
-@njit(cache=True)
+@compiled()
 def normal_equations(
     state: WindowState,
     window: FactorWindow,
@@ -455,7 +455,7 @@ def normal_equations(
     return H, g, drift_scale
 
 
-@njit(cache=True)
+@compiled()
 def _add_prior(state: WindowState, prior: MarginalPrior, free: NDArray[np.intp], H: F64, g: F64) -> None:
     """Add the marginalised prior on the errors and the first states."""
     d, m = len(free), len(prior.about.poses)
@@ -476,7 +476,7 @@ def _add_prior(state: WindowState, prior: MarginalPrior, free: NDArray[np.intp],
             g[a] += prior.information[a, b] * off[b]
 
 
-@njit(cache=True)
+@compiled()
 def _add_drifts(
     moves: tuple[F64, F64, F64],
     state: WindowState,
@@ -523,7 +523,7 @@ def _add_drifts(
     return drift_scale
 
 
-@njit(cache=True)
+@compiled()
 def _add_constant_velocity(
     moves: tuple[F64, F64, F64],
     window: FactorWindow,
@@ -561,7 +561,7 @@ def _add_constant_velocity(
         _add(ERRORS + 2 * d * k, error, jacobian, information, np.inf, H, g, 5 * d)
 
 
-@njit(cache=True)
+@compiled()
 def corrected(reported: F64, errors: F64) -> tuple[F64, F64, F64]:
     """Remove the systematic errors (4,) from a step (6,) that odometry reports.
 
@@ -582,7 +582,7 @@ def corrected(reported: F64, errors: F64) -> tuple[F64, F64, F64]:
     return step, by_report, by_errors
 
 
-@njit(cache=True)
+@compiled()
 def drift_variance(reported: F64, drift: float, drift_turn_m: float) -> F64:
     """Return the variances (6,) of the drift over a step (6,)."""
     x, y, z, roll, pitch, yaw = reported[0], reported[1], reported[2], reported[3], reported[4], reported[5]
@@ -595,14 +595,14 @@ def drift_variance(reported: F64, drift: float, drift_turn_m: float) -> F64:
     return variance
 
 
-@njit(cache=True)
+@compiled()
 def change_sigma(seconds: float, unsteady: float, growth: float) -> float:
     """Return the standard deviation, m and rad, of the change of the motion from one scan to the next."""
     sigma: float = unsteady * seconds ** (1.0 + growth)
     return sigma
 
 
-@njit(cache=True)
+@compiled()
 def _put(block: F64, factor: float, free: NDArray[np.intp], column: int, jacobian: F64) -> None:
     """Add a block (6, 6), times a factor, to a Jacobian (D, K) at a column."""
     for a in range(len(free)):
@@ -610,7 +610,7 @@ def _put(block: F64, factor: float, free: NDArray[np.intp], column: int, jacobia
             jacobian[a, column + b] += factor * block[free[a], free[b]]
 
 
-@njit(cache=True)
+@compiled()
 def _add(
     first: int, error: F64, jacobian: F64, information: F64, kernel: float, H: F64, g: F64, own: int
 ) -> None:
@@ -640,7 +640,7 @@ def _add(
                 H[row, first + k if k < own else k - own] += left * LJ[a, k]
 
 
-@njit(cache=True)
+@compiled()
 def _product(A: F64, B: F64) -> F64:
     """Multiply two matrices (6, 6)."""
     result = np.zeros((6, 6))
@@ -651,7 +651,7 @@ def _product(A: F64, B: F64) -> F64:
     return result
 
 
-@njit(cache=True)
+@compiled()
 def _difference(step: F64, factor: float, other: F64, direction: int) -> float:
     """Return a component of a step (6,) minus a multiple of another step; a turn about z within half a
     turn."""

@@ -16,7 +16,6 @@ import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
@@ -25,6 +24,7 @@ from pc2grid.estimation.line_map import moved, steps, weakest
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.smoother import PoseWithCovariance
 from pc2grid.geometry import F32, F64, I64, BoolGrid
+from pc2grid.libraries import compiled
 from pc2grid.settings import RegistrationConfig
 
 
@@ -343,13 +343,13 @@ def _displacement(points_m: F64) -> F64:
     return mean + 1e-9 * np.eye(6)
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def code_of(i: int, j: int, k: int) -> int:
     """Return the three indices of a voxel, each within a million of zero, as one number."""
     return ((i + HALF_VOXELS) << (2 * AXIS_BITS)) | ((j + HALF_VOXELS) << AXIS_BITS) | (k + HALF_VOXELS)
 
 
-@njit(cache=True, inline="always")
+@compiled(inline="always")
 def _slot(slots: NDArray[np.int32], codes: I64, code: int) -> int:
     """Return the slot of the row of a code, or the slot where it belongs."""
     mask = len(slots) - 1
@@ -360,7 +360,7 @@ def _slot(slots: NDArray[np.int32], codes: I64, code: int) -> int:
     return slot
 
 
-@njit(cache=True)
+@compiled()
 def rebuild(slots: NDArray[np.int32], codes: I64, used: int) -> None:
     """Enter the first `used` rows into `slots`, which is overwritten."""
     slots[:] = -1
@@ -368,7 +368,7 @@ def rebuild(slots: NDArray[np.int32], codes: I64, used: int) -> None:
         slots[_slot(slots, codes, codes[row])] = row
 
 
-@njit(cache=True)
+@compiled()
 def add(
     slots: NDArray[np.int32],
     codes: I64,
@@ -415,7 +415,7 @@ def add(
     return used
 
 
-@njit(cache=True)
+@compiled()
 def fit_shapes(
     codes: I64, moments: F64, shapes: F64, rows: I64, edge: float, least: float, noise: float
 ) -> None:
@@ -455,7 +455,7 @@ def fit_shapes(
             shape[8] += held * w * w
 
 
-@njit(cache=True)
+@compiled()
 def first_per_voxel(points: F32, edge: float) -> NDArray[np.int64]:
     """Return the indices of the first of points (N, 3) in each voxel, in order."""
     size = 1 << 12
@@ -478,7 +478,7 @@ def first_per_voxel(points: F32, edge: float) -> NDArray[np.int64]:
     return kept[:used]
 
 
-@njit(cache=True)
+@compiled()
 def normal_equations(
     slots: NDArray[np.int32],
     codes: I64,

@@ -28,12 +28,12 @@ import math
 from dataclasses import dataclass, replace
 
 import cv2
-import numba
 import numpy as np
 from numpy import fft
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64, SE2, U8, BoolGrid, wrap_angle
+from pc2grid.libraries import compiled
 from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField, Walls
 
 
@@ -352,7 +352,7 @@ def _drawn(walls: Walls, n: int) -> tuple[F64, F64, F64]:
 # --- compiled functions -------------------------------------------------------------------------------
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def known_sums(
     values: U8,
     known: BoolGrid,
@@ -387,7 +387,7 @@ def known_sums(
     return seen, likelihood, behind
 
 
-@numba.njit(cache=True, nogil=True, fastmath=True)
+@compiled(nogil=True, fastmath=True)
 def normal_equations(
     field: U8, x: F64, y: F64, tx: float, ty: float, yaw: float
 ) -> tuple[F64, F64, float, float]:

@@ -20,10 +20,10 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import cv2
-import numba
 import numpy as np
 
 from pc2grid.geometry import F32, F64, I64, U8, U16
+from pc2grid.libraries import compiled
 from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField, Walls
 from pc2grid.model import OccupancyGrid
 
@@ -284,7 +284,7 @@ _PARTS = 1 + 4 + SQUARE * SQUARE
 """Parts of a square: all of it, its quarters, and the cells, those of one quarter after the other."""
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def tile_bounds(
     flat: U8,
     shape: tuple[int, int],
@@ -313,7 +313,7 @@ def tile_bounds(
     return bounds
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def best_in_tiles(
     flat: U8,
     shape: tuple[int, int],
@@ -371,7 +371,7 @@ def best_in_tiles(
     return found[:number]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _best_in_block(
     flat: U8, width: int, at: I64, counted: I64, sums: U16, down: int, right: int, least: float
 ) -> tuple[int, int, int, int]:
@@ -395,7 +395,7 @@ def _best_in_block(
     return best, best_square, best_side, best_part
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _best_cell(flat: U8, at: I64, counted: I64, move: int, least: float) -> tuple[int, int]:
     """Return the highest sum of a cell of a square, and its part; -1 where it is below `least`."""
     best, part = -1, 0
@@ -411,7 +411,7 @@ def _best_cell(flat: U8, at: I64, counted: I64, move: int, least: float) -> tupl
     return best, part
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _place_parts(
     turned: F64, levels: I64, shape: tuple[int, int], corner: I64, at: I64, counted: I64
 ) -> None:
@@ -427,7 +427,7 @@ def _place_parts(
             _place(turned, levels[3], i + 0.5, j + 0.5, shape, corner, at[part], counted[part])
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _place(
     turned: F64,
     level: I64,
@@ -461,7 +461,7 @@ def _place(
     counted[0], counted[1] = count, rest
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _turn(points: F64, yaw: float, turned: F64) -> None:
     """Set `turned` (2, N), rows y and x, to the points rotated by `yaw`."""
     c, s = math.cos(yaw), math.sin(yaw)
@@ -470,7 +470,7 @@ def _turn(points: F64, yaw: float, turned: F64) -> None:
         turned[1, p] = c * points[p, 0] - s * points[p, 1]
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _sum_tile(flat: U8, at: I64, rest: int, width: int, inside: U16, sums: U16) -> int:
     """Set `sums` (TILE) to the sums of a tile, 0 for squares that are not `inside`; returns the highest."""
     top = 0
@@ -490,7 +490,7 @@ def _sum_tile(flat: U8, at: I64, rest: int, width: int, inside: U16, sums: U16) 
     return top
 
 
-@numba.njit(cache=True, nogil=True)
+@compiled(nogil=True)
 def _sum(flat: U8, at: I64, rest: int, move: int) -> int:
     """Return the sum of one square of a tile, `move` cells behind the first one in all images, flat."""
     total = rest

@@ -16,12 +16,12 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.metrics import auc, precision_recall_curve
 
 from pc2grid.geometry import F64, I64
+from pc2grid.libraries import compiled
 from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid, Submap
 
 Key = TypeVar("Key")
@@ -309,7 +309,7 @@ class Method(Protocol):
         ...
 
 
-@numba.njit(cache=True)
+@compiled()
 def weighed_pairs(cells: I64, weights: F64, bin_of: NDArray[np.int32], bins: int) -> F64:
     """Products of the weights of all pairs of cells (N, 2), summed by the bin of their distance: (W, bins).
 

@@ -33,13 +33,13 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import cv2
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from sklearn.cluster import KMeans
 from sklearn.feature_extraction.text import TfidfTransformer
 
 from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.libraries import compiled
 from pc2grid.model import Submap
 from pc2grid.submaps.junction_graph import thin
 
@@ -502,7 +502,7 @@ def orientations(integral: F64, points: F64) -> F64:
 C64 = NDArray[np.complex64]
 
 
-@numba.njit(cache=True)
+@compiled()
 def ring_votes(keypoints: I64, offsets: I64, falloff: F64, strength: F32, turns: F64, bins: int) -> F64:
     """Votes (K, bins) of the gradient around keypoints (K, 2) on its direction, shared by two bins.
 
@@ -522,7 +522,7 @@ def ring_votes(keypoints: I64, offsets: I64, falloff: F64, strength: F32, turns:
     return lower + upper
 
 
-@numba.njit(cache=True)
+@compiled()
 def _remainder(value: float, size: float) -> float:
     """value % size as numpy has it, for a size that is a power of two."""
     while value >= size:
@@ -532,7 +532,7 @@ def _remainder(value: float, size: float) -> float:
     return value + size if value < 0 else value
 
 
-@numba.njit(cache=True)
+@compiled()
 def direction_shares(
     rows: I64,
     columns: I64,
@@ -560,7 +560,7 @@ def direction_shares(
     return out
 
 
-@numba.njit(cache=True)
+@compiled()
 def most_agreeing(
     a: C64, b: C64, submap: I64, rotation: C64, shift: C64, inlier_m: float, counts: I64
 ) -> None:
@@ -583,7 +583,7 @@ def most_agreeing(
         counts[s] = max(counts[s], count)
 
 
-@numba.njit(cache=True)
+@compiled()
 def haar(integral: F64, y: F64, x: F64, half: I64) -> tuple[F64, F64]:
     """Haar wavelets in x and y at places y, x (M, K), 2 * half (M or 1, K or 1) pixels wide: (M, K) each.
 
@@ -607,7 +607,7 @@ def haar(integral: F64, y: F64, x: F64, half: I64) -> tuple[F64, F64]:
     return across, down
 
 
-@numba.njit(cache=True)
+@compiled()
 def sector_sums(angles: F64, dx: F64, dy: F64, sectors: int) -> F64:
     """Sums (sectors, 2, K) of wavelets (M, K) whose angles lie in each sector of 60 degrees."""
     sums = np.zeros((sectors, 2, angles.shape[1]))
