@@ -1,4 +1,4 @@
-"""Displays of results in a notebook: a map as a picture, facts as a table.
+"""Displays of results: in a notebook a map as a picture and facts as a table; frozen types as JSON.
 
 Jupyter calls `_repr_png_` and `_repr_html_` of the last value of a cell (https://ipython.readthedocs.io,
 "Rich display"); the types of pc2grid use these functions there.
@@ -7,14 +7,17 @@ Jupyter calls `_repr_png_` and `_repr_html_` of the last value of a cell (https:
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import is_dataclass
+from functools import cache
 from html import escape
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
+    from pydantic import TypeAdapter
 
     from pc2grid.geometry import F64, U8
 
@@ -119,3 +122,28 @@ def counted(number: int, noun: str) -> str:
     ('1 submap', '0 submaps', '12 lidar scans')
     """
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+SCHEMA_VERSION = 1
+"""Of all documents. Within a version they only gain keys: a reader must ignore keys that it does not know."""
+
+
+@cache
+def adapter(kind: Any) -> TypeAdapter[Any]:
+    """Return what makes the JSON of a type, and its schema."""
+    from pydantic import TypeAdapter
+
+    return TypeAdapter(kind)
+
+
+def plain(document: Any) -> dict[str, Any]:
+    """Return a document of plain types: frozen types in it become objects, with the digits they declare."""
+    return {"schema_version": SCHEMA_VERSION, **_plain(document)}
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value) and not isinstance(value, type):
+        return adapter(type(value)).dump_python(value, mode="json", by_alias=True)
+    if isinstance(value, Mapping):
+        return {key: _plain(part) for key, part in value.items()}
+    return [_plain(part) for part in value] if isinstance(value, (list, tuple)) else value

@@ -13,41 +13,22 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, is_dataclass, replace
-from functools import cache
+from dataclasses import dataclass, field, replace
 from itertools import compress
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
-from pydantic import Field, TypeAdapter
+from pydantic import Field
 
-from pc2grid.display import html_picture, html_table, map_png, probability, short
+from pc2grid.display import html_picture, html_table, map_png, plain, probability, short
 from pc2grid.geometry import F64, I64, SE2, freeze, wrap_angle
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.posterior import POSTERIOR, PRIOR, Evidence
 
-SCHEMA_VERSION = 1
-"""Of all documents. Within a version they only gain keys: a reader must ignore keys that it does not know."""
 Status = Literal["located", "ambiguous", "not_found"]
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]
-
-adapter = cache(TypeAdapter)
-"""What makes the JSON of a type, and its schema."""
-
-
-def plain(document: Any) -> dict[str, Any]:
-    """Return a document of plain types: frozen types in it become objects, with the digits they declare."""
-    return {"schema_version": SCHEMA_VERSION, **_plain(document)}
-
-
-def _plain(value: Any) -> Any:
-    if is_dataclass(value) and not isinstance(value, type):
-        return adapter(type(value)).dump_python(value, mode="json", by_alias=True)
-    if isinstance(value, Mapping):
-        return {key: _plain(part) for key, part in value.items()}
-    return [_plain(part) for part in value] if isinstance(value, (list, tuple)) else value
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

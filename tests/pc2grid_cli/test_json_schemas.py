@@ -16,6 +16,7 @@ import pytest
 from typer.main import get_command
 from typer.testing import CliRunner
 
+from pc2grid.display import adapter
 from pc2grid.geometry import SE2
 from pc2grid.io.source import TopicInfo
 from pc2grid.model import (
@@ -37,7 +38,7 @@ from pc2grid_cli.main import app
 from pc2grid_cli.options import Export, Simulate
 from signature.config import Config
 from signature.database import Problem
-from signature.localization.answer import AmbiguousLine, Point, QueryRecording, adapter
+from signature.localization.answer import AmbiguousLine, Point, QueryRecording
 from tests.helpers.json_schema import closed, keys
 from tests.helpers.shared_folders import shared_folder
 

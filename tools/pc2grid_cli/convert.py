@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from pc2grid import libraries as extras
-from pc2grid.display import counted
+from pc2grid.display import counted, plain
 from pc2grid.errors import ConfigError, DatabaseError, OutputError, Pc2GridError, one_line
 from pc2grid.model import is_part_of
 from pc2grid.observer import Observer
@@ -24,7 +24,6 @@ from signature.conversion_jobs import Job
 from signature.database import Label, Provenance, maintenance, open_database
 from signature.database.postgres import is_url
 from signature.database.protocol import Entry
-from signature.localization.answer import plain
 from signature.localization.joining.building import join_sessions
 from signature.sessions import digest_of
 

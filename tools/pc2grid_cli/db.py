@@ -9,18 +9,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pc2grid.display import counted, probability
+from pc2grid.display import counted, plain, probability
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid_cli import console, options, output
 from pc2grid_cli.documents import Document, buildings, joined_document, stored_document
 from signature.database import Problem, SessionInfo, SubmapDatabase, maintenance, open_database
 from signature.database.maintenance import shown
 from signature.database.protocol import largest_m
-from signature.localization.answer import plain
-from signature.localization.joining.building import Joined, join_sessions
-from signature.localization.joining.join import SessionPair
-from signature.localization.shown.picture import draw_building
+
+if TYPE_CHECKING:
+    from signature.localization.joining.building import Joined
+    from signature.localization.joining.join import SessionPair
 
 
 def info(given: options.DbInfo, terminal: console.Console) -> None:
@@ -125,6 +126,8 @@ _SAID = {"joined": "joined", "ambiguous": "ambiguous", "different": "not the sam
 
 def join(given: options.DbJoin, terminal: console.Console) -> None:
     """Compare every two sessions, store how they lie to each other, and print it."""
+    from signature.localization.joining.building import join_sessions
+
     output.check_file("plot", given.plot, given.force)
     with open_database(given.database) as opened:
         names = [info.name for info in opened.sessions()]
@@ -199,6 +202,8 @@ def _sigma_m(covariance: Sequence[Sequence[float]]) -> float:
 
 def _draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
     """Draw the building with most sessions; nothing if none is joined."""
+    from signature.localization.shown.picture import draw_building
+
     known = buildings(found.frames)
     if not known:
         console.warn(f"{path}: not written, no two sessions are joined")

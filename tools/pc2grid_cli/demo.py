@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from pydantic import ValidationError
 
-from pc2grid.display import counted
+from pc2grid.display import counted, plain
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import wrap_angle
 from pc2grid.io.atomic import require_writable
@@ -27,7 +27,6 @@ from pc2grid_cli.output import make_folder
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.answer import plain
 from signature.localization.shown.page import write_report
 from signature.localization.shown.picture import draw_answer
 from signature.sessions import add_sessions, build_session, find

@@ -15,6 +15,7 @@ from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
+from pc2grid.display import SCHEMA_VERSION, adapter
 from pc2grid.errors import ConfigError
 from pc2grid.model import Precision, SessionMap
 from pc2grid.settings import dump_settings
@@ -22,7 +23,6 @@ from pc2grid_cli import console, options
 from signature.config import Config
 from signature.database import Provenance, SessionInfo
 from signature.database.protocol import BuildingFrame, largest_m
-from signature.localization.answer import SCHEMA_VERSION, adapter
 
 Document = dict[str, Any]
 """Plain and frozen types, by key."""

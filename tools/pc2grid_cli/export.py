@@ -15,6 +15,7 @@ import numpy as np
 
 from pc2grid import libraries as extras
 from pc2grid._version import __version__
+from pc2grid.display import plain
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid.geometry import F64
 from pc2grid.io.export import LogWriter, Marker, write_cloud, write_g2o, write_graph
@@ -24,7 +25,7 @@ from pc2grid.model import THING, MapOf, OccupancyGrid, Trajectory
 from pc2grid_cli import console, options, output
 from signature.database import SubmapDatabase, open_database
 from signature.database.protocol import BuildingFrame, SessionInfo
-from signature.localization.answer import Answer, plain
+from signature.localization.answer import Answer
 from signature.localization.shown.page import write_report
 from signature.localization.shown.picture import draw_building, draw_session
 

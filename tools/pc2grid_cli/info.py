@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pc2grid import libraries as extras
+from pc2grid.display import plain
 from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io import open_log
@@ -22,7 +23,6 @@ from pc2grid.io.robots import Namespaces, camera_info_topic
 from pc2grid.io.source import Choice, LogInfo
 from pc2grid.model import SENSOR_MODELS
 from pc2grid_cli import console, options
-from signature.localization.answer import plain
 
 if TYPE_CHECKING:
     from pc2grid.mapping.drawn import DrawnMap

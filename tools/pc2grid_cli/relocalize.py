@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 
 from pc2grid import libraries as extras
-from pc2grid.display import probability
+from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, LogError, NotALog, one_line
 from pc2grid.geometry import F64
 from pc2grid.io import open_log
@@ -36,7 +36,7 @@ from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.maintenance import is_database
 from signature.database.protocol import BuildingFrame
-from signature.localization.answer import AmbiguousLine, Answer, answer_in_building, plain
+from signature.localization.answer import AmbiguousLine, Answer, answer_in_building
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.page import Found, write_report

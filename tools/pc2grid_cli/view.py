@@ -33,6 +33,7 @@ from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from pc2grid import libraries as extras
+from pc2grid.display import plain
 from pc2grid.errors import ConfigError, LogTruncated, OutputError, Pc2GridError
 from pc2grid.geometry import SE2
 from pc2grid.io.live.live_log import open_live
@@ -43,7 +44,6 @@ from pc2grid_cli.console import json_text
 from pc2grid_cli.watch import feed
 from signature.config import Config
 from signature.database import SubmapDatabase
-from signature.localization.answer import plain
 from signature.localization.localizer import Estimate, Follower, Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.page import page

@@ -19,7 +19,7 @@ from typing import Any, TypeVar, cast
 import numpy as np
 
 from pc2grid import libraries as extras
-from pc2grid.display import probability
+from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, TrackingLost, one_line
 from pc2grid.geometry import SE2
 from pc2grid.io import Log, open_log
@@ -37,7 +37,7 @@ from pc2grid_cli.documents import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.protocol import BuildingFrame, SessionInfo
-from signature.localization.answer import answer_in_building, plain
+from signature.localization.answer import answer_in_building
 from signature.localization.joining.building import map_of
 from signature.localization.localizer import Estimate, Follower, Localizer, ResetPolicy
 from signature.localization.map_index import MapIndex

@@ -31,6 +31,7 @@ import cv2
 import numpy as np
 
 from pc2grid._version import __version__
+from pc2grid.display import adapter
 from pc2grid.errors import OutputError
 from pc2grid.geometry import F32, F64, I64, SE2, BoolGrid
 from pc2grid.io.atomic import replace_file, require_writable
@@ -42,7 +43,7 @@ from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_edges, boundary_p
 from signature.config import SignatureConfig
 from signature.database import SessionInfo, SubmapDatabase, open_database
 from signature.freespace import PATH_BINS, freespace_nodes, freespace_seen, visibility_graph
-from signature.localization.answer import Answer, QueryRecording, adapter
+from signature.localization.answer import Answer, QueryRecording
 from signature.localization.shown.picture import (
     FURNITURE,
     PALETTE,
