@@ -83,7 +83,7 @@ def convert(
     that cannot be written; else as `signature.build_session` and `signature.add_session`.
 
     >>> import pc2grid
-    >>> monday = pc2grid.convert("monday.mcap", "new.submaps", span=pc2grid.TimeSpan(0.0, 2.0))
+    >>> monday = pc2grid.convert("monday.mcap", "made.submaps", span=pc2grid.TimeSpan(0.0, 2.0))
     >>> monday.session, monday.sensor
     ('monday', 'laser')
     """
