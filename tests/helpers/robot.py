@@ -8,15 +8,24 @@ bridges before version 3.2.
 from __future__ import annotations
 
 import contextlib
+import functools
 import socket
 import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import foxglove
-from foxglove.websocket import Capability, ChannelView, Client, ClientChannel, ServerListener
+from foxglove.websocket import (
+    Capability,
+    ChannelView,
+    Client,
+    ClientChannel,
+    ServerListener,
+    WebSocketServer,
+)
 from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 from websockets.exceptions import ConnectionClosed
@@ -63,6 +72,18 @@ class Recorded:
         return Recorded(tuple(channels.values()), tuple(messages))
 
 
+def _when_free(start: Callable[[], WebSocketServer]) -> WebSocketServer:
+    """Start a server as soon as its port is free: one that was stopped gives it back in its own time."""
+    until_s = time.monotonic() + LONG_S
+    while True:
+        try:
+            return start()
+        except RuntimeError as error:
+            if "in use" not in str(error) or time.monotonic() > until_s:
+                raise
+            time.sleep(0.05)
+
+
 class Robot(ServerListener):
     """The server, until the block ends; it is made by `with`.
 
@@ -100,7 +121,8 @@ class Robot(ServerListener):
             for channel in recorded.channels
         }
         certificate, key = tls or (None, None)
-        self._server = foxglove.start_server(
+        start = functools.partial(
+            foxglove.start_server,
             name="robot",
             port=port,
             capabilities=[*capabilities],
@@ -111,6 +133,7 @@ class Robot(ServerListener):
             tls_cert=certificate,
             tls_key=key,
         )
+        self._server = _when_free(start)
         self.port = self._server.port
         self.url = f"{'wss' if tls else 'ws'}://127.0.0.1:{self.port}"
 
