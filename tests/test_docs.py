@@ -772,8 +772,8 @@ def test_robots_that_are_carried_away_are_those_of_the_page() -> None:
     said = (
         f"Of {kidnaps} such robots, {noticed} noticed it, {s} s and {m} m after they were put down (median). "
         f"At {shown} of the new places the map shows what the robot sees: {again} robots were located again, "
-        f"after {again_s} s and {again_m} m. False alarms: {alarms} in {rows} drives; of {judged} poses {wrong} "
-        "were wrong."
+        f"after {again_s} s and {again_m} m. False alarms: {alarms} in {rows} drives; of {judged} poses "
+        f"{wrong} were wrong."
     )
     assert said in FLAT
 
