@@ -7,10 +7,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from pc2grid import libraries as threads
+from pc2grid import libraries
 from tests.helpers.browser import CHROMIUM, Browser, browser_in
 
-threads.use_one()  # as the program does; tests call functions that do not limit BLAS themselves
+libraries.use_one()  # as the program does; tests call functions that do not limit BLAS themselves
 
 
 @pytest.fixture(scope="session")

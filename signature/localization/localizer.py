@@ -264,7 +264,7 @@ def answer_query(
     """Where a query is.
 
     seen : `query` drawn. known : hypotheses that are compared, too. prior_of : what was known before it, of
-    each place. off_map : where it may be beside the map, see `signature.localization.belief.Belief.off_map`.
+    each place. off_map : where it may be beside the map, see `signature.localization.belief.Belief.before`.
     session_index : of the map that is preferred among several that show the place.
     """
     verdict, found = decide(index, seen, known, prior_of)

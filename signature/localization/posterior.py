@@ -22,7 +22,7 @@ The posterior over places and "not in this map": one equation decides every answ
   (n + few) instead of 1, because neighbouring points repeat each other and all share what has been moved in
   the building (`n_eff`). Ground that one side does not know says nothing.
 - t is what wrong places tell. However well a place fits, "not in this map" explains the query as well if
-  another place fits nearly so well: then such a fit is nothing special. The score (`two_way_score`) is a
+  another place fits nearly so well: then such a fit is nothing special. The score (`score_fit`) is a
   mean, which varies by chance as 1 / sqrt(n). No lead counts as longer than the share q of the score: what
   scores less is not searched for, so there may always be a rival so near. Places that fit equally well are
   no examples of it. What tells for the best of them tells for each, so they share the mass by their priors.

@@ -14,7 +14,7 @@ import scipy.linalg  # noqa: F401  its BLAS is loaded, as that of a user's progr
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import pc2grid
-from pc2grid import libraries as threads
+from pc2grid import libraries
 from pc2grid.geometry import SE2
 from pc2grid.model import RegisteredScan
 from pc2grid.simulate import SimulationConfig, simulate_session
@@ -52,13 +52,13 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_one_thread_while_a_call_runs_and_the_callers_number_after_it() -> None:
-    inner = threads.one_blas_thread(blas_threads)
-    assert threads.one_blas_thread(lambda: (blas_threads(), inner(), blas_threads()))() == ({1}, {1}, {1})
+    inner = libraries.one_blas_thread(blas_threads)
+    assert libraries.one_blas_thread(lambda: (blas_threads(), inner(), blas_threads()))() == ({1}, {1}, {1})
     assert blas_threads() == {2}
 
 
 def test_the_number_is_restored_after_an_error() -> None:
-    @threads.one_blas_thread
+    @libraries.one_blas_thread
     def fails() -> None:
         raise ValueError
 
@@ -69,7 +69,7 @@ def test_the_number_is_restored_after_an_error() -> None:
 
 def test_a_thread_of_the_callers_program_is_limited_too() -> None:
     """As a robot's node calls it, after the main thread did."""
-    limited, seen = threads.one_blas_thread(blas_threads), []
+    limited, seen = libraries.one_blas_thread(blas_threads), []
     worker = Thread(target=lambda: seen.append(limited()))
     worker.start()
     worker.join()
@@ -78,9 +78,9 @@ def test_a_thread_of_the_callers_program_is_limited_too() -> None:
 
 def test_what_the_user_has_set_wins(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OMP_NUM_THREADS", "4")
-    assert threads.one_blas_thread(blas_threads)() == {2}
+    assert libraries.one_blas_thread(blas_threads)() == {2}
     environment = {"OMP_NUM_THREADS": "4"}
-    threads.use_one(environment)
+    libraries.use_one(environment)
     assert environment == {"OMP_NUM_THREADS": "4"}
 
 

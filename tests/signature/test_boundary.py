@@ -17,7 +17,7 @@ from scipy.spatial.distance import pdist
 from pc2grid.geometry import I64, BoolGrid, cells_of
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN
 from pc2grid.submaps.junction_graph import sample_evenly, thin
-from signature import freespace as _kernels
+from signature import freespace
 from signature.boundary import (
     ROUNDING_BINS,
     boundary_bins,
@@ -247,7 +247,7 @@ def test_the_compiled_line_of_sight_is_that_of_numpy(seed: int, share: float) ->
     occupied, nodes = rng.random((31, 47)) < share, rng.integers(0, (31, 47), (12, 2))
     first, second = (axis.ravel() for axis in np.indices((12, 12)))
     expected = in_sight(occupied, nodes, first, second)
-    assert np.array_equal(_kernels.in_sight(occupied, nodes, first, second), expected)
+    assert np.array_equal(freespace.in_sight(occupied, nodes, first, second), expected)
     assert np.array_equal(expected.reshape(12, 12).diagonal(), ~occupied[nodes[:, 0], nodes[:, 1]])
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from pc2grid import libraries as extras
+from pc2grid import libraries
 from pc2grid.display import counted, plain
 from pc2grid.errors import ConfigError, DatabaseError, OutputError, Pc2GridError, one_line
 from pc2grid.model import is_part_of
@@ -84,7 +84,7 @@ def run(given: options.Convert, terminal: console.Console) -> int | None:
             "--dask ADDRESS names the scheduler of a cluster", hint="--jobs N: processes of this machine"
         )
     cluster = {} if given.dask is None else {"cluster": "--dask"}
-    extras.require(cluster | extras.of_addresses(given.output))
+    libraries.require(cluster | libraries.of_addresses(given.output))
     jobs = _jobs(given)
     stored = _stored_sessions(given, jobs)
     if any(job.name not in stored for job in jobs):

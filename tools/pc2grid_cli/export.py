@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pc2grid import libraries as extras
+from pc2grid import libraries
 from pc2grid._version import __version__
 from pc2grid.display import plain
 from pc2grid.errors import ConfigError, DatabaseError, one_line
@@ -50,7 +50,7 @@ def run(given: options.Export, terminal: console.Console) -> None:
     if "map" in outputs:
         outputs["map"] = output.map_stem(outputs["map"])
     _check(outputs, given)
-    extras.require(extras.of_addresses(given.database))
+    libraries.require(libraries.of_addresses(given.database))
     # Only maps of buildings need what joins them.
     from signature.localization.joining.building import floors_of
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pc2grid import libraries as extras
+from pc2grid import libraries
 from pc2grid.display import plain
 from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
@@ -52,7 +52,7 @@ class Info(LogInfo):
 def run(given: options.Info, terminal: console.Console) -> int | None:
     """Print what is in a recording, a map or a database. Return the exit code."""
     log, path = given.log, Path(given.log)
-    if "postgres" in extras.of_addresses(log) or is_submap_file(path):
+    if "postgres" in libraries.of_addresses(log) or is_submap_file(path):
         from pc2grid_cli import db
 
         db.info(options.DbInfo(database=log, json=given.json), terminal)

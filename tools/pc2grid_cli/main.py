@@ -21,7 +21,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 import pc2grid
-from pc2grid import libraries as threads
+from pc2grid import libraries
 from pc2grid.errors import ConfigError
 from pc2grid_cli import console
 
@@ -258,7 +258,7 @@ of a laser."""
 def main() -> None:
     """Entry point of the console script."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for them in all packages
-    threads.use_one()
+    libraries.use_one()
     # Imports make more than 100,000 objects, which stay. Python's collector of cycles would walk through them
     # again and again, also at the end.
     gc.set_threshold(_NEW_OBJECTS)

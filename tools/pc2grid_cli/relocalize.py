@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pc2grid import libraries as extras
+from pc2grid import libraries
 from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, LogError, NotALog, one_line
 from pc2grid.geometry import F64
@@ -75,7 +75,7 @@ def run(given: options.Relocalize, terminal: console.Console) -> int:
 
 def _check(given: options.Relocalize, outputs: Mapping[str, Path], *, is_check: bool, several: bool) -> None:
     """Raise what is wrong with the options before any work is done. several : queries at once."""
-    extras.require(extras.of_addresses(given.database))
+    libraries.require(libraries.of_addresses(given.database))
     for option, path in outputs.items():
         output.check_file(option, path, given.force)
     if several:

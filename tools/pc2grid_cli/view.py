@@ -32,7 +32,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
-from pc2grid import libraries as extras
+from pc2grid import libraries
 from pc2grid.display import plain
 from pc2grid.errors import ConfigError, LogTruncated, OutputError, Pc2GridError
 from pc2grid.geometry import SE2
@@ -55,7 +55,7 @@ _META = '<meta http-equiv="Content-Security-Policy"'
 
 def run(given: options.View, terminal: console.Console) -> None:
     """Serve the pages until the program is stopped."""
-    extras.require(extras.of_addresses(given.source, given.database))
+    libraries.require(libraries.of_addresses(given.source, given.database))
     settings, most_bytes = given.settings(), round(given.most_gb * 1e9)
     with (
         known_pose.searched(given) as (opened, _),

@@ -18,7 +18,7 @@ from typing import Any, TypeVar, cast
 
 import numpy as np
 
-from pc2grid import libraries as extras
+from pc2grid import libraries
 from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, TrackingLost, one_line
 from pc2grid.geometry import SE2
@@ -50,7 +50,7 @@ EstimateT = TypeVar("EstimateT")
 
 def run(given: options.Watch, terminal: console.Console) -> int | None:
     """Follow a robot or a recording, and print what is found. Return the exit code."""
-    extras.require(extras.of_addresses(given.source, given.database))
+    libraries.require(libraries.of_addresses(given.source, given.database))
     settings = given.settings()
     prior, check_topic = known_pose.region(given), given.check_topic
     if given.first and (given.publish == "tf" or check_topic is not None):

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pc2grid import libraries as extras
+from pc2grid import libraries
 from pc2grid_cli import console
 from pc2grid_cli.options import OUTPUT_FOLDER
 
@@ -188,7 +188,7 @@ def compare_paper_command(
 
     Example: pc2grid compare paper --maps maps/ --queries 200 --ablation
     """
-    extras.require({"paper": "compare paper"})
+    libraries.require({"paper": "compare paper"})
     from pc2grid_lab.paper import tables as command
 
     command.run(
@@ -216,7 +216,7 @@ def compare_scale_command(
 
     Example: pc2grid compare scale --maps maps/
     """
-    extras.require({"paper": "compare scale"})
+    libraries.require({"paper": "compare scale"})
     from pc2grid_lab.paper import scale
 
     scale.run(maps, out, console.of(context), queries=queries, jobs=jobs, seed=seed)

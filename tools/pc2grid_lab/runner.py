@@ -33,7 +33,7 @@ import cv2
 import pc2grid as product
 import pc2grid_cli
 import signature
-from pc2grid import libraries as threads
+from pc2grid import libraries
 from pc2grid.io.atomic import replace_file
 
 FRONT, BACK = Path(product.__file__).parent, Path(signature.__file__).parent
@@ -108,7 +108,7 @@ def in_processes(
             found.append(function(*arguments))
             advance(len(found) / len(given))
         return found
-    threads.use_one()  # the processes run in parallel; they read it when they load their libraries
+    libraries.use_one()  # the processes run in parallel; they read it when they load their libraries
     spawn = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,))
     return _run_in(pool, function, given, advance)

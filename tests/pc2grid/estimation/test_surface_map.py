@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.estimation import surface_map as kernels
+from pc2grid.estimation import surface_map
 from pc2grid.estimation.line_map import weakest
 from pc2grid.estimation.smoother import SPATIAL, PoseWithCovariance
 from pc2grid.estimation.surface_map import SurfaceMap
@@ -134,4 +134,4 @@ def test_the_equations_are_those_of_points_and_planes() -> None:
 
 def test_the_first_point_of_each_voxel_is_kept() -> None:
     points = np.array([(0.1, 0.1, 0.1), (0.2, 0.2, 0.2), (1.1, 0.1, 0.1), (-0.1, 0.1, 0.1)], np.float32)
-    assert kernels.first_per_voxel(points, 1.0).tolist() == [0, 2, 3]
+    assert surface_map.first_per_voxel(points, 1.0).tolist() == [0, 2, 3]

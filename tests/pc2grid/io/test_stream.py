@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import FrameError, NoScans, TopicError
-from pc2grid.io import open_log
-from pc2grid.io import stream as scan_stream
+from pc2grid.io import open_log, stream
 from pc2grid.io.live.live_log import open_live
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.settings import ReadConfig
@@ -99,11 +98,11 @@ def test_what_waits_for_its_turn_is_bounded_in_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: int, taken: int
 ) -> None:
     """Scans of one moment, however many and large, are not all held in memory."""
-    monkeypatch.setattr(scan_stream, "PARAMETERS", scan_stream.StreamParameters(max_waiting_bytes=limit))
+    monkeypatch.setattr(stream, "PARAMETERS", stream.StreamParameters(max_waiting_bytes=limit))
     seen: list[int] = []
-    take = scan_stream.Stream._take_scan
+    take = stream.Stream._take_scan
     monkeypatch.setattr(
-        scan_stream.Stream,
+        stream.Stream,
         "_take_scan",
         lambda self, topic, data, time: (seen.append(time), take(self, topic, data, time))[1],
     )

@@ -9,8 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64, I64
-from pc2grid_lab.paper import rivals as _kernels
-from pc2grid_lab.paper import rivals as sdf
+from pc2grid_lab.paper import rivals
 
 SEEDS = pytest.mark.parametrize("seed", range(4))
 
@@ -19,7 +18,7 @@ def field(rng: np.random.Generator) -> tuple[F32, F64]:
     """Strength and direction, in turns, of a gradient; some of it without strength."""
     gx, gy = (rng.normal(size=(40, 50)).astype(np.float32) for _ in range(2))
     gx[:20:3], gy[::4] = 0.0, 0.0
-    return np.hypot(gx, gy), sdf._turns(gx, gy)
+    return np.hypot(gx, gy), rivals._turns(gx, gy)
 
 
 @SEEDS
@@ -36,7 +35,7 @@ def test_votes_on_a_keypoints_direction(seed: int) -> None:
     owner, votes = np.arange(30)[:, None] * 36, np.zeros(30 * 36)
     for at, share in ((low, 1 - (turn - low)), (low + 1, turn - low)):
         votes += np.bincount((owner + at % 36).ravel(), (weights * share).ravel(), len(votes))
-    found = _kernels.ring_votes(keypoints, offsets, falloff, strength, turns, 36)
+    found = rivals.ring_votes(keypoints, offsets, falloff, strength, turns, 36)
     assert not inside.all() and np.array_equal(found, votes.reshape(30, 36))
 
 
@@ -51,7 +50,7 @@ def test_shares_of_the_directions(seed: int) -> None:
     turn = (turns[rows, columns] - own[:, None]) % 1.0 * 8
     weights = strength[rows, columns] * falloff * inside
     plain = [weights * np.maximum(0.0, 1.0 - np.abs((turn - k + 8 / 2) % 8 - 8 / 2)) for k in range(8)]
-    found = _kernels.direction_shares(rows, columns, inside, own, falloff, strength, turns, 8)
+    found = rivals.direction_shares(rows, columns, inside, own, falloff, strength, turns, 8)
     assert np.array_equal(found, plain)
 
 
@@ -90,7 +89,7 @@ def test_the_most_that_one_motion_explains(seed: int, matches: int) -> None:
     nearest[1] = 60 + np.arange(matches)
     nearest[2, ::2], nearest[3, ::5] = nearest[1, ::2], nearest[1, ::5]
     nearest[4] = -1
-    found = sdf._consensus(a, b, nearest, 0.25, 400)
+    found = rivals._consensus(a, b, nearest, 0.25, 400)
     assert found.tolist() == [*(consensus(a, b[row], 0.25, 400) for row in nearest[:4]), 0]
     assert matches < 37 or found[1] > 2 * found[0]
 
@@ -117,7 +116,7 @@ def test_wavelets(seed: int, shape: tuple[int, int]) -> None:
     integral = rng.integers(0, 256, (61, 81)).cumsum(axis=0).cumsum(axis=1).astype(np.float64)
     y, x = rng.uniform(-3, 64, (70, 30)), rng.uniform(-3, 84, (70, 30))
     half = rng.integers(1, 9, shape)
-    found, plain = _kernels.haar(integral, y, x, half), haar(integral, y, x, half)
+    found, plain = rivals.haar(integral, y, x, half), haar(integral, y, x, half)
     assert np.array_equal(found, plain) and 0.2 < (found[0] == 0).mean() < 0.9
 
 
@@ -137,4 +136,4 @@ def test_sums_over_sectors(seed: int) -> None:
     dx, dy = rng.integers(-2, 3, (2, 109, 40)) * rng.random((109, 1))
     dx[:50], dy[:50] = rng.normal(size=(2, 50, 40))
     angles = np.arctan2(dy, dx)
-    assert np.array_equal(_kernels.sector_sums(angles, dx, dy, 36), sector_sums(angles, dx, dy))
+    assert np.array_equal(rivals.sector_sums(angles, dx, dy, 36), sector_sums(angles, dx, dy))

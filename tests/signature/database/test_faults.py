@@ -37,10 +37,8 @@ from pc2grid.submaps.submaps import divide
 from pc2grid_cli.main import app
 from signature.boundary import boundary_bins
 from signature.config import Config
-from signature.database import Label, Provenance, SubmapDatabase, maintenance, open_database
+from signature.database import Label, Provenance, SubmapDatabase, maintenance, open_database, postgres, sqlite
 from signature.database import document as validation
-from signature.database import postgres as server
-from signature.database import sqlite as atomic_update
 from signature.database.document import PARTS
 from signature.database.maintenance import check, copy, merge, store
 from signature.database.protocol import APPLICATION_ID
@@ -351,7 +349,7 @@ def test_fuzz_eight_readers_and_two_writers(path: Path, engine: str, monkeypatch
     place: maintenance.Place = path
     if engine == "postgres":
         place = postgresql.new_database()
-        monkeypatch.setattr(server, "BUSY_TIMEOUT_S", 1.0)  # whole seconds there
+        monkeypatch.setattr(postgres, "BUSY_TIMEOUT_S", 1.0)  # whole seconds there
         maintenance.store(place, [MONDAY, TUESDAY], keep=False)
     known: dict[str, set[str]] = {}
     for seed in (100, 101, 102):
@@ -403,13 +401,13 @@ def test_a_second_writer_learns_the_holder_and_a_killed_holder_is_no_obstacle(
     holder = context.Process(target=_hold, args=(str(path.resolve()), ready))
     holder.start()
     assert ready.wait(60)
-    monkeypatch.setattr(atomic_update, "BUSY_TIMEOUT_S", 0.1)
+    monkeypatch.setattr(sqlite, "BUSY_TIMEOUT_S", 0.1)
     with pytest.raises(DatabaseBusy, match=f"being written by process {holder.pid} on ") as caught:
         store(path, [make_entry("friday", 5)], keep=True)
     assert caught.value.hint == "try again when it is done"
     with open_database(path) as database:
         assert len(database.sessions()) == 2
-    monkeypatch.setattr(atomic_update, "BUSY_TIMEOUT_S", 60)
+    monkeypatch.setattr(sqlite, "BUSY_TIMEOUT_S", 60)
     threading.Timer(0.3, holder.kill).start()
     store(path, [make_entry("friday", 5)], keep=True)  # waits until the other one is gone
     holder.join(60)

@@ -15,11 +15,11 @@ from pc2grid.observer import Observer
 from pc2grid.submaps.submaps import partition
 from signature.config import Config
 from signature.database import maintenance, open_database
-from signature.localization import map_index as building_file
+from signature.localization import map_index
 from signature.localization.localizer import locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.query import query_of
-from signature.retrieval import places as viewpoints
+from signature.retrieval import places
 from signature.sessions import add_session, provenance
 from signature.visible import SeenPlaces, View
 from tests.helpers.databases import sql
@@ -69,13 +69,13 @@ class _Counted(Mapping[str, OccupancyGrid]):
 @pytest.fixture(autouse=True)
 def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
     """The best eight places are compared at first."""
-    monkeypatch.setattr(viewpoints, "FIRST_PLACES", 8)
-    monkeypatch.setattr(building_file, "FIRST_PLACES", 8)
+    monkeypatch.setattr(places, "FIRST_PLACES", 8)
+    monkeypatch.setattr(map_index, "FIRST_PLACES", 8)
 
 
 def test_few_maps_are_read_and_the_answer_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
-    monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 2 * max(areas_m2.values()))
+    monkeypatch.setattr(places, "AT_ONCE_M2", 2 * max(areas_m2.values()))
     maps = _Counted()
     large = MapIndex(
         maps, whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
@@ -94,7 +94,7 @@ def test_few_maps_are_read_and_the_answer_is_the_same(monkeypatch: pytest.Monkey
 def test_a_map_larger_than_what_is_searched_at_once_is_still_searched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 1.0)
+    monkeypatch.setattr(places, "AT_ONCE_M2", 1.0)
     areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
     index = MapIndex(
         _Counted(), whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
@@ -106,8 +106,8 @@ def test_a_map_larger_than_what_is_searched_at_once_is_still_searched(
 
 def test_the_maps_that_were_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
-    monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 1.0)
-    monkeypatch.setattr(building_file, "AT_ONCE_M2", 0.25 * sum(areas_m2.values()))
+    monkeypatch.setattr(places, "AT_ONCE_M2", 1.0)
+    monkeypatch.setattr(map_index, "AT_ONCE_M2", 0.25 * sum(areas_m2.values()))
     maps = _Counted()
     index = MapIndex(
         maps, whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
@@ -151,8 +151,8 @@ def query_views() -> tuple[View, ...]:
 def test_a_stored_map_is_read_when_it_matters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "large.submaps"
     store_maps(file, {name: MAPS[name] for name in ("other0", "office")})
-    monkeypatch.setattr(viewpoints, "AT_ONCE_M2", 1.0)
-    monkeypatch.setattr(building_file, "AT_ONCE_M2", 1.0)
+    monkeypatch.setattr(places, "AT_ONCE_M2", 1.0)
+    monkeypatch.setattr(map_index, "AT_ONCE_M2", 1.0)
     with open_database(file) as database:
         read: list[str] = []
         take = database.grid

@@ -24,8 +24,7 @@ from pc2grid.errors import (
     Pc2GridError,
 )
 from signature.config import Config
-from signature.database import create_database, maintenance, open_database
-from signature.database import postgres as server
+from signature.database import create_database, maintenance, open_database, postgres
 from signature.database.maintenance import store
 from tests.helpers import postgresql
 from tests.helpers.databases import MONDAY, assert_holds, everything, make_entry, sql
@@ -57,7 +56,7 @@ def test_wrong_urls_are_one_line_without_the_password(bad: str, error: type, wor
 
 
 def test_location_is_a_url_without_secrets(url: str) -> None:
-    shown = server.location("postgresql://robot:pa%40ss@host:5433/db?sslpassword=x&options=-cx%3D1")
+    shown = postgres.location("postgresql://robot:pa%40ss@host:5433/db?sslpassword=x&options=-cx%3D1")
     assert shown == "postgresql://robot@host:5433/db"
     with open_database(url) as database, open_database(database.location) as again:
         assert again.sessions() == database.sessions()
@@ -229,7 +228,7 @@ def test_first_two_with_different_settings_do_not_both_win() -> None:
 
 
 def test_writer_that_waits_too_long_is_told(url: str, monkeypatch) -> None:
-    monkeypatch.setattr(server, "BUSY_TIMEOUT_S", 1.0)
+    monkeypatch.setattr(postgres, "BUSY_TIMEOUT_S", 1.0)
     with postgresql.connect(url) as other, other.transaction():
         other.execute("SELECT 1 FROM pc2grid.about FOR UPDATE")
         with pytest.raises(DatabaseBusy, match="lock timeout"):

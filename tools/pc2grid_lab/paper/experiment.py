@@ -313,7 +313,7 @@ class Method(Protocol):
 def weighed_pairs(cells: I64, weights: F64, bin_of: NDArray[np.int32], bins: int) -> F64:
     """Products of the weights of all pairs of cells (N, 2), summed by the bin of their distance: (W, bins).
 
-    weights (W, N). bin_of : as of `signature.freespace.pair_counts`.
+    weights (W, N). bin_of : as of `signature.boundary.pair_counts`.
     """
     sums = np.zeros((bins, len(weights)))
     for i in range(len(cells)):
