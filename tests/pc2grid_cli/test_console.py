@@ -264,14 +264,15 @@ STOPPED = pytest.mark.parametrize(("number", "code"), [("SIGINT", 130), ("SIGTER
 
 
 @STOPPED
-def test_signal_during_an_extension_is_no_bug(number: str, code: int) -> None:
+@pytest.mark.parametrize("becomes", ["SystemError('a result with an exception set')", "SystemExit(1)"])
+def test_signal_that_arrives_as_something_else_is_no_bug(number: str, code: int, becomes: str) -> None:
     done = run_until_stopped(
         f"""
 def command():
     try:
         os.kill(os.getpid(), signal.{number})
     except BaseException as stop:
-        raise SystemError("returned a result with an exception set") from stop
+        raise {becomes} from stop
 """
     )
     assert done.returncode == code, done.stderr
@@ -290,6 +291,19 @@ def command():
     )
     assert done.returncode == code, done.stderr
     assert "Exception ignored" not in done.stderr
+
+
+def test_a_stopped_program_waits_for_nothing_that_still_runs() -> None:
+    """Python's own end would wait for the thread, and has crashed where an extension was half imported."""
+    done = run_until_stopped(
+        """
+def command():
+    import threading
+    threading.Thread(target=time.sleep, args=(3600.0,)).start()
+    os.kill(os.getpid(), signal.SIGTERM)
+"""
+    )
+    assert done.returncode == 143, done.stderr
 
 
 # --- Tables of all commands look alike, and nothing in them is cut off ---

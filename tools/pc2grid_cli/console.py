@@ -123,7 +123,10 @@ class Console:
                 raise KeyboardInterrupt
             return result if isinstance(result, int) else OK
         except BaseException as error:
-            return self._ended_by(error, stop.number)
+            code = self._ended_by(error, stop.number)
+        if stop.number is not None:
+            _leave(code)
+        return code
 
     def _ended_by(self, error: BaseException, signal_number: int | None) -> int:
         """The exit code of a command that ended by an error or a signal; what is to be said is printed."""
@@ -132,13 +135,25 @@ class Console:
             return INTERRUPTED
         if isinstance(error, BrokenPipeError) or isinstance(error.__context__, BrokenPipeError):
             return _pipe_closed()  # click turns it into SystemExit(1)
-        if isinstance(error, SystemExit):
-            raise error
         if signal_number is not None:
             return 128 + signal_number
+        if isinstance(error, SystemExit):
+            raise error
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):  # a usage error of typer's
             return _report_usage(error)
         return self.report_error(error)
+
+
+def _leave(code: int) -> None:
+    """End the process at once.
+
+    A signal may have come in the middle of anything, the import of an extension for example: Python's own end
+    would wait for threads, and take down what was never set up, which crashes.
+    """
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(OSError, ValueError):
+            stream.flush()
+    os._exit(code)
 
 
 def of(context: typer.Context) -> Console:
