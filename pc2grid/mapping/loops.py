@@ -510,7 +510,7 @@ class Recognition:
     older, newer : their indices.
     T_older_newer : the frame of the newer place map in that of the older one. Exact to some decimetres; loop
         closure refines it on the local maps.
-    probability : 0..1, calibrated, that both show the same place, by their appearance.
+    log_odds : that both show the same place, by their appearance.
 
     At most one recognition of a newer place map is right, or those at one place that several older ones show.
     """
@@ -518,7 +518,7 @@ class Recognition:
     older: int
     newer: int
     T_older_newer: SE2
-    probability: float
+    log_odds: float
 
 
 class PlaceRecognizer(Protocol):
@@ -663,7 +663,6 @@ class LoopCandidates:
             return []
         older, newer = np.array([(c.older, c.newer) for c in pending]).T
         measured = np.array([(c.T_older_newer.x, c.T_older_newer.y, c.T_older_newer.yaw) for c in pending])
-        probability = np.clip([c.probability for c in pending], 1e-6, 1.0 - 1e-6)
 
         way_m = travel_m[newer] - travel_m[older]
         error = between(measured, between(nodes[older], nodes[newer]))
@@ -673,7 +672,7 @@ class LoopCandidates:
         agrees = self._agreement(older, newer, measured, nodes, travel_m)
         same = newer[:, None] == newer
         support = np.array([len(set(newer[row])) for row in agrees & ~same & in_reach])
-        likely = np.log(probability / (1.0 - probability)) - 0.5 * off**2
+        likely = np.array([c.log_odds for c in pending]) - 0.5 * off**2
 
         reach = np.choose(np.minimum(support, 2), (p.alone, p.supported, p.possible))
         fits = (off <= reach) & ~known

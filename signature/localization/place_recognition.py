@@ -2,9 +2,10 @@
 
 The session is its own database: each stretch of some metres of travel becomes a small map with a few
 described places, and every new stretch is looked up among those before it with the parts of a `MapIndex`.
-Signatures propose, the alignment of walls in both directions verifies, and a calibrated
-probability says how sure it is that the two maps show the same place. Which of several such places is the
-right one is decided by loop closure (`pc2grid.mapping.loops`), which knows the travel between them.
+Signatures propose, the alignment of walls in both directions verifies, and the posterior of every answer
+(`signature.localization.posterior`) says how sure it is that two maps show one place. Which of several such
+places is the right one is decided by loop closure (`pc2grid.mapping.loops`), which knows the travel between
+them.
 """
 
 from __future__ import annotations
@@ -18,12 +19,12 @@ from functools import lru_cache
 import numpy as np
 
 from pc2grid.mapping.loops import PlaceMap, Recognition
-from pc2grid.matching.score import Fit
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
+from signature.localization.decision import LEFT
 from signature.localization.hypotheses import align, best_around, distinct
-from signature.localization.posterior import log_likelihood_ratio
+from signature.localization.posterior import evidence_of
 from signature.localization.query import QueryMap, query_of
 from signature.paper import SignatureTable
 from signature.retrieval.places import LazySequence, Places
@@ -36,27 +37,11 @@ class RecognitionParameters:
     views : places of a stretch that are described. They are both what is asked and what is asked for.
     shortlist : so many earlier places are compared with it, those that are likeliest by their signatures.
     maps : prepared maps of earlier stretches that stay in memory, about 4 MB each.
-    least : hypotheses that are less probable are not reported.
-    neutral, sharpness : s_0 and k of `probability`, fitted to simulated sessions in the plans of fr079 and
-        intel.
     """
 
     views: int = 12
     shortlist: int = 10
     maps: int = 16
-    least: float = 0.3
-    neutral: float = 0.627
-    sharpness: float = 16.2
-
-    def probability(self, fit: Fit) -> float:
-        """How probable it is that two maps that fit so well show one place, rivals left aside, 0..1.
-
-        logit p = k min(1, W/100) (l(s) - l(s_0)) with the score s, the wall points W that it rests on, and
-        l(a) = ln a - ln(1.2 - a).
-        """
-        k = self.sharpness * min(1.0, fit.compared / 100.0)
-        least = log_likelihood_ratio(self.neutral)
-        return 1.0 / (1.0 + math.exp(-k * (log_likelihood_ratio(fit.score) - least)))
 
 
 RECOGNITION = RecognitionParameters()
@@ -76,11 +61,7 @@ class SessionRecognizer:
     def __init__(self, config: Config, parameters: RecognitionParameters = RECOGNITION) -> None:
         """config : stretches are described as the places of a database with this configuration."""
         self._made_with = config
-        self._config = config.relocalize.model_copy(
-            update={
-                "views": parameters.views,
-            }
-        )
+        self._config = config.relocalize.model_copy(update={"views": parameters.views})
         self._parameters = parameters
         # Grids are kept compressed: some 10 kB a stretch, so that a long session needs little memory.
         self._stored: list[tuple[bytes, tuple[int, ...], float, tuple[float, float]]] = []
@@ -88,7 +69,7 @@ class SessionRecognizer:
         self._places: Places | None = None
 
     def recognize(self, newest: PlaceMap) -> Sequence[Recognition]:
-        """The earlier stretches that look like the newest one, each place with its own probability."""
+        """The earlier stretches that look like the newest one, each place with its own odds."""
         query = query_of(newest.grid, newest.poses[:, :2], self._made_with, self._config)
         found = [] if self._places is None else self._look_up(query, self._places)
         self._remember(newest.grid, query)
@@ -97,20 +78,16 @@ class SessionRecognizer:
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
         rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
         maps = LazySequence(self._map, len(self._stored), most=0)
-        likely = [
-            best_around(query, found, maps[found.session_index])
-            for found in next(align(query, [places.areas(rows)], places, maps, self._config))
-            if self._parameters.probability(found.fit) >= self._parameters.least
-        ]
+        found = distinct(query, next(align(query, [places.areas(rows)], places, maps, self._config)))
         return [
             Recognition(
-                older=found.session_index,
+                older=h.session_index,
                 newer=len(self._stored),
-                T_older_newer=found.fit.T_map_query,
-                probability=probability,
+                T_older_newer=best_around(query, h, maps[h.session_index]).fit.T_map_query,
+                log_odds=evidence.log_odds(),
             )
-            for found in distinct(query, likely)
-            for probability in [self._parameters.probability(found.fit)]
+            for h, evidence in zip(found, evidence_of([h.fit for h in found], query), strict=True)
+            if evidence.log_odds() > math.log(LEFT / (1.0 - LEFT))
         ]
 
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:

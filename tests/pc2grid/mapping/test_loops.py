@@ -203,9 +203,7 @@ class KnowsTheTruth:
         for older, frame in enumerate(self.frames[:-1]):
             true = frame.inverse() @ self.frames[-1]
             if math.hypot(true.x, true.y) < 8.0:
-                found.append(
-                    Recognition(older=older, newer=newest.index, T_older_newer=true, probability=1.0)
-                )
+                found.append(Recognition(older=older, newer=newest.index, T_older_newer=true, log_odds=13.8))
         return found
 
 
@@ -263,7 +261,7 @@ NODES = corridor(41)[0]
 def seen(older: int, newer: int, *, off: SE2 = SE2(0.2, 0.0, 0.0)) -> Recognition:  # noqa: B008
     """A candidate that is `off` from where tracking puts the newer stretch."""
     T = SE2(*NODES[older]).inverse() @ SE2(*NODES[newer]) @ off
-    return Recognition(older=older, newer=newer, T_older_newer=T, probability=0.99)
+    return Recognition(older=older, newer=newer, T_older_newer=T, log_odds=4.6)
 
 
 def accepted(*batches: list[Recognition]) -> list[Recognition]:

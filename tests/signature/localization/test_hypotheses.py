@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from types import SimpleNamespace
-from typing import cast
 
 import numpy as np
 import pytest
 
 from pc2grid.geometry import F32, SE2, wrap_angle
 from pc2grid.mapping.loops import PlaceMap
-from pc2grid.matching.score import Fit, score_fit
+from pc2grid.matching.score import score_fit
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config, RelocalizeConfig, ShortlistBy
@@ -27,7 +25,7 @@ from signature.localization.hypotheses import (
     distinct,
     fitted,
 )
-from signature.localization.place_recognition import RECOGNITION, RecognitionParameters, SessionRecognizer
+from signature.localization.place_recognition import RecognitionParameters, SessionRecognizer
 from signature.localization.query import query_of
 from tests.helpers.simulated_drives import building, office, office_part, with_tables
 
@@ -213,31 +211,22 @@ def test_an_earlier_place_is_recognised_and_a_new_one_is_not() -> None:
     assert list(recognizer.recognize(stretch(0, rooms(0)))) == []
     for index in (1, 2, 3):
         found = recognizer.recognize(stretch(index, rooms(index)))
-        assert all(recognition.probability < 0.9 for recognition in found)
+        assert all(recognition.log_odds < 2.2 for recognition in found)
     again = SE2(0.7, -0.4, 2.0)
     found = recognizer.recognize(stretch(4, seen_from(rooms(1), again)))
-    best = max(found, key=lambda recognition: recognition.probability)
-    assert (best.older, best.newer) == (1, 4) and best.probability > 0.95
+    best = max(found, key=lambda recognition: recognition.log_odds)
+    assert (best.older, best.newer) == (1, 4) and best.log_odds > 3.0
     assert math.hypot(best.T_older_newer.x - again.x, best.T_older_newer.y - again.y) < 0.1
     assert abs(wrap_angle(best.T_older_newer.yaw - again.yaw)) < 0.02
     assert all(recognition.older < 4 for recognition in found)
 
 
 def test_tables_that_were_seen_over_and_under_do_not_hide_an_earlier_place() -> None:
-    """They were carried away since. They hide it if nothing tells at which heights they stood."""
-    tables, probable = with_tables(rooms(1)), []
+    """They were carried away since. They tell against it if nothing says at which heights they stood."""
+    tables, odds = with_tables(rooms(1)), []
     for earlier in (tables, replace(tables, heights=None)):
         recognizer = SessionRecognizer(Config())
         recognizer.recognize(stretch(0, earlier))
         found, *_ = recognizer.recognize(stretch(1, rooms(1)))
-        probable.append(found.probability)
-    assert probable[0] > 0.99 > 0.9 > probable[1]
-
-
-def test_two_maps_show_one_place_the_surer_the_more_walls_agree() -> None:
-    def probability(score: float, compared: float) -> float:
-        return RECOGNITION.probability(cast(Fit, SimpleNamespace(score=score, compared=compared)))
-
-    assert probability(0.627, 1000.0) == pytest.approx(0.5)
-    assert probability(0.9, 100.0) > 0.99 > probability(0.9, 10.0) > 0.5
-    assert probability(0.3, 1000.0) < 0.01
+        odds.append(found.log_odds)
+    assert odds[0] > 4.6 and odds[0] > odds[1] + 2.0
