@@ -266,11 +266,6 @@ class Answer:
         return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
 
     @property
-    def slipped(self) -> float:
-        """Probability that the query lay at the best place until it was carried away or tracking slipped."""
-        return self.masses[0] * self.evidence.slipped() if self.masses else 0.0
-
-    @property
     def beside_map(self) -> OffMap | None:
         """Where the robot is, beside the map, if that is more likely than all else together."""
         return next((away for away in self.off_map if away.mass >= POSTERIOR.likely), None)

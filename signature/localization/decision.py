@@ -20,7 +20,6 @@ from signature.localization.posterior import (
     NO_EVIDENCE,
     evidence_of,
     masses,
-    tail_of,
 )
 from signature.localization.query import QueryMap
 
@@ -75,9 +74,6 @@ def judge(
     known = list(zip(places, map(prior_of, places), evidence_for, strict=True))
     known.sort(key=lambda each: -math.log(each[1]) - each[2].log_odds())
     ordered, prior, evidence = (list(each) for each in zip(*known, strict=True))
-    best = ordered[0][0]
-    walls = index.maps_for(query)[best.session_index].walls
-    evidence[0] = replace(evidence[0], tail=tail_of(query, best.fit, walls, index.config.step_m))
     mass = masses(evidence, prior).tolist()
     in_the_map = evidence[0].log_odds() + math.log(prior[0]) >= 0.0
     status: Status = "ambiguous" if in_the_map else "not_found"
@@ -91,35 +87,25 @@ def judge(
     )
 
 
-def with_slip(verdict: Verdict, since: float, accept: float) -> Verdict:
-    """The verdict with `Evidence.since` of its first place. accept : least confidence to be located."""
-    evidence = replace(verdict.evidence, since=since)
-    more = verdict.masses[0] * (evidence.slipped() - verdict.evidence.slipped())
-    masses = tuple(mass / (1.0 + more) for mass in verdict.masses)
-    off_map = tuple(replace(away, mass=away.mass / (1.0 + more)) for away in verdict.off_map)
-    confidence = verdict.confidence / (1.0 + more)
-    doubtful = verdict.status == "located" and confidence < accept
-    status: Status = "ambiguous" if doubtful else verdict.status
-    return replace(
-        verdict, status=status, confidence=confidence, masses=masses, evidence=evidence, off_map=off_map
-    )
-
-
-def beside_map(
-    verdict: Verdict, query: QueryMap, prior_of: PriorOf, off_map: Sequence[OffMap], accept: float
+def weighed(
+    verdict: Verdict,
+    query: QueryMap,
+    prior_of: PriorOf,
+    off_map: Sequence[OffMap],
+    slipped: float,
+    accept: float,
 ) -> Verdict:
-    """Return the verdict with places that the map does not show; of one that it puts where the query lies by
-    its walls, too, both masses count for the confidence.
+    """Return the verdict weighed against what else may be: places that the map does not show, and that the
+    robot was carried away or tracking slipped. Of a place beside the map that the map puts where the query
+    lies by its walls, too, both masses count for the confidence.
 
-    off_map : with masses relative to "nowhere".
+    off_map : with masses relative to "nowhere". slipped : relative to the first place.
     """
-    if not off_map:
-        return verdict
     first, at = place_of(verdict, 0), query.T_odom_base
     odds = 1.0
     if verdict.confidence:
         odds = prior_of(first) * math.exp(verdict.evidence.log_odds()) / verdict.masses[0]
-    share = 1.0 / (odds + sum(away.mass for away in off_map))
+    share = 1.0 / (odds * (1.0 + slipped * verdict.confidence) + sum(away.mass for away in off_map))
     masses = tuple(mass * odds * share for mass in verdict.masses)
     here = [
         away

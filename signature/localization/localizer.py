@@ -23,7 +23,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from types import TracebackType
@@ -36,13 +36,13 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
-from signature.localization.answer import Answer, Moment, OffMap, Verdict
+from signature.localization.answer import Answer, Moment, Verdict
 from signature.localization.belief import Belief, Masses, State
-from signature.localization.decision import PriorOf, beside_map, decide, judge, with_slip
+from signature.localization.decision import PriorOf, decide, judge, weighed
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis, moved_to_origin
 from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import POSTERIOR
+from signature.localization.posterior import POSTERIOR, slip_of
 from signature.localization.query import Query, QueryMap, ViewSpacing, map_as_query
 
 _MOMENTS = 10_000
@@ -137,7 +137,7 @@ class Localizer:
         if not self.take(registered, planar_scan, may_search=may_search):
             return None
         try:
-            self.query, answer = self._since_slip(self._on_the_way)
+            self.query, answer = self.search(self.query, index=self._on_the_way)
         except NoScans:  # the scans since the start, or since registration was lost, show nothing
             return None
         query = self.query.map()
@@ -177,7 +177,7 @@ class Localizer:
 
         Raises NoScans if no scan could be used.
         """
-        return self._answer or self._since_slip(self.index)[1]
+        return self._answer or self.search(self.query)[1]
 
     def restart(self) -> None:
         """The scans do not go on from those before: what comes next is a search of its own, and a prior of an
@@ -196,43 +196,55 @@ class Localizer:
         begin_ns = 0 if self.index.prior is None else self.index.prior.stamp_ns or 0
         return any(past.status == "located" and past.stamp_ns >= begin_ns for past in self._history)
 
-    def _since_slip(self, index: MapIndex) -> tuple[Query, Answer]:
-        """The answer, and the query that it is about: the scans since the robot was carried away or tracking
-        slipped, if that is more likely than not."""
-        query, answer = self.query, self.search(self.query, index=index)
-        while answer.slipped >= POSTERIOR.likely:
-            query = query.since(answer.evidence.scans_since)
-            answer = self.search(query, index=index)
-        return query, answer
-
     def search(
         self,
         query: Query,
         known: tuple[Hypothesis, ...] = (),
         prior_of: PriorOf | None = None,
         index: MapIndex | None = None,
-    ) -> Answer:
-        """Where a query is. Nothing of it is kept.
+    ) -> tuple[Query, Answer]:
+        """Where a query is, and the query that this is about: if it is more likely than not that the robot
+        was carried away or tracking slipped, the scans since. Nothing of it is kept.
 
         known : hypotheses to be compared, too. prior_of : of each place; None: by the searches before the
         last metres. index : where to look, if not where the localizer does. Raises NoScans if no scan could
         be used.
         """
-        seen, index = query.map(), index or self.index
-        self._clock.lap("describe")
+        seen, index, clock = query.map(), index or self.index, self._clock
+        clock.lap("describe")
         part, _, carried = self._last
         before, off_map = self._belief.before(index, seen)
-        return answer_query(
-            index,
-            query,
+        known = (*(carried if part == seen.part else ()), *known)
+        verdict, found = decide(index, seen, known, prior_of or before.prior)
+        clock.lap("search")
+        prior, excluded = _with_prior(index, seen, verdict, found)
+        slipped, later = 0.0, None
+        if verdict.hypotheses:
+            best = verdict.hypotheses[0]
+            walls = index.maps_for(seen)[best.session_index].walls
+            slipped, scans = slip_of(seen, best.fit, walls, index.config.step_m)
+            if scans and query is self.query:
+                later = self.search(query.since(scans), index=index)
+                slipped *= _elsewhere(*later, best)
+        verdict = weighed(
+            verdict,
             seen,
-            (*(carried if part == seen.part else ()), *known),
-            prior_of=prior_of or before.prior,
-            off_map=off_map if prior_of is None else (),
-            session_index=self._belief.session_index,
-            history=tuple(self._history),
-            clock=self._clock,
+            prior_of or before.prior,
+            off_map if prior_of is None else (),
+            slipped,
+            index.config.accept,
         )
+        if later and slipped * verdict.masses[0] >= POSTERIOR.likely:
+            return later
+        verdict = _in_map(verdict, self._belief.session_index)
+        clock.lap("decide")
+        in_space = None
+        if query.in_space is not None:
+            verdict, in_space = settle_in_space(verdict, query.in_space, index.surface, index.config.accept)
+            clock.lap("in_space")
+        answer = _answer(index, seen, verdict, tuple(self._history))
+        timing_ms = dict(clock.total_ms)
+        return query, replace(answer, prior=prior, excluded=excluded, in_space=in_space, timing_ms=timing_ms)
 
 
 class Clock:
@@ -247,39 +259,6 @@ class Clock:
         now = time.perf_counter()
         self.total_ms[name] = self.total_ms.get(name, 0.0) + 1000.0 * (now - self._last)
         self._last = now
-
-
-def answer_query(
-    index: MapIndex,
-    query: Query,
-    seen: QueryMap,
-    known: tuple[Hypothesis, ...],
-    *,
-    prior_of: PriorOf,
-    off_map: Sequence[OffMap],
-    session_index: int | None,
-    history: tuple[Moment, ...],
-    clock: Clock,
-) -> Answer:
-    """Where a query is.
-
-    seen : `query` drawn. known : hypotheses that are compared, too. prior_of : what was known before it, of
-    each place. off_map : where it may be beside the map, see `signature.localization.belief.Belief.before`.
-    session_index : of the map that is preferred among several that show the place.
-    """
-    verdict, found = decide(index, seen, known, prior_of)
-    clock.lap("search")
-    prior, excluded = _with_prior(index, seen, verdict, found)
-    verdict = beside_map(verdict, seen, prior_of, off_map, index.config.accept)
-    verdict = _in_map(_with_slip(index, query, verdict), session_index)
-    clock.lap("decide")
-    in_space = None
-    if query.in_space is not None:
-        verdict, in_space = settle_in_space(verdict, query.in_space, index.surface, index.config.accept)
-        clock.lap("in_space")
-    answer = _answer(index, seen, verdict, history)
-    timing_ms = dict(clock.total_ms)
-    return replace(answer, prior=prior, excluded=excluded, in_space=in_space, timing_ms=timing_ms)
 
 
 def _with_prior(
@@ -298,17 +277,11 @@ def _with_prior(
     return "used", moment_of(index.whole, query, best) if excluded else None
 
 
-def _with_slip(index: MapIndex, query: Query, verdict: Verdict) -> Verdict:
-    """The verdict, by what the scans since the likeliest slip say alone."""
-    evidence = verdict.evidence
-    if not evidence.tail or min(evidence.tail) >= 0.0:
-        return verdict
-    since = query.since(evidence.scans_since).map()
-    alone, _ = decide(index, since)
-    here = Masses.of(since, alone).mass([verdict.hypotheses[0]])
-    found = alone.confidence and math.exp(alone.evidence.log_odds()) / alone.confidence
-    elsewhere = 1.0 + found * (sum(alone.masses) - here)
-    return with_slip(verdict, elsewhere, index.config.accept)
+def _elsewhere(query: Query, alone: Answer, place: Hypothesis) -> float:
+    """What a query can be, as a multiple of "nowhere": this, and each place that it has alone but one."""
+    here = Masses.of(query.map(), alone).mass([place])
+    odds = alone.masses[0] and math.exp(alone.evidence.log_odds()) / alone.masses[0] if alone.masses else 0.0
+    return 1.0 + odds * (sum(alone.masses) - here)
 
 
 def _in_map(verdict: Verdict, session_index: int | None) -> Verdict:

@@ -143,7 +143,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     fit = score_fit(walls, seen.walls, T_map_query, np.zeros((3, 3)))
     believed = Hypothesis(session_index=number, row=-1, fit=fit)
     # All mass was near the pose before what was seen lately. So of two equal rooms it is in the nearer one.
-    answer = localizer.search(
+    _, answer = localizer.search(
         localizer.query,
         near.in_region(seen, (believed,)),
         lambda place: 1.0 / (1.0 - kept(seen)) if any(near.allows(seen, h) for h in place) else 1.0,

@@ -9,9 +9,9 @@ in the region, and if another place fits better by far, nothing inside is. That 
 The posterior over places and "not in this map": one equation decides every answer.
 
     mass(h)  =  prior(h) exp(z_h) / N                        the query lies at h
-    lost(h)  =  mass(h) A sum_k s exp(-c r_hk)               it lay there until it slipped before scan k
+    slipped  =  mass(h) A sum_k s exp(-c r_k)                it lay at the likeliest h until scan k
     nowhere  =  1 / N                                        it lies at no place of this map
-    N        =  1 + sum_h prior(h) exp(z_h) (1 + A sum_k s exp(-c r_hk))
+    N        =  1 + sum_h prior(h) exp(z_h), and all else that is told apart from "nowhere"
 
     z_h = b + c (f_h + g_h) + d t_h
     f = l(a_f) n_f / (n_f + few),    g = l(a_b) n_b / (n_b + few),    l(a) = ln a - ln(1.2 - a)
@@ -28,12 +28,13 @@ The posterior over places and "not in this map": one equation decides every answ
   no examples of it. What tells for the best of them tells for each, so they share the mass by their priors.
 - like, how well the query fits onto itself, slid along (`pc2grid.matching.score`): the walls of a
   bare corridor tell no place along it from another.
-- r_hk, the log-likelihood of the scans from k on, f of these alone, a metre, times the metres since: where
+- r_k, the log-likelihood of the scans from k on, f of these alone, a metre, times the metres since: where
   tracking slips or the robot is carried away, the scans before fit and those after do not. s is the rate of
   slips, per scan. As in a test by the least sum (Page 1954, "Continuous inspection schemes"), what has
   contradicted for long tells more; metres count, because neighbouring scans see the same walls.
 - A, what the scans since the likeliest slip can be: "nowhere" and each other place of the map, found for
-  these scans alone. 1 as long as nothing contradicts the place.
+  these scans alone. 1 as long as nothing contradicts the place. If that is likelier than not, what they say
+  is the answer.
 
 `located` means that one place has at least the mass `RelocalizeConfig.accept`; `ambiguous`, that the best
 place is at least as likely as "nowhere", z + ln prior >= 0; `not_found` all else.
@@ -279,8 +280,6 @@ class Evidence:
     `pc2grid.matching.walls.permanence`. backward, looked_at : the other way round, from whichever side.
     lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
     likeness : `pc2grid.matching.score` of the query.
-    tail : r_k, log-likelihood of the scans from the k-th one on, the last one first, without the first scan
-    of the query. since : A, what the scans since the likeliest slip can be, as a multiple of "nowhere".
     """
 
     forward: float
@@ -289,8 +288,6 @@ class Evidence:
     looked_at: float
     lead: float
     likeness: float
-    tail: tuple[float, ...] = ()
-    since: float = 1.0
 
     @property
     def agreement(self) -> float:
@@ -313,15 +310,6 @@ class Evidence:
         if not self.walls:
             return -math.inf
         return float(np.dot((p.bias, p.fit, p.lead), self.terms))
-
-    @property
-    def scans_since(self) -> int:
-        """How many scans there are since the likeliest slip."""
-        return 1 + min(range(len(self.tail)), key=self.tail.__getitem__)
-
-    def slipped(self, p: PosteriorParameters = POSTERIOR) -> float:
-        """Mass of "it lay here, but tracking slipped", as a multiple of the mass of the place."""
-        return float(p.slip * self.since * np.exp(-p.fit * np.array(self.tail)).sum())
 
 
 NO_EVIDENCE = Evidence(forward=0.0, walls=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
@@ -352,23 +340,25 @@ def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()
 def masses(
     evidence: Sequence[Evidence], prior: float | Sequence[float] = 1.0, p: PosteriorParameters = POSTERIOR
 ) -> F64:
-    """(H,) probability of each place; what is missing to 1 is "nowhere" and "tracking slipped".
+    """(H,) probability of each place; what is missing to 1 is "nowhere".
 
     prior : of each place, relative to that of "nowhere".
     """
     log_odds = np.array([e.log_odds(p) for e in evidence]) + np.log(prior)
     highest = max(0.0, *log_odds, 0.0)
     odds = np.exp(log_odds - highest)
-    lost = odds @ np.array([e.slipped(p) for e in evidence])
-    return np.asarray(odds / (math.exp(-highest) + odds.sum() + lost))
+    return np.asarray(odds / (math.exp(-highest) + odds.sum()))
 
 
-def tail_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[float, ...]:
-    """`Evidence.tail` of a query at a pose on a map; empty for a drawn map. step_m : travel after which scans
-    are new evidence."""
+def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[float, int]:
+    """Mass of "it lay here until it was carried away or tracking slipped" as a multiple of the mass of a
+    place, with A = 1; and how many scans there are since the likeliest slip, 0 if none contradict the place.
+
+    step_m : travel after which scans are new evidence.
+    """
     above = query.walls.facing(walls).only_explain
     likelihood = points = 0.0
-    tail = []
+    told = []
     # Before the first scan there was nothing to slip from.
     for count, keyframe in enumerate(reversed(query.keyframes[1:]), start=1):
         hits_m = (fit.T_map_query @ keyframe.T_odom_base).apply(keyframe.planar_scan.hits_m)
@@ -377,8 +367,10 @@ def tail_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[flo
         points += float(np.count_nonzero(known))
         mean = likelihood / points if points else 0.0
         steps = (query.path_m - keyframe.path_m) / step_m
-        tail.append(tempered(mean, points / count) * max(steps, 1.0))
-    return tuple(tail)
+        told.append(tempered(mean, points / count) * max(steps, 1.0))
+    tail = np.array(told)
+    since = 1 + int(tail.argmin()) if tail.min(initial=0.0) < 0.0 else 0
+    return POSTERIOR.slip * float(np.exp(-POSTERIOR.fit * tail).sum()), since
 
 
 def log_likelihood(fit: Fit) -> float:

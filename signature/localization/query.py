@@ -248,18 +248,15 @@ class Query:
 
     def since(self, scans: int) -> Query:
         """The query that begins with the last so many `QueryMap.keyframes`, before which tracking slipped."""
-        keyframes = self.map().keyframes[-scans:]
-        later = self.anew()
-        later._slipped_m = keyframes[0].path_m
-        later.in_space = (
-            None if self.in_space is None else self.in_space.since(self.path_m - later._slipped_m)
-        )
-        later.part, later.first_ns = self.part, keyframes[0].planar_scan.stamp_ns
-        later._keyframes.extend(keyframes)
-        later._newest = keyframes[-1]
-        at_prior = self._at_prior[1]
-        if at_prior is not None and at_prior.path_m >= later._slipped_m:
-            later._at_prior = self._at_prior
+        later = copy(self)
+        later._keyframes = deque(self.map().keyframes[-scans:])
+        later._drawn = None
+        later._slipped_m = later._keyframes[0].path_m
+        if self.in_space is not None:
+            later.in_space = self.in_space.since(self.path_m - later._slipped_m)
+        off_ns, at_prior = self._at_prior
+        if at_prior is not None and at_prior.path_m < later._slipped_m:
+            later._at_prior = off_ns, None
         return later
 
     def forget_prior(self) -> None:

@@ -17,7 +17,7 @@ from signature.localization.posterior import POSTERIOR, Evidence, masses
 TRUTH = replace(POSTERIOR, bias=-4.0, fit=2.0, lead=4.0)
 
 
-def place(rng: np.random.Generator, lead: float, tail: tuple[float, ...] = ()) -> Evidence:
+def place(rng: np.random.Generator, lead: float) -> Evidence:
     return Evidence(
         forward=float(rng.uniform(0.3, 0.98)),
         walls=float(rng.uniform(30, 300)),
@@ -25,7 +25,6 @@ def place(rng: np.random.Generator, lead: float, tail: tuple[float, ...] = ()) -
         looked_at=float(rng.uniform(30, 300)),
         lead=lead,
         likeness=float(rng.uniform(0.0, 1.0)),
-        tail=tail,
     )
 
 
@@ -35,8 +34,7 @@ def answers(count: int) -> list[Known]:
     made = []
     for i in range(count):
         lead = float(rng.uniform(0.0, 0.15))
-        tail = tuple(rng.uniform(-1.0, 1.5, 5).tolist())
-        places = (place(rng, lead, tail), place(rng, -lead))
+        places = (place(rng, lead), place(rng, -lead))
         drawn = rng.random() - np.cumsum(masses(places, p=TRUTH))
         first = next((k for k in (0, 1) if drawn[k] < 0.0), None)
         buildings = frozenset("abc"[i % 3])

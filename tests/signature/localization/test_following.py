@@ -18,7 +18,7 @@ from signature.config import Config, RelocalizeConfig
 from signature.localization import localizer as follower_module
 from signature.localization.answer import Answer, OffMap
 from signature.localization.belief import Belief
-from signature.localization.decision import anywhere, beside_map, decide
+from signature.localization.decision import anywhere, decide, weighed
 from signature.localization.localizer import Estimate, Follower, Localizer
 from signature.localization.posterior import Prior
 from signature.localization.query import query_of
@@ -82,8 +82,20 @@ def test_what_odometry_says_counts_for_the_place_where_walls_say_it_more_exactly
         seen=moved.covariance,
     )
     assert verdict.status == "located"
-    beside = beside_map(verdict, query, anywhere, [away], 0.75)
-    assert (beside.status == "located") == counts == (beside.confidence > 0.75)
+    told = weighed(verdict, query, anywhere, [away], 0.0, 0.75)
+    assert (told.status == "located") == counts == (told.confidence > 0.75)
+
+
+def test_a_place_is_the_less_certain_the_likelier_tracking_slipped() -> None:
+    query = query_of(office(), np.array([(2.0, 7.0), (7.0, 7.0)]), Config(), Config().relocalize)
+    verdict, _ = decide(OFFICE, query)
+    told = weighed(verdict, query, anywhere, [], 2.0, 0.75)
+    assert verdict.status == "located" and told.status == "ambiguous"
+    assert (
+        told.confidence
+        == told.masses[0]
+        == pytest.approx(verdict.confidence / (1.0 + 2.0 * verdict.confidence))
+    )
 
 
 def check_poses(estimates: list[tuple[Estimate, SE2]]) -> None:

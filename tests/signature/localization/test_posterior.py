@@ -19,6 +19,7 @@ from pc2grid.matching.score import Fit
 from pc2grid.model import Health, RegisteredScan
 from signature.config import Config, RelocalizeConfig
 from signature.localization.answer import Answer
+from signature.localization.decision import decide
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
@@ -28,9 +29,10 @@ from signature.localization.posterior import (
     Prior,
     evidence_of,
     masses,
+    slip_of,
     tempered,
 )
-from signature.localization.query import QueryMap
+from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import building, drive, office, plan
 
 AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
@@ -54,11 +56,10 @@ def test_more_agreement_or_a_longer_lead_never_lowers_the_mass(field: str, value
 
 
 def test_masses_and_what_they_leave_add_up_to_one() -> None:
-    """ "Nowhere" has the weight 1 beside exp(z) of each place and its slips."""
-    places = [replace(USUAL, lead=0.01, tail=(1.0, -0.5)), replace(USUAL, lead=-0.01, forward=0.85)]
+    """ "Nowhere" has the weight 1 beside exp(z) of each place."""
+    places = [replace(USUAL, lead=0.01), replace(USUAL, lead=-0.01, forward=0.85)]
     odds = np.exp([p.log_odds() for p in places])
-    slips = odds[0] * POSTERIOR.slip * np.exp(-POSTERIOR.fit * np.array([1.0, -0.5])).sum()
-    assert masses(places) == pytest.approx(odds / (1.0 + odds.sum() + slips))
+    assert masses(places) == pytest.approx(odds / (1.0 + odds.sum()))
 
 
 def test_of_two_equal_places_each_has_at_most_half() -> None:
@@ -74,16 +75,23 @@ def test_the_prior_decides_between_equal_places_and_not_what_is_certain() -> Non
     assert masses([USUAL], [0.5])[0] == pytest.approx(mass(USUAL) / (2.0 - mass(USUAL)))
 
 
-def test_scans_that_contradict_the_place_move_its_mass_to_slipped() -> None:
-    """The last ten scans fit no better than a wrong place: where the robot is now is not known."""
-    fits, contradicts = tempered(0.9, 200.0), tempered(0.1, 200.0)
-    assert mass(replace(USUAL, tail=(fits,) * 50)) == pytest.approx(mass(USUAL), abs=0.01)
-    assert mass(replace(USUAL, tail=(contradicts,) * 10 + (fits,) * 40)) < 0.5
-    # A little contradiction is enough where these scans alone fit another place.
-    some = replace(USUAL, tail=(tempered(0.4, 200.0),) * 5 + (fits,) * 45)
-    assert mass(some) > 0.9 and mass(replace(some, since=100.0)) < 0.6
-    # A single one that is seen from the same place may be a person who stands in the way.
-    assert mass(replace(USUAL, tail=(tempered(0.5, 200.0), *(fits,) * 49))) > 0.9
+@pytest.mark.parametrize(("turned", "likely"), [(0, False), (1, False), (10, True)])
+def test_scans_that_contradict_a_place_say_since_when_tracking_slipped(turned: int, likely: bool) -> None:
+    """A single one that is seen from the same place may be a person who stands in the way."""
+    index = building({"office": office()})
+    query = Query(index.made_with, index.config)
+    for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
+        query.add(registered, planar_scan)
+    seen = query.map()
+    fit = decide(index, seen)[0].hypotheses[0].fit
+    last = len(seen.keyframes) - turned
+    keyframes = tuple(
+        k if n < last else replace(k, T_odom_base=k.T_odom_base @ SE2(0.0, 0.0, 0.7))
+        for n, k in enumerate(seen.keyframes)
+    )
+    walls, step_m = index.maps[0].walls, index.config.step_m
+    odds, since = slip_of(replace(seen, keyframes=keyframes), fit, walls, step_m)
+    assert since == turned and (odds > 0.5) is likely
 
 
 def test_what_neither_side_knows_says_nothing() -> None:

@@ -107,7 +107,6 @@ def is_right(error: Sequence[float]) -> bool:
 def fit(answers: Sequence[Known]) -> PosteriorParameters:
     """The parameters bias, fit and lead under which the truth is likeliest; only the bias may be negative.
 
-    The rate of slips stays as it is in use: queries in which tracking slips are too rare to tell it.
     Raises ValueError unless there are both queries whose place was found and others.
     """
     found = np.array([answer.first is not None for answer in answers])
@@ -128,44 +127,32 @@ def fit(answers: Sequence[Known]) -> PosteriorParameters:
 
 @dataclass(frozen=True, slots=True)
 class _Likelihood:
-    """Of N answers with up to K places: terms (N, K, 3), tails (N, T) of the best place, and the number of
-    the true place (N,), K for none.
+    """Of N answers with up to K places: terms (N, K, 3), and the number of the true place (N,), K for none.
 
-    Places that are missing or without walls have terms (inf, 0, 0); missing tails are inf.
+    Places that are missing or without walls have terms (inf, 0, 0).
     """
 
     terms: F64
-    tails: F64
     first: NDArray[np.intp]
 
     @staticmethod
     def of(answers: Sequence[Known]) -> _Likelihood:
         most = max((len(a.places) for a in answers), default=0)
-        longest = max((len(e.tail) for a in answers for e in a.places), default=0)
         terms = np.tile((np.inf, 0.0, 0.0), (len(answers), most, 1))
-        tails = np.full((len(answers), longest), np.inf)
         for n, answer in enumerate(answers):
             for k, evidence in enumerate(answer.places):
                 if evidence.walls:
                     terms[n, k] = evidence.terms
-                tails[n, : len(evidence.tail)] = evidence.tail
         first = np.array([most if a.first is None else a.first for a in answers])
-        return _Likelihood(terms, tails, first)
+        return _Likelihood(terms, first)
 
     def of_truth(self, x: F64) -> F64:
         """(N,) probability of what is true, by bias, fit and lead."""
         given = np.isfinite(self.terms[:, :, 0])
         z = np.where(given, np.nan_to_num(self.terms, posinf=0.0) @ x, -700.0)
         odds = np.exp(np.clip(z, -700.0, 300.0))
-        lost = (
-            POSTERIOR.slip
-            * np.exp(-x[1] * np.minimum(self.tails, 700.0)).sum(axis=1)
-            * odds[:, :1].sum(axis=1)
-        )
         every = np.column_stack((odds, np.ones(len(odds))))
-        lost_or_nowhere = np.where(self.first == odds.shape[1], lost, 0.0)
-        truth = every[np.arange(len(odds)), self.first] + lost_or_nowhere
-        return np.asarray(truth / (every.sum(axis=1) + lost))
+        return np.asarray(every[np.arange(len(odds)), self.first] / every.sum(axis=1))
 
 
 def balanced(found: NDArray[np.bool_]) -> F64:

@@ -61,7 +61,7 @@ from signature.database import open_database
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import SPACE, fit_in_space, terms_in_space
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import evidence_of, tail_of
+from signature.localization.posterior import evidence_of
 from signature.localization.query import Query, QueryInSpace, QueryMap, best_observed
 from signature.visible import PROFILE_BEARINGS, seen_signatures, viewpoints_of
 from signature.weights import Pairs, SeenStatistics
@@ -232,14 +232,9 @@ def rows(
 def _asked(
     index: MapIndex, query: QueryMap, truth: Mapping[str, SE2], in_space: QueryInSpace | None = None
 ) -> dict[str, Any]:
-    """What tells for each place that is found, for the best one with what its last scans tell, and how far it
-    is from the truth."""
+    """What tells for each place that is found, and how far it is from the truth."""
     *_, (found, _) = index.search(query)
-    evidence = list(evidence_of([h.fit for h in found], query))
-    if found:
-        walls = index.maps[found[0].session_index].walls
-        tail = tail_of(query, found[0].fit, walls, index.config.step_m)
-        evidence[0] = replace(evidence[0], tail=tail)
+    evidence = evidence_of([h.fit for h in found], query)
     errors = [error_of(index, query, h, truth) for h in found]
     row = {"evidence": list(map(asdict, evidence)), "errors": errors}
     if in_space is None or not in_space.views or index.surface_of is None:
