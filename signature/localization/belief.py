@@ -113,6 +113,11 @@ class Masses:
         """The likeliest place alone."""
         return replace(self, places=(max(self.places, key=lambda place: place[0].mass),))
 
+    @property
+    def beside(self) -> bool:
+        """Whether the map shows too little of the first place."""
+        return self.places[0][0].seen_m < self.path_m
+
     def prior(self, place: Sequence[Hypothesis]) -> float:
         """Prior of a place, relative to that of "nowhere", as the masses are (`Belief.before`)."""
         shown = place[0].fit.overlap >= POSTERIOR.shown
@@ -154,7 +159,7 @@ class Belief:
         self._searches: list[Masses] = []
         self._place: Masses | None = None  # where it is held to be, located or off the map
         self._found: tuple[Masses, float] | None = None  # the last search, if it located the robot; doubt
-        self._beside = self._was_located = False  # _beside: it is held to be where the map shows too little
+        self._was_located = False
 
     @property
     def located(self) -> bool:
@@ -165,11 +170,6 @@ class Belief:
     def session_index(self) -> int | None:
         """Of the map in which it is held to be."""
         return self._place.places[0][0].hypothesis.session_index if self._place else None
-
-    def restart(self) -> None:
-        """The scans do not go on from those before. It is remembered that the robot was located once."""
-        self._searches.clear()
-        self._beside, self._place, self._found = False, None, None
 
     def before(self, index: MapIndex, query: QueryMap) -> tuple[Masses, tuple[OffMap, ...]]:
         """What was known before all scans of a query, where odometry has carried it; and those of its places
@@ -211,21 +211,17 @@ class Belief:
             self._found = now.most, doubt
             if on >= POSTERIOR.likely or doubt <= 1.0 - POSTERIOR.certain:
                 goes_on = on >= POSTERIOR.likely or not self._was_located
-                self._was_located, self._beside, self._place = True, False, now.most
+                self._was_located, self._place = True, now.most
                 return "located" if goes_on else "recovered"
         else:
             self._found = None
             if answer.beside_map is not None:
-                self._beside, self._place = True, now.most
+                self._place = now.most
                 return "off_map"
-        if on > 1.0 - self._accept or self._beside:
+        held = self._place
+        if held is not None and held.part == now.part and (on > 1.0 - self._accept or held.beside):
             return "doubtful"
         self._place = None
-        return self._nowhere
-
-    @property
-    def _nowhere(self) -> State:
-        """The state of a robot that no place is told of."""
         return "lost" if self._was_located else "searching"
 
 

@@ -50,7 +50,8 @@ _MOMENTS = 10_000
 _LOST_SCANS = 20
 """A robot of which so many scans in a row cannot be registered is looked for by the last one; by hand."""
 _STANDING_S = 2.0
-"""A robot that has moved by less than hypotheses differ by is looked for once, after this time; by hand."""
+"""A robot that has moved by less than hypotheses differ by is looked for once, after this time since the
+start, or since registration was lost; by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,16 +106,12 @@ class Localizer:
         self._belief = Belief(index.config.accept)
         self._history: deque[Moment] = deque(maxlen=_MOMENTS)
         prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
-        self._begin(Query(index.made_with, index.config, prior_ns=prior_ns, in_space=self.uses_points))
-
-    def _begin(self, query: Query) -> None:
-        self.query = query
+        self.query = Query(index.made_with, index.config, prior_ns=prior_ns, in_space=self.uses_points)
         # Of the last search: part of the query, metres driven in it, and hypotheses.
         self._last: tuple[int, float, tuple[Hypothesis, ...]] = 0, 0.0, ()
         self._answer: Answer | None = None  # of the last scan
-        self._history.clear()
         self._clock = Clock()
-        self._stood = False
+        self._stood: int | None = None  # part of the query that was looked for where it stood
 
     @property
     def uses_points(self) -> bool:
@@ -161,8 +158,8 @@ class Localizer:
             return False
         path_m = self.query.path_m
         waited = registered.scan.stamp_ns - (self.query.first_ns or 0) > _STANDING_S * 1e9
-        stands = waited and not self._stood and path_m < HYPOTHESES.same_m
-        self._stood = self._stood or waited
+        stands = waited and self._stood != self.query.part and path_m < HYPOTHESES.same_m
+        self._stood = self.query.part if waited else self._stood
         part, last_m, hypotheses = self._last
         if part != self.query.part:
             last_m, hypotheses = 0.0, ()
@@ -182,8 +179,9 @@ class Localizer:
     def restart(self) -> None:
         """The scans do not go on from those before: what comes next is a search of its own, and a prior of an
         earlier time says nothing of it."""
-        self._belief.restart()
-        self._begin(self.query.anew())
+        self.query.restart()
+        self._answer = None
+        self._history.clear()
 
     @property
     def _on_the_way(self) -> MapIndex:

@@ -70,7 +70,7 @@ class QueryMap:
     stamp_ns : the last scan. T_odom_base : pose of the base there. path_m : metres driven so far.
     grid : local map in the odom frame. views : best observed first. walls : the local map as verification
     takes it. center_m : (x, y) in the odom frame that poses of the query rotate about.
-    part : number of times that registration was lost before; each part has an odom frame of its own.
+    part : number of times that the scans did not go on before; each part has an odom frame of its own.
     slipped_m : metres driven until the robot was likely carried away or tracking slipped; none counts before.
     T_odom_prior : the base at the scan nearest to the time that a prior is about; None if it is not known in
     this odom frame. since_prior_m : metres driven since that scan.
@@ -167,8 +167,8 @@ class Query:
     query.
 
     in_space : the same scans in space; None if their points are not needed. part : number of times that
-    registration was lost. lost_scans : on how many of the last scans in a row. first_ns : stamp of the
-    first scan.
+    registration was lost or the scans began anew. lost_scans : on how many of the last scans in a row it was
+    lost. first_ns : stamp of the first scan of the part.
     """
 
     def __init__(
@@ -206,12 +206,10 @@ class Query:
         self._drawn = None
         self.first_ns = registered.scan.stamp_ns if self.first_ns is None else self.first_ns
         if registered.health is Health.LOST:
-            self.part += 1
             self.lost_scans += 1
-            self._slipped_m = 0.0
-            self._keyframes.clear()
-            self._newest = Keyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
             self._at_prior = min(self._at_prior[0], self._off_prior(planar_scan)), None
+            self.restart()
+            self._newest = Keyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
             return
         self.lost_scans = 0
         path_m = 0.0
@@ -237,14 +235,14 @@ class Query:
         while newest.path_m - self._keyframes[0].path_m > self._config.window_m:
             self._keyframes.popleft()
 
-    def anew(self) -> Query:
-        """The query that begins with the next scan, which does not go on from those before: a prior of an
-        earlier time says nothing of it."""
-        later = Query(
-            self._made_with, self._config, prior_ns=self._prior_ns, in_space=self.in_space is not None
-        )
-        later._at_prior = self._at_prior[0], None
-        return later
+    def restart(self) -> None:
+        """The scans do not go on from those before, and a prior of an earlier time says nothing of them."""
+        self.part += 1
+        self._slipped_m, self.first_ns = 0.0, None
+        self._keyframes.clear()
+        self._newest = self._drawn = None
+        self._at_prior = self._at_prior[0], None
+        self.in_space = self.in_space and QueryInSpace()
 
     def since(self, scans: int) -> Query:
         """The query that begins with the last so many `QueryMap.keyframes`, before which tracking slipped."""
@@ -252,8 +250,7 @@ class Query:
         later._keyframes = deque(self.map().keyframes[-scans:])
         later._drawn = None
         later._slipped_m = later._keyframes[0].path_m
-        if self.in_space is not None:
-            later.in_space = self.in_space.since(self.path_m - later._slipped_m)
+        later.in_space = self.in_space and self.in_space.since(self.path_m - later._slipped_m)
         off_ns, at_prior = self._at_prior
         if at_prior is not None and at_prior.path_m < later._slipped_m:
             later._at_prior = off_ns, None
