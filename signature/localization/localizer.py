@@ -108,10 +108,10 @@ class Localizer:
         prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
         self.query = Query(index.made_with, index.config, prior_ns=prior_ns, in_space=self.uses_points)
         # Of the last search: part of the query, metres driven in it, and hypotheses.
-        self._last: tuple[int, float, tuple[Hypothesis, ...]] = 0, 0.0, ()
+        self._part, self._last_m, self._known = 0, 0.0, tuple[Hypothesis, ...]()
         self._answer: Answer | None = None  # of the last scan
         self._clock = Clock()
-        self._stood: int | None = None  # part of the query that was looked for where it stood
+        self._stood = False
 
     @property
     def uses_points(self) -> bool:
@@ -139,11 +139,9 @@ class Localizer:
             return None
         query = self.query.map()
         self._answer = answer if self._on_the_way is self.index else None
-        self._last = query.part, query.path_m, answer.hypotheses
+        self._last_m, self._known = query.path_m, answer.hypotheses
         self._history.append(answer.history[-1])
         state = self._belief.follow(query, answer)
-        if state == "lost" and self._was_located_since_prior():
-            self.query.forget_prior()
         elapsed_s = time.perf_counter() - begin
         return Estimate(state=state, answer=answer, registered=registered, elapsed_s=elapsed_s)
 
@@ -152,20 +150,19 @@ class Localizer:
         self._clock.lap("register")
         self.query.add(registered, planar_scan)
         self._answer = None
+        if self._part != self.query.part:
+            self._part, self._last_m, self._known, self._stood = self.query.part, 0.0, (), False
         if registered.health is Health.LOST:
             return self._belief.located and self.query.lost_scans == _LOST_SCANS
         if not may_search:
             return False
         path_m = self.query.path_m
         waited = registered.scan.stamp_ns - (self.query.first_ns or 0) > _STANDING_S * 1e9
-        stands = waited and self._stood != self.query.part and path_m < HYPOTHESES.same_m
-        self._stood = self.query.part if waited else self._stood
-        part, last_m, hypotheses = self._last
-        if part != self.query.part:
-            last_m, hypotheses = 0.0, ()
-        is_time = stands or path_m - last_m >= self.index.config.step_m
+        stands = waited and not self._stood and path_m < HYPOTHESES.same_m
+        self._stood = self._stood or waited
+        is_time = stands or path_m - self._last_m >= self.index.config.step_m
         if is_time:
-            self._last = self.query.part, path_m, hypotheses
+            self._last_m = path_m
         return is_time
 
     @one_blas_thread
@@ -189,11 +186,6 @@ class Localizer:
         timeless = self.index.prior is not None and self.index.prior.stamp_ns is None
         return self.index.whole or self.index if timeless else self.index
 
-    def _was_located_since_prior(self) -> bool:
-        """Whether the robot was located after the time of the prior, and not lost by the prior itself."""
-        begin_ns = 0 if self.index.prior is None else self.index.prior.stamp_ns or 0
-        return any(past.status == "located" and past.stamp_ns >= begin_ns for past in self._history)
-
     def search(
         self,
         query: Query,
@@ -210,10 +202,9 @@ class Localizer:
         """
         seen, index, clock = query.map(), index or self.index, self._clock
         clock.lap("describe")
-        part, _, carried = self._last
         before, off_map = self._belief.before(index, seen)
-        known = (*(carried if part == seen.part else ()), *known)
-        verdict, found = decide(index, seen, known, prior_of or before.prior)
+        prior_of = prior_of or before.prior
+        verdict, found = decide(index, seen, (*self._known, *known), prior_of)
         clock.lap("search")
         prior, excluded = _with_prior(index, seen, verdict, found)
         slipped, later = 0.0, None
@@ -224,14 +215,7 @@ class Localizer:
             if scans and query is self.query:
                 later = self.search(query.since(scans), index=index)
                 slipped *= _elsewhere(*later, best)
-        verdict = weighed(
-            verdict,
-            seen,
-            prior_of or before.prior,
-            off_map if prior_of is None else (),
-            slipped,
-            index.config.accept,
-        )
+        verdict = weighed(verdict, seen, prior_of, off_map, slipped, index.config.accept)
         if later and slipped * verdict.masses[0] >= POSTERIOR.likely:
             return later
         verdict = _in_map(verdict, self._belief.session_index)

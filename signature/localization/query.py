@@ -147,10 +147,9 @@ class QueryInSpace:
 
     def since(self, travel_m: float) -> QueryInSpace:
         """The same without the scans from before the last so many metres of travel."""
-        later = QueryInSpace()
-        later._spacing, later.T_odom_base = copy(self._spacing), self.T_odom_base
-        first_m = self._spacing.path_m - travel_m
-        later._views.extend(view for view in self._views if view[0] >= first_m)
+        later, first_m = copy(self), self._spacing.path_m - travel_m
+        later._spacing = copy(self._spacing)
+        later._views = deque(view for view in self._views if view[0] >= first_m)
         return later
 
     @property
@@ -255,10 +254,6 @@ class Query:
         if at_prior is not None and at_prior.path_m < later._slipped_m:
             later._at_prior = off_ns, None
         return later
-
-    def forget_prior(self) -> None:
-        """The motion since the time of the prior is not known any more."""
-        self._prior_ns, self._at_prior, self._drawn = None, (math.inf, None), None
 
     def map(self) -> QueryMap:
         """What has been seen over the last metres, described as the database is.
