@@ -30,8 +30,9 @@ The posterior over places and "not in this map": one equation decides every answ
   bare corridor tell no place along it from another.
 - r_k, the log-likelihood of the scans from k on, f of these alone, a metre, times the metres since: where
   tracking slips or the robot is carried away, the scans before fit and those after do not. s is the rate of
-  slips, per scan. As in a test by the least sum (Page 1954, "Continuous inspection schemes"), what has
-  contradicted for long tells more; metres count, because neighbouring scans see the same walls.
+  slips, per scan, higher where its pose is not fine. As in a test by the least sum (Page 1954, "Continuous
+  inspection schemes"), what has contradicted for long tells more; metres count, because neighbouring scans
+  see the same walls.
 - A, what the scans since the likeliest slip can be: "nowhere" and each other place of the map, found for
   these scans alone. 1 as long as nothing contradicts the place. If that is likelier than not, what they say
   is the answer.
@@ -243,6 +244,8 @@ class PosteriorParameters:
     bias, fit, lead : b, c and d.
     slip : s, once in 100 m of scans 0.1 m apart; by hand, since it is too rare to be fitted. At .0006 a robot
         that is carried away notices later, at .002 one that leaves the map forgets where it was.
+    slip_weak : s of a scan whose pose is not fine; by hand: at .05 a robot that is lifted is lost while its
+        last scans fit.
     few : wall points (0.1 m apart, by weight). Chosen among 3 to 100 by what is judged without the building;
         from half to twice of it the likelihood is as high.
     longest_lead : q. By hand; searches report what is nearer.
@@ -259,6 +262,7 @@ class PosteriorParameters:
     fit: float = 2.55
     lead: float = 4.19
     slip: float = 0.001
+    slip_weak: float = 0.01
     few: float = 10.0
     longest_lead: float = 0.2
     slack: float = 0.2
@@ -371,7 +375,9 @@ def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[flo
         told.append(tempered(mean, points / count) * max(steps, 1.0))
     tail = np.array(told)
     since = 1 + int(tail.argmin()) if tail.min(initial=0.0) < 0.0 else 0
-    return POSTERIOR.slip * float(np.exp(-POSTERIOR.fit * tail).sum()), since
+    weak = [keyframe.weak for keyframe in reversed(query.keyframes[1:])]
+    rates = np.where(weak, POSTERIOR.slip_weak, POSTERIOR.slip)
+    return float(rates @ np.exp(-POSTERIOR.fit * tail)), since
 
 
 def log_likelihood(fit: Fit) -> float:

@@ -56,11 +56,13 @@ QUERY = QueryParameters()
 
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """A planar scan of a query, in the base frame, and the base there; path_m : metres driven until then."""
+    """A planar scan of a query, in the base frame, and the base there; path_m : metres driven until then.
+    weak : its pose, or that of a scan since the keyframe before, is not fine (`Health`)."""
 
     planar_scan: PlanarScan
     T_odom_base: SE2
     path_m: float
+    weak: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)  # no slots, for what is computed once
@@ -211,11 +213,12 @@ class Query:
             self._newest = Keyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
             return
         self.lost_scans = 0
-        path_m = 0.0
+        path_m, weak = 0.0, registered.health is not Health.FINE
         if self._keyframes and self._newest is not None:
+            weak |= self._newest.weak and self._newest is not self._keyframes[-1]
             step = self._newest.T_odom_base.inverse() @ pose
             path_m = self._newest.path_m + math.hypot(step.x, step.y)
-        self._newest = Keyframe(planar_scan, pose, path_m)
+        self._newest = Keyframe(planar_scan, pose, path_m, weak)
         if self._off_prior(planar_scan) < self._at_prior[0]:
             self._at_prior = self._off_prior(planar_scan), self._newest
         self._keep(self._newest)

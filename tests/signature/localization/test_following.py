@@ -246,6 +246,21 @@ def test_a_robot_that_stands_is_looked_for_once() -> None:
     check_poses(estimates)
 
 
+def test_a_robot_that_stands_after_registration_was_lost_is_looked_for_at_once() -> None:
+    steps = list(stretch(FIRST))
+    end = SE2.from_matrix(steps[-1][0].T_session_base)
+    (lost, planar_scan, truth), *_ = stretch(SECOND, end, Health.LOST, field_deg=360.0)
+    since = []
+    for number in range(30):
+        scan = replace(lost.scan, stamp_ns=steps[-1][0].scan.stamp_ns + (number + 1) * 10**8)
+        health = Health.FINE if number else Health.LOST
+        since.append((replace(lost, scan=scan, health=health), planar_scan, truth))
+    localizer = Localizer(OFFICE)
+    assert estimates_of(localizer, steps)[-1][0].state == "located"
+    ((estimate, _),) = estimates_of(localizer, since)
+    assert estimate.state in ("lost", "recovered") and estimate.answer.path_m == 0.0
+
+
 def test_after_a_restart_a_located_robot_is_recovered() -> None:
     localizer = Localizer(OFFICE)
     assert estimates_of(localizer, list(stretch(FIRST)))[-1][0].state == "located"

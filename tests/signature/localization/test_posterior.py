@@ -92,6 +92,9 @@ def test_scans_that_contradict_a_place_say_since_when_tracking_slipped(turned: i
     walls, step_m = index.maps[0].walls, index.config.step_m
     odds, since = slip_of(replace(seen, keyframes=keyframes), fit, walls, step_m)
     assert since == turned and (odds > 0.5) is likely
+    weak = tuple(replace(k, weak=True) for k in keyframes)
+    more, _ = slip_of(replace(seen, keyframes=weak), fit, walls, step_m)
+    assert more == pytest.approx(odds * POSTERIOR.slip_weak / POSTERIOR.slip) and more > odds
 
 
 def test_what_neither_side_knows_says_nothing() -> None:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
-from pc2grid.model import UNKNOWN, OccupancyGrid
+from pc2grid.model import UNKNOWN, Health, OccupancyGrid
 from signature.localization.localizer import locate_map
 from signature.localization.query import Query
 from tests.helpers.simulated_drives import RESOLUTION_M, building, cut, drive, office, plan
@@ -50,6 +52,29 @@ def test_the_scans_since_a_slip_know_the_pose_of_a_later_time() -> None:
         if kept:
             assert since.T_odom_prior == whole.T_odom_prior
             assert since.since_prior_m == pytest.approx(whole.since_prior_m)
+
+
+def test_a_keyframe_is_weak_where_a_pose_since_the_one_before_is_not_fine() -> None:
+    seen = Query(OFFICE.made_with, OFFICE.config)
+    scans = list(drive(office(), [(1.5, 7.0), (3.5, 7.0)]))
+    for number, (registered, planar_scan, _) in enumerate(scans):
+        seen.add(replace(registered, health=Health.OVERRULED if number == 3 else Health.FINE), planar_scan)
+        if number in (3, 6):  # the robot stands for a moment
+            seen.add(replace(registered, health=Health.DEGENERATE), planar_scan)
+    assert [n for n, k in enumerate(seen.map().keyframes) if k.weak] == [3, 4, 7]
+
+
+def test_a_restart_forgets_the_scans_and_the_pose_of_an_earlier_time() -> None:
+    scans = list(drive(office(), [(1.5, 7.0), (3.5, 7.0)]))
+    seen = Query(OFFICE.made_with, OFFICE.config, prior_ns=scans[2][0].scan.stamp_ns)
+    for registered, planar_scan, _ in scans:
+        seen.add(registered, planar_scan)
+    assert seen.map().T_odom_prior is not None
+    seen.restart()
+    with pytest.raises(NoScans):
+        seen.map()
+    seen.add(*scans[-1][:2])
+    assert seen.map().T_odom_prior is None and seen.part == 1 and seen.path_m == 0.0
 
 
 def test_standing_still_adds_nothing() -> None:
