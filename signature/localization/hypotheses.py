@@ -83,14 +83,15 @@ def align(
     places: Places,
     maps: Sequence[SearchMap],
     config: RelocalizeConfig,
+    best: float = 0.0,
 ) -> Iterator[tuple[Hypothesis, ...]]:
     """Align the query with any heading wherever the robot may stand; yields what fits in each batch of areas.
 
     batches : likeliest first; what is clearly less than the best so far is not looked for in the next.
-    maps : prepared map of each session, by session_index.
+    maps : prepared map of each session, by session_index. best : score of a place that is known before.
     """
     most = HYPOTHESES.refined * config.hypotheses
-    scores = [0.0]  # the best so far
+    scores, enough = [best, 0.0], config.coarse_keep * best  # the best so far, and what is worth refining
     for areas in batches:
         coarse: list[tuple[float, int, int, SE2]] = []
         for session, squares_m in areas:
@@ -102,7 +103,7 @@ def align(
                 half_t_m=0.5 * SQUARE_M,
                 half_a_rad=math.pi,
                 parameters=SearchParameters(
-                    floor=max(config.coarse_floor, config.coarse_keep * scores[0]),
+                    floor=max(config.coarse_floor, enough),
                     keep=config.coarse_keep,
                     most=config.hypotheses,
                 ),
@@ -111,7 +112,7 @@ def align(
             for (x, y, yaw, score), row in zip(poses.tolist(), rows.tolist(), strict=True):
                 coarse.append((score, session, row, _about(query.center_m, SE2(x, y, yaw))))
             scores = sorted((*scores, *poses[:, 3].tolist()), reverse=True)[:most]
-        enough = max(config.coarse_keep * scores[0], scores[-1])
+            enough = max(config.coarse_keep * scores[0], scores[-1])
         yield tuple(
             fitted(query, session, row, maps[session], T_map_query)
             for score, session, row, T_map_query in coarse

@@ -184,7 +184,8 @@ class Localizer:
     def _on_the_way(self) -> MapIndex:
         """Where to look before the answer is asked: a prior without a time is about none of these scans."""
         timeless = self.index.prior is not None and self.index.prior.stamp_ns is None
-        return self.index.whole or self.index if timeless else self.index
+        index = self.index.whole or self.index if timeless else self.index
+        return index.at_look(int(self.query.path_m / self.index.config.step_m))
 
     def search(
         self,

@@ -7,7 +7,7 @@ import copy
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, islice, pairwise
+from itertools import chain, islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -46,11 +46,13 @@ class MapIndex:
     Each map is prepared (in tens of milliseconds) when it first matters to a query, and kept.
 
     region : of the places that a prior allows, see `within`. whole : the index without the prior.
+    look : number of the look of a robot that is searched for, see `at_look`.
     surface_of : the points of the maps, which answers are refined and checked with; None if they have none.
     """
 
     region: Region | None = None
     whole: MapIndex | None = None
+    look: int | None = None
     surface_of: SurfaceOf | None = None
 
     def __init__(
@@ -178,6 +180,16 @@ class MapIndex:
         restricted.region, restricted.whole = Region.of(prior, self.sessions), self.whole or self
         return restricted
 
+    def at_look(self, number: int) -> MapIndex:
+        """An index of which a search ends in time for a robot: beside the likeliest places it has one part of
+        the others, at each look the next one. All that is prepared is shared. The index itself if there is
+        only one part."""
+        if len(self.places.table) <= 11 * FIRST_PLACES:
+            return self
+        limited = copy.copy(self)
+        limited.look = number
+        return limited
+
     def prior_applies(self, query: QueryMap) -> bool:
         """Whether there is a prior, and the motion of the query since its time is known."""
         return self._region_for(query) is not None
@@ -204,17 +216,17 @@ class MapIndex:
         """
         maps = self.maps_for(query)
         found = self._worth_keeping(query, self._fitted(query, known))
-        rows, after = self.places.order(query.views, query.center_m, self.config)
-        ends = [FIRST_PLACES]
-        while ends[-1] < len(rows):
-            ends.append(10 * ends[-1])
-        ends[-1] = len(rows)
-        parts = [rows[begin:end] for begin, end in pairwise((0, *ends))]
-        batches = [self.places.areas(part) for part in parts]
+        rows, mass = self.places.order(query.views, query.center_m, self.config)
+        parts = np.split(np.arange(len(rows)), range(FIRST_PLACES, len(rows), 10 * FIRST_PLACES))
+        if self.look is not None and len(parts) > 1:
+            parts = [parts[0], parts[1 + self.look % (len(parts) - 1)]]
+        batches = [self.places.areas(rows[part]) for part in parts]
         batches[0] = chain(batches[0], self._allowed(query))
-        for end, fits in zip(ends, align(query, batches, self.places, maps, self.config), strict=True):
-            found = self._worth_keeping(query, fits, found)
-            yield found, float(after[end - 1]) if end else 0.0
+        best = max((h.fit.score for h in found if self.allows(query, h)), default=0.0)
+        aligned, left = align(query, batches, self.places, maps, self.config, best), 1.0
+        for part, fits in zip(parts, aligned, strict=True):
+            found, left = self._worth_keeping(query, fits, found), left - float(mass[part].sum())
+            yield found, left
 
     def in_region(self, query: QueryMap, known: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
         """`known` and what fits anywhere in the region of the prior."""

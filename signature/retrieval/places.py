@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, NamedTuple, TypeVar, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64, I64
+from pc2grid.geometry import F64, I64, cells_of
 from pc2grid.model import OccupancyGrid
 from signature.config import RelocalizeConfig, ShortlistBy
 from signature.paper import SignatureTable
@@ -35,8 +35,8 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 FIRST_PLACES = 100
-"""So many places are searched before it is asked whether one is certain, then ten times as many, and so on.
-By hand, by the time: places that are searched later share tiles of the search with those before."""
+"""So many places are searched before it is asked whether one is certain, then ten times as many each time. By
+hand, by the time: places that are searched later share tiles of the search with those before."""
 AT_ONCE_M2 = 200_000.0
 """So much free floor is searched at once; of a larger database, the sessions that look likeliest. Chosen by
 the time of a look-up."""
@@ -72,11 +72,10 @@ class Area(NamedTuple):
 
 
 class Order(NamedTuple):
-    """Places (R,), likeliest first, and of each the share (R,) of the mass that those after it have, by the
-    signatures."""
+    """Places (R,), likeliest first, and the share (R,) of the mass that each has by the signatures."""
 
     rows: I64
-    after: F64
+    mass: F64
 
 
 class Places:
@@ -112,11 +111,6 @@ class Places:
         self._controls: dict[ShortlistBy, PlaceIndex] = {}
         self._ordered: tuple[Sequence[View], RelocalizeConfig, Order] | None = None
 
-    @property
-    def is_large(self) -> bool:
-        """Whether there is more free floor than is searched at once."""
-        return bool(self._areas_m2.sum() > AT_ONCE_M2)
-
     def order(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> Order:
         """Return the places by how likely the robot at `base_m` stands next to them: by `PlaceIndex.poses`,
         or by a control (`RelocalizeConfig.shortlist_by`). Of a large database those in the likeliest maps, up
@@ -141,15 +135,13 @@ class Places:
         if by == "signatures":
             return self.index()
         if by not in self._controls:
-            self._controls[by] = self._control(by)
+            names = by.split("+")
+            self._controls[by] = (
+                self.index().shuffled(self._chance)
+                if by == "shuffled"
+                else PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names))
+            )
         return self._controls[by]
-
-    def _control(self, by: ShortlistBy) -> PlaceIndex:
-        """What `_searched` says of a control; made anew."""
-        if by == "shuffled":
-            return self.index().shuffled(self._chance)
-        names = by.split("+")
-        return PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names))
 
     def next_to(self, poses: Poses) -> F64:
         """(N,) the log-likelihood of the likeliest pose next to each place. Where none is, it is that of the
@@ -163,7 +155,7 @@ class Places:
     def _at_once(self, rows: I64, likelihood: F64) -> Order:
         """The order of the places (R,) of such log-likelihoods that are in the maps that are searched at
         once."""
-        if self.is_large:
+        if self._areas_m2.sum() > AT_ONCE_M2:
             of = self.table.session_index[rows]
             sessions = np.array(list(dict.fromkeys(of.tolist())))
             areas_m2 = self._areas_m2[sessions]
@@ -171,7 +163,7 @@ class Places:
             rows, likelihood = rows[kept], likelihood[kept]
         mass = np.exp((likelihood - likelihood.max(initial=-math.inf)) / ORDER.dependent)
         mass = (1.0 - ORDER.astray) * mass / mass.sum() + ORDER.astray / max(len(mass), 1)
-        return Order(rows, np.cumsum(mass[::-1])[::-1] - mass)
+        return Order(rows, mass)
 
     def index(self, on_progress: Callable[[float], None] = lambda share: None) -> PlaceIndex:
         """The viewpoints of all places with their signatures; made when first asked for.
@@ -237,11 +229,9 @@ def ground_squares(grid: OccupancyGrid) -> F64:
     """Centres (K, 2) of the squares of `SQUARE_M` of a grid that hold any ground, map frame."""
     n = max(1, round(SQUARE_M / grid.resolution_m))
     height, width = grid.cells.shape
-    if not height or not width:
-        return np.empty((0, 2))
-    rows, columns = np.arange(0, height, n), np.arange(0, width, n)
-    ground = np.add.reduceat(np.add.reduceat(grid.ground.astype(np.int32), rows, axis=0), columns, axis=1)
-    corners = np.argwhere(ground > 0)[:, ::-1] * (n * grid.resolution_m)
+    ground = np.zeros((math.ceil(height / n), math.ceil(width / n)), bool)
+    ground[tuple((cells_of(grid.ground) // n).T)] = True
+    corners = cells_of(ground)[:, ::-1] * (n * grid.resolution_m)
     return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
 
 

@@ -14,6 +14,7 @@ from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import Label
+from signature.localization import map_index
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
@@ -72,6 +73,25 @@ def test_an_answer_is_one_search_and_asking_changes_nothing(monkeypatch: pytest.
         if estimate and told and answer:
             assert (answer.confidence, answer.T_map_base) == (told.answer.confidence, told.answer.T_map_base)
             assert answer.history[-1].stamp_ns == registered.scan.stamp_ns
+
+
+def test_a_look_on_the_way_is_one_part_of_the_search_and_the_answer_is_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    looks, search = [], MapIndex.search
+
+    def noted(index: MapIndex, query: QueryMap, *arguments: Any) -> Any:
+        looks.append(index.look)
+        return search(index, query, *arguments)
+
+    monkeypatch.setattr(map_index, "FIRST_PLACES", 1)
+    monkeypatch.setattr(MapIndex, "search", noted)
+    localizer, scans = Localizer(OFFICE), iter(drive(office(), ROUTE))
+    while len(set(looks)) < 3:
+        registered, planar_scan, _ = next(scans)
+        localizer.add(registered, planar_scan)
+    assert localizer.answer().status == "located"
+    assert list(dict.fromkeys(looks)) == [1, 2, 3, None]
 
 
 def test_another_building_is_not_found() -> None:
