@@ -74,8 +74,8 @@ class Masses:
 
     @staticmethod
     def of(query: QueryMap, found: Verdict | Answer) -> Masses:
-        """The masses that a query gives, first place first. One of which the map shows too little to align
-        it stays where odometry has carried the robot."""
+        """Return the masses that a query gives, first place first. A place of which the map shows too little
+        to align it stays where odometry has carried the robot."""
         beside = list(found.off_map)
         places: list[tuple[OffMap, ...]] = []
         for number, mass in enumerate(found.masses):
@@ -105,13 +105,13 @@ class Masses:
         )
 
     def carried(self, now: QueryMap | Masses, odds: float = 1.0) -> Masses:
-        """The same places where odometry has carried the robot since, each with its covariance there and so
-        many times its mass."""
+        """Return the same places where odometry has carried the robot since: with their covariances there,
+        and their masses multiplied by `odds`."""
         places = tuple(tuple(_carried(one, now, odds) for one in place) for place in self.places)
         return replace(self, path_m=now.path_m, T_odom_base=now.T_odom_base, places=places)
 
     def mass(self, place: Iterable[Hypothesis]) -> float:
-        """Mass of the places that put the robot where one of these hypotheses does."""
+        """Return the mass of the places that put the robot where one of these hypotheses does."""
         hypotheses = tuple(place)
         return sum(
             known[0].mass
@@ -121,7 +121,7 @@ class Masses:
 
     @property
     def most(self) -> Masses:
-        """The likeliest place alone."""
+        """Return these masses with the likeliest place alone."""
         return replace(self, places=(max(self.places, key=lambda place: place[0].mass),))
 
     @property
@@ -130,14 +130,14 @@ class Masses:
         return self.places[0][0].seen_m < self.path_m
 
     def prior(self, place: Sequence[Hypothesis]) -> float:
-        """Prior of a place, relative to that of "nowhere", as the masses are (`Belief.before`)."""
+        """Return the prior of a place relative to that of "nowhere", as the masses are (`Belief.before`)."""
         shown = place[0].fit.overlap >= POSTERIOR.shown
         found = (known for known in self.places if shown or more_exact(place[0], known[0].hypothesis))
         return 1.0 + replace(self, places=tuple(found)).mass(place)
 
 
 def _carried(place: OffMap, now: QueryMap | Masses, odds: float) -> OffMap:
-    """The place with the covariance of the base now, by the odometry since the map showed it."""
+    """Return the place with the covariance of the base now, by the odometry since the map showed it."""
     fit = place.hypothesis.fit
     begin, end = fit.T_map_query @ place.T_odom_seen, fit.T_map_query @ now.T_odom_base
     J = np.eye(3)
@@ -150,7 +150,7 @@ def _carried(place: OffMap, now: QueryMap | Masses, odds: float) -> OffMap:
 
 
 def kept(query: QueryMap) -> float:
-    """1 - k, the share of the masses before a query that stays where it was."""
+    """Return 1 - k, the share of the masses before a query that stays where it was."""
     return float((1.0 - POSTERIOR.slip) ** max(len(query.keyframes), 1))
 
 
@@ -158,7 +158,10 @@ class Belief:
     """The masses of the searches since the start of the last window, and what they say of a running robot."""
 
     def __init__(self, accept: float) -> None:
-        """accept : least mass to say where the robot is, and to say that it is not where it was."""
+        """Begin without any place.
+
+        accept : least mass to say where the robot is, and to say that it is not where it was.
+        """
         self._accept = accept
         self._searches: list[Masses] = []
         self._place: Masses | None = None  # where it is held to be, located or off the map
@@ -167,17 +170,17 @@ class Belief:
 
     @property
     def located(self) -> bool:
-        """Whether the robot is held to be somewhere, in the map or off it."""
+        """Return whether the robot is taken to be somewhere, in the map or off it."""
         return self._place is not None
 
     @property
     def session_index(self) -> int | None:
-        """Of the map in which it is held to be."""
+        """Return the number of the map in which the robot is taken to be."""
         return self._place.places[0][0].hypothesis.session_index if self._place else None
 
     def before(self, index: MapIndex, query: QueryMap) -> tuple[Masses, tuple[OffMap, ...]]:
-        """What was known before all scans of a query, where odometry has carried it; and those of its places
-        of which the map shows too little. Their masses are relative to that of "nowhere"."""
+        """Return the masses before all scans of a query, carried on by odometry, and those of their places of
+        which the map shows too little. Masses are relative to that of "nowhere"."""
         known = Masses(part=query.part, path_m=query.path_m, T_odom_base=query.T_odom_base)
         beside, share = [], kept(query)
         for past in self._before(query)[-1:]:
@@ -192,7 +195,7 @@ class Belief:
         return known, tuple(beside)
 
     def _before(self, query: QueryMap) -> list[Masses]:
-        """The searches that lie before all scans of a query, and after a slip before it."""
+        """Return the searches that lie before all scans of a query, and after a slip before it."""
         first_m = query.keyframes[0].path_m if query.keyframes else 0.0
         return [
             past
@@ -201,8 +204,8 @@ class Belief:
         ]
 
     def follow(self, query: QueryMap, answer: Answer) -> State:
-        """The state of a running robot after a search. Its masses are kept, those that no later query follows
-        from are forgotten."""
+        """Return the state of a running robot after a search. Keep its masses; forget those that no later
+        query continues."""
         now = Masses.of(query, answer)
         forgotten = max(len(self._before(query)) - 1, 0)
         here = [known for known in self._searches if known.part == query.part]
@@ -230,7 +233,8 @@ class Belief:
 
 
 def _mass_there(now: Masses, before: Masses | None) -> float:
-    """Mass of the places that a robot may be at now, where odometry has carried it from one place before."""
+    """Return the mass of the places where a robot may be now if odometry has carried it from one place
+    before."""
     if before is None or before.part != now.part:
         return 0.0
     return now.mass(one.hypothesis for one in before.carried(now).places[0])

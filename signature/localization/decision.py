@@ -36,7 +36,7 @@ NOTHING = Verdict(
 
 
 def anywhere(place: Place) -> float:
-    """The prior of a place without any knowledge."""
+    """Return the prior of a place without any knowledge."""
     return 1.0
 
 
@@ -46,9 +46,9 @@ def decide(
     known: tuple[Hypothesis, ...] = (),
     prior_of: PriorOf = anywhere,
 ) -> tuple[Verdict, tuple[Hypothesis, ...]]:
-    """The verdict on what is known and what is found where the signatures say, until one place is certain and
-    the right one is likely searched, or the rest of the map does not matter; and all hypotheses that it is
-    about."""
+    """Return the verdict on the hypotheses that are known and those that the search finds, and all of these.
+    The search ends when one place is certain and the right one likely searched, or when what is left has too
+    little mass to matter."""
     verdict, found = NOTHING, known
     for found, left in index.search(query, known):
         verdict = judge(index, query, found, prior_of)
@@ -61,7 +61,7 @@ def decide(
 def judge(
     index: MapIndex, query: QueryMap, hypotheses: Sequence[Hypothesis], prior_of: PriorOf = anywhere
 ) -> Verdict:
-    """The posterior over the places of the hypotheses, see `signature.localization.posterior`.
+    """Return the posterior over the places of the hypotheses, see `signature.localization.posterior`.
 
     A place that the prior of the index excludes has no mass. But it shows what wrong places score for this
     query, so it remains a rival. Otherwise any place in a small region, which has few rivals, would look
@@ -126,20 +126,21 @@ def weighed(
 
 
 def place_of(found: Verdict | Answer, number: int) -> Place:
-    """The hypotheses of one place."""
+    """Return the hypotheses of one place."""
     return tuple(h for h, of in zip(found.hypotheses, found.places, strict=True) if of == number)
 
 
 def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:
-    """The places that the prior of the index allows, and fits of others that tell what wrong places score."""
+    """Return the places that the prior of the index allows, and the fits of the others, which show what wrong
+    places score."""
     inside = [tuple(h for h in place if index.allows(query, h)) for place in places]
     excluded = [place[0].fit for place, left in zip(places, inside, strict=True) if not left]
     return [place for place in inside if place], excluded
 
 
 def places_of(index: MapIndex, query: QueryMap, hypotheses: Iterable[Hypothesis]) -> list[Place]:
-    """The hypotheses by place, best first. Those in the maps of joined sessions are one place if they put the
-    query at one pose of their building; a place has one hypothesis a session."""
+    """Return the hypotheses by place, best first. Hypotheses in the maps of joined sessions are one place if
+    they put the query at one pose of their building; a place has one hypothesis a session."""
     places: list[Place] = []
     for h in hypotheses:
         for number, place in enumerate(places):
@@ -153,7 +154,7 @@ def places_of(index: MapIndex, query: QueryMap, hypotheses: Iterable[Hypothesis]
 
 
 def _one_place(index: MapIndex, query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether two hypotheses in the maps of two sessions are one pose of the building of both."""
+    """Return whether two hypotheses in the maps of two sessions are one pose of the building of both."""
     frames = index.joined(a.session_index, b.session_index)
     return frames is not None and same_pose(
         *(at.placed(h.fit.T_map_query @ query.T_odom_base) for at, h in zip(frames, (a, b), strict=True))

@@ -121,7 +121,7 @@ def align(
 
 
 def best_around(query: QueryMap, h: Hypothesis, target: SearchMap) -> Hypothesis:
-    """The best hypothesis as near to one as `HypothesisParameters.around_m` and `around_rad` say."""
+    """Return the best hypothesis within `HypothesisParameters.around_m` and `around_rad` of a given one."""
     p, center_m = HYPOTHESES, query.center_m
     at = _at(query, h)
     poses = search_windows(
@@ -140,7 +140,7 @@ def best_around(query: QueryMap, h: Hypothesis, target: SearchMap) -> Hypothesis
 
 
 def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Hypothesis:
-    """The hypothesis that the query lies at a pose, which is refined first."""
+    """Return the hypothesis that the query lies at a pose, which is refined first."""
     pose, covariance = _refined(query, target, T_map_query)
     covariance = covariance + np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
     fit = score_fit(target.walls, query.walls, pose, covariance)
@@ -148,7 +148,7 @@ def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_m
 
 
 def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2, F64]:
-    """The pose of the query improved, and its covariance (3, 3) at `QueryMap.center_m`, map frame.
+    """Return the refined pose of the query, and its covariance (3, 3) at `QueryMap.center_m`, map frame.
 
     The walls of the query are brought onto those of the map. Of two planes at different heights it is the
     walls of the higher one, since things near a wall in the lower one would be drawn onto it.
@@ -167,7 +167,7 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
 
 
 def distinct(query: QueryMap, hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
-    """Best first, without those that are one peak with a better one.
+    """Return the hypotheses best first, without those that are one peak with a better one.
 
     The best one takes over the `row` of the others if it has none.
     """
@@ -182,7 +182,7 @@ def distinct(query: QueryMap, hypotheses: Iterable[Hypothesis]) -> tuple[Hypothe
 
 
 def _one_peak(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether a search around one of two hypotheses has seen the other."""
+    """Return whether a search around one of two hypotheses has seen the other."""
     here, there = _at(query, a), _at(query, b)
     p, off_m = HYPOTHESES, max(abs(here.x - there.x), abs(here.y - there.y))
     turned = abs(wrap_angle(here.yaw - there.yaw))
@@ -190,12 +190,12 @@ def _one_peak(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
 
 
 def _at(query: QueryMap, h: Hypothesis) -> SE2:
-    """Where a hypothesis puts `QueryMap.center_m`, which its covariance is about."""
+    """Return where a hypothesis puts `QueryMap.center_m`, to which its covariance refers."""
     return h.fit.T_map_query @ SE2(*query.center_m, 0.0)
 
 
 def agree(T_odom_base: SE2, a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether two hypotheses put the base at one place, by the covariances of both."""
+    """Return whether two hypotheses put the base at one place, by the covariances of both."""
     one, other = (h.fit.T_map_query @ T_odom_base for h in (a, b))
     off = np.array([one.x - other.x, one.y - other.y, wrap_angle(one.yaw - other.yaw)])
     squared = float(off @ np.linalg.solve(a.fit.covariance + b.fit.covariance, off))
@@ -203,12 +203,12 @@ def agree(T_odom_base: SE2, a: Hypothesis, b: Hypothesis) -> bool:
 
 
 def more_exact(a: Hypothesis, b: Hypothesis) -> bool:
-    """Whether one hypothesis says more exactly than another where the base is."""
+    """Return whether one hypothesis has the smaller covariance of the base than another."""
     return bool(np.trace(a.fit.covariance[:2, :2]) < np.trace(b.fit.covariance[:2, :2]))
 
 
 def same_pose(a: SE2, b: SE2) -> bool:
-    """Whether two poses are so near that hypotheses there are one."""
+    """Return whether two poses are so near that hypotheses there are one."""
     return _nearer(a, b, HYPOTHESES.same_m, HYPOTHESES.same_rad)
 
 
@@ -217,7 +217,8 @@ def _nearer(a: SE2, b: SE2, apart_m: float, apart_rad: float) -> bool:
 
 
 def moved_to_origin(covariance: F64, T_map_query: SE2, at: SE2) -> F64:
-    """The covariance (3, 3) of a pose in the map at the query's origin; it is known for its point `at`."""
+    """Return the covariance (3, 3) of a pose in the map at the query's origin, given that at its point
+    `at`."""
     there = T_map_query @ at
     J = np.eye(3)
     J[:2, 2] = there.y - T_map_query.y, T_map_query.x - there.x
@@ -225,8 +226,8 @@ def moved_to_origin(covariance: F64, T_map_query: SE2, at: SE2) -> F64:
 
 
 def coarse_points(points_m: F32, center_m: tuple[float, float]) -> F32:
-    """(M, 2) float32: a few of the wall points (N, 2), near and far, spread evenly around `center_m` and
-    relative to it."""
+    """Return a few of the wall points (N, 2), near and far, spread evenly around `center_m` and relative to
+    it: (M, 2) float32."""
     p = HYPOTHESES
     local = points_m - np.asarray(center_m, np.float32)
     away_m = np.hypot(local[:, 0], local[:, 1])
@@ -242,5 +243,6 @@ def _few(points_m: F32) -> F32:
 
 
 def _about(center_m: tuple[float, float], pose: SE2) -> SE2:
-    """T_map_query that puts `center_m` of the query's frame at the position of `pose`, turned by its yaw."""
+    """Return T_map_query that puts `center_m` of the query's frame at the position of `pose`, turned by its
+    yaw."""
     return pose @ SE2(-center_m[0], -center_m[1], 0.0)

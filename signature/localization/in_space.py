@@ -65,7 +65,8 @@ SurfaceOf = Callable[[str], MapSurface | None]
 
 
 def surface_reader(database: SubmapDatabase) -> SurfaceOf | None:
-    """Reads the points of the sessions of a database, and keeps the latest; None if none has any."""
+    """Return what reads the points of the sessions of a database, and keeps the latest; None if no session
+    has any."""
     if not any(info.points for info in database.sessions()):
         return None
 
@@ -79,8 +80,9 @@ def surface_reader(database: SubmapDatabase) -> SurfaceOf | None:
 def settle_in_space(
     verdict: Verdict, query: QueryInSpace, surface_of: Callable[[int], MapSurface | None], accept: float
 ) -> tuple[Verdict, PoseInSpace | None]:
-    """The verdict with the points as a factor, and the pose in space of the place that is located, or was and
-    is turned down; else None. As it was, where no place can be compared.
+    """Return the verdict with the points as a factor, and the pose in space of the place that is located, or
+    of the one that was located and is rejected now; else None. Return it unchanged where no place can be
+    compared.
 
     surface_of : the points of a session, by its index. accept : least confidence to be located.
     """
@@ -99,8 +101,9 @@ def settle_in_space(
 def _compared(
     verdict: Verdict, query: QueryInSpace, surface_of: Callable[[int], MapSurface | None], accept: float
 ) -> tuple[dict[int, SpatialFit | Unfit], F64, int]:
-    """The fits of places by number, without those of which nothing is known; the masses with them, and the
-    likeliest place. Those with the most mass are compared, until no other one can change what is certain."""
+    """Return the fits of places by number, without those of which nothing is known; the masses with them, and
+    the likeliest place. The places with the most mass are compared, until no other one can change what is
+    certain."""
     fits: dict[int, SpatialFit | Unfit] = {}
     best, masses = 0, np.array(verdict.masses)
     for place in range(min(len(masses), SPACE.places)):
@@ -117,12 +120,12 @@ def _compared(
 
 
 def fit_in_space(query: QueryInSpace, surface: MapSurface | None, place: Hypothesis) -> SpatialFit | Unfit:
-    """The fit of a query at a place. surface : the points of its map; None: there are none."""
+    """Return the fit of a query at a place. surface : the points of its map; None: there are none."""
     return "unknown" if surface is None else register_in_space(query.views, surface, place.fit.T_map_query)
 
 
 def masses_of(masses: Sequence[float], fits: Mapping[int, SpatialFit | Unfit]) -> tuple[F64, int]:
-    """`masses_in_space` of places, by the fits of those that are compared, by number."""
+    """Return `masses_in_space` of places, by the fits of those that are compared, by number."""
     u, patches = np.full(len(masses), np.nan), np.zeros((len(masses), len(masses)))
     for place, fit in fits.items():
         u[place] = log_odds_in_space(fit)
@@ -133,7 +136,7 @@ def masses_of(masses: Sequence[float], fits: Mapping[int, SpatialFit | Unfit]) -
 
 
 def masses_in_space(masses: F64, u: F64, other: F64 | float = 0.0) -> tuple[F64, int]:
-    """(P,) the masses of places with the points as a factor, and the number of the likeliest.
+    """Return the masses (P,) of places with the points as a factor, and the number of the likeliest.
 
     masses : (P,) in the plane. u : (P,), NaN of a place that is not compared. other : (P, P), by how much the
     log odds of the second place are higher beside the first one.
@@ -149,12 +152,12 @@ def masses_in_space(masses: F64, u: F64, other: F64 | float = 0.0) -> tuple[F64,
 
 
 def log_odds_in_space(fit: SpatialFit | Unfit, p: SpaceParameters = SPACE) -> float:
-    """u of a place: below 0 its surfaces agree with the rays less than those of wrong places."""
+    """Return u of a place: below 0 its surfaces agree with the rays less than those of wrong places."""
     return float(np.dot(terms_in_space(fit), (p.on, p.through, p.before, p.left)))
 
 
 def terms_in_space(fit: SpatialFit | Unfit) -> tuple[float, float, float, float]:
-    """What a, b, c and `left` are multiplied with."""
+    """Return the factors of a, b, c and `left`."""
     if isinstance(fit, SpatialFit):
         return fit.held * fit.on, fit.held * fit.through, fit.held * fit.before, 0.0
     return 0.0, 0.0, 0.0, float(fit == "left")
@@ -180,7 +183,8 @@ def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
 def _settled(
     verdict: Verdict, best: int, masses: F64, in_space: PoseInSpace | None, T_odom_base: F64, accept: float
 ) -> Verdict:
-    """The verdict with new masses (P,) of its places, `best` first, at the pose that its points give."""
+    """Return the verdict with new masses (P,) of its places, `best` first, at the pose that its points
+    give."""
     located = masses[best] >= accept
     order = sorted(
         range(len(verdict.places)), key=lambda k: (verdict.places[k] != best, -masses[verdict.places[k]])

@@ -1,20 +1,13 @@
-"""Where is the robot? Scans go in, a belief is held, and after every metre an estimate comes out.
+"""Scans in, an estimate of the pose after every metre: `Localizer`, and `Follower` beside the tracking.
 
 Hypotheses are carried along the query's travel: after every metre the old ones are refined on what has been
 seen since, and the database is searched again, so that a wrong first hypothesis is replaced. What was seen
-before the last metres is in the masses that the belief holds (`signature.localization.belief`).
+before the last metres is in the masses of the belief (`signature.localization.belief`). An answer rests on
+both, is refined, and is checked in space where query and map have points (`answer_query`).
 
-From a query and the hypotheses for it to its answer.
-
-By what it has seen over the last metres, and by what was known before; refined and checked in space, where
-both sides have points.
-
-Searches of the database beside the tracking of a robot.
-
-A search takes up to seconds in a large building, and a robot sends 40 scans in one. So it is made in a thread
-of its own, while tracking goes on: its parts that cost most are compiled and run beside Python.
-
-When a robot is told its pose.
+A search takes up to seconds in a large building, and a robot sends 40 scans a second. So `Follower` searches
+in a thread while tracking goes on; the most expensive parts are compiled and run beside Python.
+`ResetPolicy` decides when a robot gets its pose.
 """
 
 from __future__ import annotations
@@ -69,12 +62,13 @@ class Estimate:
 
     @property
     def is_told(self) -> bool:
-        """Whether the place is sure enough to tell a robot that it is there."""
+        """Return whether the place is certain enough to be sent to a robot."""
         return self.state in ("located", "recovered")
 
     @property
     def T_map_odom(self) -> SE2 | None:
-        """The frame of the robot's own odometry in the map; None without an answer or without odometry."""
+        """Return the frame of the robot's own odometry in the map; None without an answer or without
+        odometry."""
         T_map_base, T_odom_base = self.answer.T_map_base, self.registered.scan.T_odom_base
         if T_map_base is None or T_odom_base is None:
             return None
@@ -100,8 +94,11 @@ class Localizer:
     """
 
     def __init__(self, index: MapIndex, *, prior_ns: int | None = None) -> None:
-        """prior_ns : time at which the pose of the query is wanted (`QueryMap.T_odom_prior`), if not that of
-        the prior."""
+        """Begin a query without any scan.
+
+        prior_ns : time at which the pose of the query is wanted (`QueryMap.T_odom_prior`), if not that of
+        the prior.
+        """
         self.index = index
         self._belief = Belief(index.config.accept)
         self._history: deque[Moment] = deque(maxlen=_MOMENTS)
@@ -115,7 +112,7 @@ class Localizer:
 
     @property
     def uses_points(self) -> bool:
-        """Whether scans must be given with their points."""
+        """Return whether scans must be given with their points."""
         return self.index.surface_of is not None
 
     @one_blas_thread
@@ -167,7 +164,7 @@ class Localizer:
 
     @one_blas_thread
     def answer(self) -> Answer:
-        """Where the query is, by the scans so far; what comes later does not depend on whether it was asked.
+        """Return where the query is, by the scans so far. Later estimates do not depend on this call.
 
         Raises NoScans if no scan could be used.
         """
@@ -182,7 +179,8 @@ class Localizer:
 
     @property
     def _on_the_way(self) -> MapIndex:
-        """Where to look before the answer is asked: a prior without a time is about none of these scans."""
+        """Return the index that is searched before the answer is asked: a prior without a time is about none
+        of these scans."""
         timeless = self.index.prior is not None and self.index.prior.stamp_ns is None
         index = self.index.whole or self.index if timeless else self.index
         return index.at_look(int(self.query.path_m / self.index.config.step_m))
@@ -247,8 +245,8 @@ class Clock:
 def _with_prior(
     index: MapIndex, query: QueryMap, verdict: Verdict, found: tuple[Hypothesis, ...]
 ) -> tuple[Literal["used", "lapsed", "ahead"] | None, Moment | None]:
-    """What became of the prior, and the best place of those found that it excludes, where nothing is certain
-    that it allows."""
+    """Return whether the prior was used, and, if no place that it allows is certain, the best place found
+    that it excludes."""
     if index.whole is None or index.region is None:
         return None, None
     if not index.prior_applies(query):
@@ -268,7 +266,7 @@ def _elsewhere(query: Query, alone: Answer, place: Hypothesis) -> float:
 
 
 def _in_map(verdict: Verdict, session_index: int | None) -> Verdict:
-    """The verdict in which, of each place, the hypothesis in the map of one session comes first."""
+    """Return the verdict in which, of each place, the hypothesis in the map of one session comes first."""
     ordered = sorted(
         zip(verdict.places, verdict.hypotheses, strict=True),
         key=lambda each: (each[0], each[1].session_index != session_index),
@@ -303,14 +301,15 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
 
 
 def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
-    """The hypothesis with its covariance, known for the point `at` of the query, at the query's origin."""
+    """Return the hypothesis with its covariance at the query's origin, given that at the point `at` of the
+    query."""
     fit = hypothesis.fit
     covariance = moved_to_origin(fit.covariance, fit.T_map_query, at)
     return replace(hypothesis, fit=replace(fit, covariance=covariance))
 
 
 def moment_of(index: MapIndex, query: QueryMap, verdict: Verdict) -> Moment:
-    """The state of the answer now."""
+    """Return the state of the answer now."""
     best = verdict.hypotheses[0] if verdict.hypotheses else None
     return Moment(
         stamp_ns=query.stamp_ns,
@@ -373,7 +372,7 @@ class Follows(Protocol[EstimateT_co]):
         ...
 
     def restart(self) -> None:
-        """The scans do not go on from those before."""
+        """Begin anew: the next scans do not continue those before."""
         ...
 
 
@@ -389,8 +388,8 @@ class Follower(Generic[EstimateT]):
     """
 
     def __init__(self, localizer: Follows[EstimateT], *, beside: bool, step_m: float = 1.0) -> None:
-        """beside : in a thread; otherwise each search is made before `add` returns, always after the same
-        scans.
+        """Begin without any scan. beside : search in a thread; otherwise each search is made before `add`
+        returns, always after the same scans.
 
         step_m : travel after which a search is due. It is left out if so much travel waits behind it.
         """
@@ -427,12 +426,12 @@ class Follower(Generic[EstimateT]):
         self._hand_over((registered, planar_scan, self._path_m))
 
     def restart(self) -> None:
-        """The scans do not go on from those before."""
+        """Begin anew: the next scans do not continue those before."""
         self._last, self._spacing = None, ViewSpacing()
         self._hand_over(None)
 
     def take(self) -> list[EstimateT]:
-        """The estimates that are done. Raises what the thread raised."""
+        """Return the estimates that are done. Raises what the thread raised."""
         taken = []
         while self._estimates and self._estimates[0].done():
             estimate = self._estimates.popleft().result()
@@ -484,7 +483,7 @@ class ResetPolicy:
     _count: int = 0
 
     def allows(self, state: State) -> bool:
-        """Whether the pose of an estimate is to be sent; it then counts as sent.
+        """Return whether the pose of an estimate is to be sent; it then counts as sent.
 
         state : of each estimate in turn.
         """

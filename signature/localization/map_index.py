@@ -67,7 +67,9 @@ class MapIndex:
         frames: Mapping[str, BuildingFrame] | None = None,
         drawn: Collection[str] = (),
     ) -> None:
-        """grids : map of each session, in the order of `table.session_index`.
+        """Prepare the places of some maps.
+
+        grids : map of each session, in the order of `table.session_index`.
 
         made_with : how the places were cut and described; queries are described in the same way.
         config : its relocalize section says how to search and when to be sure.
@@ -113,7 +115,7 @@ class MapIndex:
     @staticmethod
     @one_blas_thread
     def of(database: SubmapDatabase, config: Config, observer: Observer = Observer()) -> MapIndex:
-        """Everything that is in a database.
+        """Return the index of everything in a database.
 
         If that is more than `signature.retrieval.places.AT_ONCE_M2` of free floor, maps are read when
         they first matter, and points always are, so the database must stay open as long as the index is used.
@@ -157,22 +159,23 @@ class MapIndex:
 
     @staticmethod
     def of_session(database: SubmapDatabase, session: str) -> MapIndex:
-        """One session of a database by itself, without points."""
+        """Return the index of one session of a database by itself, without points."""
         table, config = database.signatures(session), database.config()
         table = replace(table, session_index=np.zeros(len(table), np.int32))
         return MapIndex({session: database.grid(session)}, table, config, config, stored=database.seen_places)
 
     def surface(self, session_index: int) -> MapSurface | None:
-        """The points of a session in space; None if it has none."""
+        """Return the points of a session in space; None if it has none."""
         return None if self.surface_of is None else self.surface_of(self.sessions[session_index])
 
     @property
     def prior(self) -> Prior | None:
-        """What is known of the pose beforehand."""
+        """Return what is known of the pose beforehand."""
         return None if self.region is None else self.region.prior
 
     def within(self, prior: Prior) -> MapIndex:
-        """An index of which only places that the prior allows are answers; all that is prepared is shared.
+        """Return an index of which only places that the prior allows are answers; all that is prepared is
+        shared.
 
         Raises ConfigError if the prior does not name its session where there are several, or an unknown one.
         """
@@ -191,7 +194,7 @@ class MapIndex:
         return limited
 
     def prior_applies(self, query: QueryMap) -> bool:
-        """Whether there is a prior, and the motion of the query since its time is known."""
+        """Return whether there is a prior, and the motion of the query since its time is known."""
         return self._region_for(query) is not None
 
     def _region_for(self, query: QueryMap) -> Region | None:
@@ -199,7 +202,7 @@ class MapIndex:
         return None if lapsed else self.region
 
     def allows(self, query: QueryMap, h: Hypothesis) -> bool:
-        """Whether the prior allows the place of a hypothesis; true if there is none that applies."""
+        """Return whether the prior allows the place of a hypothesis; true if there is none that applies."""
         region = self._region_for(query)
         return region is None or (
             h.session_index == region.session_index and region.allows(query, h.fit.T_map_query)
@@ -208,9 +211,9 @@ class MapIndex:
     def search(
         self, query: QueryMap, known: tuple[Hypothesis, ...] = ()
     ) -> Iterator[tuple[tuple[Hypothesis, ...], float]]:
-        """Hypotheses for the query, best first, again and again: those that are known, refined, and what is
-        found next to more and more places, the likeliest first; with a prior, anywhere in its region at
-        once. Beside them the share 0..1 of the mass, by the signatures, that is not searched yet.
+        """Yield hypotheses for the query, best first, again and again: the known ones, refined, and those
+        found next to more and more places, the likeliest first; with a prior, anywhere in its region at once.
+        Beside them the share 0..1 of the mass, by the signatures, that is not searched yet.
 
         What has less than the share `RelocalizeConfig.coarse_keep` of the best coarse score is left out.
         """
@@ -229,26 +232,27 @@ class MapIndex:
             yield found, left
 
     def in_region(self, query: QueryMap, known: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
-        """`known` and what fits anywhere in the region of the prior."""
+        """Return `known` and what fits anywhere in the region of the prior."""
         fits = next(align(query, [self._allowed(query)], self.places, self.maps_for(query), self.config))
         return self._worth_keeping(query, (*self._fitted(query, known), *fits))
 
     def _allowed(self, query: QueryMap) -> Iterator[Area]:
-        """The region of the prior, if there is one that applies."""
+        """Yield the region of the prior, if there is one that applies."""
         region = self._region_for(query)
         if region is not None:
             squares_m = region.squares(query, self.places.ground[region.session_index][0], SQUARE_M)
             yield Area(region.session_index, squares_m)
 
     def _fitted(self, query: QueryMap, known: Iterable[Hypothesis]) -> list[Hypothesis]:
-        """What is known, refined."""
+        """Return the known hypotheses, refined."""
         maps = self.maps_for(query)
         return [
             fitted(query, h.session_index, h.row, maps[h.session_index], h.fit.T_map_query) for h in known
         ]
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
-        """The maps as they are searched for a query: to one in a lower plane, their free space is unknown."""
+        """Return the maps as they are searched for a query: to one in a lower plane, their free space is
+        unknown."""
 
         def facing(i: int) -> SearchMap:
             below = query.walls.at_once(self.maps[i].walls).only_explain
@@ -259,9 +263,9 @@ class MapIndex:
     def _worth_keeping(
         self, query: QueryMap, new: Sequence[Hypothesis], kept: Sequence[Hypothesis] = ()
     ) -> tuple[Hypothesis, ...]:
-        """Best first, of what is new and what was kept before, what scores enough beside the best one to tell
-        of it (`PosteriorParameters.longest_lead`), each the best around itself; what a prior excludes is
-        kept beside it."""
+        """Return the new and the earlier hypotheses that score enough beside the best one to be reported
+        (`PosteriorParameters.longest_lead`), best first, each the best around itself; those that a prior
+        excludes are kept beside them."""
         maps, share = self.maps_for(query), 1.0 - POSTERIOR.longest_lead
         worth: list[Hypothesis] = []
         for inside in (True, False):
@@ -276,7 +280,7 @@ class MapIndex:
         return tuple(sorted(worth, key=lambda h: -h.fit.score))
 
     def joined(self, a: int, b: int) -> tuple[BuildingFrame, BuildingFrame] | None:
-        """Where two sessions lie in the building in which they are joined; None if they are not."""
+        """Return where two sessions lie in the building in which they are joined; None if they are not."""
         frame, other = (self.frames.get(self.sessions[number]) for number in (a, b))
         if frame is None or other is None or frame.name != other.name:
             return None

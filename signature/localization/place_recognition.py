@@ -59,7 +59,8 @@ class SessionRecognizer:
     """
 
     def __init__(self, config: Config, parameters: RecognitionParameters = RECOGNITION) -> None:
-        """config : stretches are described as the places of a database with this configuration."""
+        """Begin without any stretch. config : stretches are described as the places of a database with this
+        configuration."""
         self._made_with = config
         self._config = config.relocalize.model_copy(update={"views": parameters.views})
         self._parameters = parameters
@@ -69,7 +70,7 @@ class SessionRecognizer:
         self._places: Places | None = None
 
     def recognize(self, newest: PlaceMap) -> Sequence[Recognition]:
-        """The earlier stretches that look like the newest one, each place with its own odds."""
+        """Return the earlier stretches that look like the newest one, each place with its own odds."""
         query = query_of(newest.grid, newest.poses[:, :2], self._made_with, self._config)
         found = [] if self._places is None else self._look_up(query, self._places)
         self._remember(newest.grid, query)
@@ -122,7 +123,7 @@ class SessionRecognizer:
 
 
 def recognizer_for(config: Config) -> SessionRecognizer | None:
-    """A recognizer for one session, or None if the configuration does not want one.
+    """Return a recognizer for one session, or None if the configuration turns it off.
 
     >>> import signature
     >>> recognizer_for(signature.Config()) is None

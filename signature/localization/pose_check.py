@@ -94,7 +94,7 @@ def check_pose(
     stamp_ns: int | None = None,
     session: str | None = None,
 ) -> PoseCheck:
-    """Whether a pose is right, by the last metres of a registered recording.
+    """Return whether a pose is right, by the last metres of a registered recording.
 
     scans : with their planar scans, from `pc2grid.pipeline.follow`, in any frame of their own.
     stamp_ns : time of the pose, of which the nearest scan is meant; None: the last scan.
@@ -133,7 +133,7 @@ def check_pose(
 
 @one_blas_thread
 def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None) -> PoseCheck:
-    """Whether a pose at the query's last scan is right. Raises the errors of `check_pose`."""
+    """Return whether a pose at the query's last scan is right. Raises the errors of `check_pose`."""
     index, seen = localizer.index, localizer.query.map()
     near = index.within(_around(T_map_base, session))
     assert near.region is not None
@@ -173,7 +173,8 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
 
 
 def _status(mass_here: float, at_most: float, accept: float) -> CheckStatus:
-    """at_most : upper bound of the probability that the pose is right. accept : least mass to be certain."""
+    """Return the status of a pose. at_most : upper bound of the probability that the pose is right. accept :
+    least mass to be certain."""
     if mass_here >= accept:
         return "fine"
     return "lost" if at_most <= 1.0 - accept else "unsure"
@@ -214,11 +215,11 @@ class PoseWatch:
 
     @property
     def uses_points(self) -> bool:
-        """Whether scans must be given with their points."""
+        """Return whether scans must be given with their points."""
         return self._localizer.uses_points
 
     def restart(self) -> None:
-        """The scans do not go on from those before."""
+        """Begin anew: the next scans do not continue those before."""
         self._localizer = Localizer(self._index)
         self._driven: deque[tuple[int, SE2]] = deque(maxlen=CHECK.most_scans)
         self._waiting: MapPose | None = None

@@ -1,12 +1,4 @@
-"""What is known of a robot's pose beforehand: a region of the map that it is in.
-
-A prior excludes: a place outside has probability 0 and is no answer. Between places that fit equally well it
-decides. But what scores differently outside still shows what wrong places score for this query, so it remains
-evidence (`signature.localization.decision`): a place that fits poorly is not certain because few others are
-in the region, and if another place fits better by far, nothing inside is. That place is reported
-(`Answer.excluded`).
-
-The posterior over places and "not in this map": one equation decides every answer.
+"""The posterior over places and "not in this map": one equation decides every answer.
 
     mass(h)  =  prior(h) exp(z_h) / N                        the query lies at h
     slipped  =  mass(h) A sum_k s exp(-c r_k)                it lay at the likeliest h until scan k
@@ -25,7 +17,7 @@ The posterior over places and "not in this map": one equation decides every answ
   another place fits nearly so well: then such a fit is nothing special. The score (`score_fit`) is a
   mean, which varies by chance as 1 / sqrt(n). No lead counts as longer than the share q of the score: what
   scores less is not searched for, so there may always be a rival so near. Places that fit equally well are
-  no examples of it. What tells for the best of them tells for each, so they share the mass by their priors.
+  no examples of it: they get the evidence of the best of them, and their priors divide the mass.
 - like, how well the query fits onto itself, slid along (`pc2grid.matching.score`): the walls of a
   bare corridor tell no place along it from another.
 - r_k, the log-likelihood of the scans from k on, f of these alone, a metre, times the metres since: where
@@ -39,6 +31,13 @@ The posterior over places and "not in this map": one equation decides every answ
 
 `located` means that one place has at least the mass `RelocalizeConfig.accept`; `ambiguous`, that the best
 place is at least as likely as "nowhere", z + ln prior >= 0; `not_found` all else.
+
+A prior (`Prior`) is a region of the map that the robot is known to be in. It excludes: a place outside has
+probability 0 and is no answer. Between places that fit equally well it decides. But what scores differently
+outside still shows what wrong places score for this query, so it remains evidence
+(`signature.localization.decision`): a place that fits poorly is not certain because few others are in the
+region, and if another place fits better by far, nothing inside is. That place is reported
+(`Answer.excluded`).
 
 `pc2grid_lab.fit.posterior` fits b, c and d to queries whose truth is known, and judges them on buildings that
 were left out. They are fitted to fr079, intel, csail, aces, killian, wean, kidnap, workshop, birmingham, the
@@ -117,7 +116,7 @@ class Prior:
         half_yaw_rad: float = math.pi,
         session: str | None = None,
     ) -> Prior:
-        """A disc, and any heading unless `half_yaw_rad` says otherwise.
+        """Return a disc, with any heading unless `half_yaw_rad` limits it.
 
         Raises ConfigError for numbers that are not finite or a radius that is not positive.
         """
@@ -137,7 +136,7 @@ class Prior:
     def of_pose(
         T_map_base: SE2, covariance: ArrayLike, *, stamp_ns: int | None = None, session: str | None = None
     ) -> Prior:
-        """The 99 % region of a pose with a covariance (3, 3) of x, y, yaw; m^2, m rad, rad^2.
+        """Return the 99 % region of a pose with a covariance (3, 3) of x, y, yaw; m^2, m rad, rad^2.
 
         Raises ConfigError for a covariance of zeros, which says nothing, and for one that is none.
         """
@@ -166,11 +165,12 @@ class Prior:
 
     @property
     def radius_m(self) -> float:
-        """Distance of the farthest position in the region from its centre."""
+        """Return the distance of the farthest position in the region from its centre."""
         return math.sqrt(float(np.linalg.eigvalsh(self.shape_m2)[1]))
 
     def allows(self, T_map_base: SE2, since_m: float = 0.0) -> bool:
-        """Whether the base can be there. since_m : way driven since `stamp_ns`, by which the region grows."""
+        """Return whether the base can be there. since_m : way driven since `stamp_ns`, by which the region
+        grows."""
         grown = self.shape_m2 + (PRIOR.drift * since_m) ** 2 * np.eye(2)
         off = np.array([T_map_base.x - self.T_map_base.x, T_map_base.y - self.T_map_base.y])
         turn = abs(wrap_angle(T_map_base.yaw - self.T_map_base.yaw))
@@ -178,7 +178,7 @@ class Prior:
         return inside and turn <= self.half_yaw_rad + PRIOR.drift_rad_m * since_m
 
     def may_hold(self, squares_m: F64, side_m: float, moved_m: float, since_m: float) -> BoolGrid:
-        """(K,) which of the squares of `side_m` around (K, 2) may hold the base now.
+        """Return which of the squares of `side_m` around (K, 2) may hold the base now, (K,).
 
         moved_m : distance from where it was at `stamp_ns`, whatever its heading was. since_m : way driven.
         """
@@ -196,8 +196,8 @@ class Region:
 
     @staticmethod
     def of(prior: Prior, sessions: Sequence[str]) -> Region:
-        """Raises ConfigError if the prior does not name its session where there are several, or an unknown
-        one."""
+        """Return the prior on the map of the session that it names. Raises ConfigError if it does not name
+        one where there are several, or names an unknown one."""
         names = ", ".join(sessions[:12]) + (", ..." if len(sessions) > 12 else "")
         if prior.session is None and len(sessions) > 1:
             raise ConfigError(
@@ -213,23 +213,25 @@ class Region:
         )
 
     def is_ahead(self, query: QueryMap) -> bool:
-        """Whether the time that the prior is about has not come yet."""
+        """Return whether the query ends before the time that the prior is about."""
         return self.prior.stamp_ns is not None and query.stamp_ns < self.prior.stamp_ns
 
     def T_odom_prior(self, query: QueryMap) -> SE2 | None:
-        """The base at the time that the prior is about; None before, and if the motion since is not known."""
+        """Return the base at the time that the prior is about; None before, and if the motion since is not
+        known."""
         if self.prior.stamp_ns is None:
             return query.T_odom_base
         return None if self.is_ahead(query) else query.T_odom_prior
 
     def allows(self, query: QueryMap, T_map_query: SE2) -> bool:
-        """Whether the query can lie at a pose. The motion since the time of the prior must be known."""
+        """Return whether the query can lie at a pose. The motion since the time of the prior must be
+        known."""
         T_odom_prior = self.T_odom_prior(query)
         assert T_odom_prior is not None
         return self.prior.allows(T_map_query @ T_odom_prior, query.since_prior_m)
 
     def squares(self, query: QueryMap, free_m: F64, side_m: float) -> F64:
-        """Those of the squares of `side_m` around (K, 2) that may hold the base now."""
+        """Return those of the squares of `side_m` around (K, 2) that may hold the base now."""
         T_odom_prior = self.T_odom_prior(query)
         assert T_odom_prior is not None
         step = T_odom_prior.inverse() @ query.T_odom_base
@@ -296,22 +298,23 @@ class Evidence:
 
     @property
     def agreement(self) -> float:
-        """0..1, the better of the two directions."""
+        """Return the better agreement of the two directions, 0..1."""
         return max(self.forward, self.backward)
 
     @property
     def log_likelihood(self) -> float:
-        """f + g: below 0 the place fits less than wrong places do."""
+        """Return f + g: below 0 the place fits less than wrong places do."""
         return tempered(self.forward, self.walls) + tempered(self.backward, self.looked_at)
 
     @property
     def terms(self) -> tuple[float, float, float]:
-        """What b, c and d are multiplied with."""
+        """Return the factors of b, c and d."""
         sharpness = math.sqrt(self.walls * (1.0 - self.likeness**2))
         return 1.0, self.log_likelihood, self.lead * sharpness
 
     def log_odds(self, p: PosteriorParameters = POSTERIOR) -> float:
-        """z: logarithm of the mass of the place over that of "nowhere"; minus infinity without walls."""
+        """Return z, the logarithm of the mass of the place over that of "nowhere"; minus infinity without
+        walls."""
         if not self.walls:
             return -math.inf
         return float(np.dot((p.bias, p.fit, p.lead), self.terms))
@@ -321,8 +324,8 @@ NO_EVIDENCE = Evidence(forward=0.0, walls=0.0, backward=0.0, looked_at=0.0, lead
 
 
 def evidence_of(fits: Sequence[Fit], query: QueryMap, rivals: Sequence[Fit] = ()) -> tuple[Evidence, ...]:
-    """Evidence of places, one fit each. rivals : of places that are no answers, but as good an example of
-    what wrong places score."""
+    """Return the evidence of places, one fit each. rivals : of places that are no answers, but examples of
+    what wrong places score as well."""
     scores = np.array([fit.score for fit in (*fits, *rivals)])
     alike = np.abs(scores[: len(fits), None] - scores) <= POSTERIOR.alike
     each = [
@@ -382,16 +385,16 @@ def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[flo
 
 
 def log_likelihood(fit: Fit) -> float:
-    """f + g of a fit: below 0 the two sides contradict each other, and where they share nothing, it is 0."""
+    """Return f + g of a fit: below 0 the two sides contradict each other; 0 where they share nothing."""
     return tempered(fit.known_agreement, fit.compared) + tempered(fit.backward, fit.looked_at)
 
 
 def tempered(agreement: float, points: float) -> float:
-    """Log-likelihood of wall points that agree so well, tempered by their number."""
+    """Return the log-likelihood of wall points that agree so well, tempered by their number."""
     return log_likelihood_ratio(agreement) * points / (points + POSTERIOR.few)
 
 
 def log_likelihood_ratio(agreement: float) -> float:
-    """l of an agreement, 0..1: 0 at what wrong places reach."""
+    """Return l of an agreement, 0..1: 0 at what wrong places reach."""
     a = min(max(agreement, POSTERIOR.least_agreement), 1.0)
     return math.log(a) - math.log(1.0 + POSTERIOR.slack - a)

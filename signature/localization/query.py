@@ -94,7 +94,7 @@ class QueryMap:
 
     @cached_property
     def likeness(self) -> float:
-        """`pc2grid.matching.score` of the walls."""
+        """Return `pc2grid.matching.score` of the walls."""
         return self_similarity(self.walls)
 
 
@@ -106,7 +106,7 @@ class ViewSpacing:
         self._last_m: F64 | None = None
 
     def takes(self, registered: RegisteredScan) -> bool:
-        """Whether the next scan is one of them. One that registration was lost on begins anew."""
+        """Return whether the next scan is one of them. One that registration was lost on begins anew."""
         if registered.health is Health.LOST:
             self.path_m, self._last_m = 0.0, None
             return False
@@ -156,7 +156,7 @@ class QueryInSpace:
 
     @property
     def views(self) -> tuple[SpatialView, ...]:
-        """The scans, oldest first."""
+        """Return the scans, oldest first."""
         return tuple(view for _, view in self._views)
 
 
@@ -180,7 +180,8 @@ class Query:
         prior_ns: int | None = None,
         in_space: bool = False,
     ) -> None:
-        """made_with : of the database; the query is drawn and described as its maps are.
+        """Begin without any scan. made_with : of the database; the query is drawn and described as its maps
+        are.
 
         prior_ns : the time of a prior; the pose there is remembered.
         """
@@ -196,7 +197,7 @@ class Query:
 
     @property
     def path_m(self) -> float:
-        """Metres driven since the start, or since registration was lost."""
+        """Return the metres driven since the start, or since registration was lost."""
         return self._newest.path_m if self._newest is not None else 0.0
 
     def add(self, registered: RegisteredScan, planar_scan: PlanarScan) -> None:
@@ -224,7 +225,7 @@ class Query:
         self._keep(self._newest)
 
     def _off_prior(self, planar_scan: PlanarScan) -> float:
-        """Nanoseconds between a scan and the time of the prior; infinite without one."""
+        """Return the nanoseconds between a scan and the time of the prior; infinite without one."""
         return math.inf if self._prior_ns is None else abs(planar_scan.stamp_ns - self._prior_ns)
 
     def _keep(self, newest: Keyframe) -> None:
@@ -259,7 +260,7 @@ class Query:
         return later
 
     def map(self) -> QueryMap:
-        """What has been seen over the last metres, described as the database is.
+        """Return the grid of the last metres, described as the database is.
 
         Raises NoScans if no scan could be used.
         """
@@ -341,7 +342,7 @@ def map_as_query(
 def best_observed(
     grid: OccupancyGrid, path_xy_m: F64, sight_m: float, config: RelocalizeConfig
 ) -> tuple[tuple[float, float], ...]:
-    """Up to `config.views` points, `config.view_spacing_m` apart, best observed first.
+    """Return up to `config.views` points, `config.view_spacing_m` apart, best observed first.
 
     Half of them lie on the path, where the robot has looked around; the others on the middle lines of all
     the free space seen, because much of what surrounds a place is seen from elsewhere. How well a place

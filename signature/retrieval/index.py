@@ -69,7 +69,7 @@ class Raster(NamedTuple):
 
     @staticmethod
     def of(at_m: F32, block: NDArray[np.int32], blocks: int) -> Raster:
-        """Of viewpoints (K, 2) of maps (K,)."""
+        """Return the raster of viewpoints (K, 2) of maps (K,)."""
         square = np.rint(at_m / LATTICE_M).astype(np.int64)
         low, high = np.zeros((blocks, 2), np.int64), np.full((blocks, 2), -1)
         starts = np.flatnonzero(np.diff(block, prepend=-1))
@@ -118,7 +118,7 @@ class PlaceIndex:
     def of(
         blocks: Iterable[PlaceBlock], weights: SeenWeights | None = None, spread: Spread | None = None
     ) -> PlaceIndex:
-        """An index of all viewpoints of the blocks, of which one is in memory at a time.
+        """Return an index of all viewpoints of the blocks, of which one is in memory at a time.
 
         weights, spread : how signatures are compared; by default all three, as the program has learned it.
         """
@@ -148,7 +148,7 @@ class PlaceIndex:
         )
 
     def shuffled(self, rng: np.random.Generator) -> PlaceIndex:
-        """The same viewpoints, each with the signatures of another one."""
+        """Return the same viewpoints, each with the signatures of another one."""
         order = rng.permutation(len(self))
         return replace(self, vectors=self.vectors[order], hidden=self.hidden[order])
 
@@ -157,12 +157,13 @@ class PlaceIndex:
 
     @property
     def nbytes(self) -> int:
-        """Memory that it takes."""
+        """Return the memory that it takes, bytes."""
         columns = (self.vectors, self.hidden, self.at_m, self.block, self.row, self.raster.at)
         return sum(column.nbytes for column in columns)
 
     def scores(self, views: Sequence[View]) -> F32:
-        """(K, V) log-likelihood ratio of each viewpoint and each view showing one place, by signatures."""
+        """Return the log-likelihood ratio (K, V) of each viewpoint and each view showing one place, by
+        signatures."""
         signatures = seen_signatures(
             np.stack([view.profile.ranges_m for view in views]),
             np.stack([view.profile.ends for view in views]),
@@ -180,7 +181,7 @@ class PlaceIndex:
         return found
 
     def poses(self, views: Sequence[View], base_m: tuple[float, float]) -> Poses:
-        """Poses of the query that its views propose.
+        """Return the poses of the query that its views propose.
 
         base_m : (x, y) of the robot in the query's frame.
         """
@@ -203,7 +204,7 @@ class PlaceIndex:
 
 
 def turned(steps_m: F64) -> F64:
-    """(H, ..., 2) steps (..., 2) at each heading of the query."""
+    """Return the steps (..., 2) at each heading of the query: (H, ..., 2)."""
     turns = 2.0 * math.pi * np.arange(POSES.headings) / POSES.headings
     turn = np.stack((np.cos(turns), -np.sin(turns), np.sin(turns), np.cos(turns)), axis=1).reshape(-1, 2, 2)
     return np.asarray(np.einsum("hij,...j->h...i", turn, steps_m), np.float64)
@@ -224,8 +225,8 @@ def best_headings(
     out: F32,
     at_best: I64,
 ) -> None:
-    """The sum of the `scores` (K, V) of all views at the best heading, into `out` (P,), and the number of
-    that heading, into `at_best` (P,).
+    """Add up the `scores` (K, V) of all views at the best heading, into `out` (P,), and write the number of
+    that heading into `at_best` (P,).
 
     squares : (K, 2) viewpoints in units of the lattice. block, low, shape, first, at : as in
     `place_index.Raster`. viewpoint, view : (P,) which view is put on which viewpoint. steps :

@@ -1,9 +1,7 @@
 """The places of a database: which of them a robot may stand next to, and the free ground there.
 
-The signatures of viewpoints select them. Walls are aligned on the free ground next to the selected places
-alone.
-
-The maps of a database, read and prepared when they are first asked for.
+The signatures of viewpoints select the places. Walls are aligned on the free ground next to these alone. The
+maps are read and prepared when they are first needed.
 """
 
 from __future__ import annotations
@@ -93,7 +91,9 @@ class Places:
         fewer: Places | None = None,
         stored: Callable[[int], SeenPlaces | None] = lambda session: None,
     ) -> None:
-        """grids, areas_m2 : the map of each session and its free space in m^2, by session_index.
+        """Prepare the places of some sessions.
+
+        grids, areas_m2 : the map of each session and its free space in m^2, by session_index.
 
         fewer : the places of the first of these sessions; viewpoints that it has computed are taken over.
         stored : what is seen from the places of a session, if it need not be computed from the map.
@@ -131,7 +131,7 @@ class Places:
         return self._at_once(rows, likelihood[rows])
 
     def _searched(self, by: ShortlistBy) -> PlaceIndex:
-        """The viewpoints, by all signatures or as a control wants them."""
+        """Return the viewpoints with all signatures, or as a control wants them."""
         if by == "signatures":
             return self.index()
         if by not in self._controls:
@@ -144,8 +144,8 @@ class Places:
         return self._controls[by]
 
     def next_to(self, poses: Poses) -> F64:
-        """(N,) the log-likelihood of the likeliest pose next to each place. Where none is, it is that of the
-        least likely one: no more are proposed."""
+        """Return the log-likelihood (N,) of the likeliest pose next to each place. Without a pose there, it
+        is that of the least likely one: no more are proposed."""
         away_m, row = self.nearest(self._session_of_block[poses.block], poses.base_m)
         likelihood = np.full(len(self.table), poses.likelihood.min(initial=0.0), np.float64)
         near = away_m <= self.sight_m
@@ -166,7 +166,7 @@ class Places:
         return Order(rows, mass)
 
     def index(self, on_progress: Callable[[float], None] = lambda share: None) -> PlaceIndex:
-        """The viewpoints of all places with their signatures; made when first asked for.
+        """Return the viewpoints of all places with their signatures; made by the first call.
 
         on_progress : is told the share of the places that is done.
         """
@@ -175,7 +175,7 @@ class Places:
         return self._index
 
     def blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[PlaceBlock]:
-        """What is seen from the places of each session: as stored, or else computed from the map."""
+        """Yield the isovists of the places of each session: as stored, or else computed from the map."""
         starts = np.flatnonzero(np.diff(self.table.session_index, prepend=-1))
         for begin in starts.tolist():
             seen = self._seen(int(self.table.session_index[begin]))
@@ -184,7 +184,7 @@ class Places:
         on_progress(1.0)
 
     def _seen(self, session: int) -> SeenPlaces:
-        """What is seen from the places of a session; kept."""
+        """Return the isovists of the places of a session; they are kept."""
         if session not in self._described:
             rows = self._rows(session)
             seen = self._stored(session)
@@ -195,12 +195,12 @@ class Places:
         return self._described[session]
 
     def _rows(self, session: int) -> slice:
-        """The places of a session in the table, which are side by side."""
+        """Return the rows of a session in the table, which are side by side."""
         first, end = np.searchsorted(self.table.session_index, (session, session + 1))
         return slice(int(first), int(end))
 
     def areas(self, rows: I64) -> Iterator[Area]:
-        """The free ground next to the places `rows`, in the order of their sessions."""
+        """Yield the free ground next to the places `rows`, in the order of their sessions."""
         chosen = np.zeros(len(self.table), bool)
         chosen[rows] = True
         for session in dict.fromkeys(self.table.session_index[rows].tolist()):
@@ -208,8 +208,8 @@ class Places:
             yield Area(session, squares_m[chosen[nearest]])
 
     def nearest(self, session: int | NDArray[np.integer], at_m: NDArray[np.floating]) -> tuple[F64, I64]:
-        """The distance (K,) of the place of a session that is next to points (K, 2), and its row (K,), -1 if
-        the session has no places."""
+        """Return the distance (K,) of the place of a session that is next to points (K, 2), and its row (K,),
+        -1 if the session has no places."""
         apart_m = np.broadcast_to(np.asarray(session, np.float64) * _APART_M, len(at_m))
         away_m, row = self._tree.query(np.column_stack((at_m, apart_m)))
         return away_m, np.where(away_m < 0.5 * _APART_M, row, -1)
@@ -226,7 +226,7 @@ class Places:
 
 
 def ground_squares(grid: OccupancyGrid) -> F64:
-    """Centres (K, 2) of the squares of `SQUARE_M` of a grid that hold any ground, map frame."""
+    """Return the centres (K, 2) of the squares of `SQUARE_M` of a grid that hold any ground, map frame."""
     n = max(1, round(SQUARE_M / grid.resolution_m))
     height, width = grid.cells.shape
     ground = np.zeros((math.ceil(height / n), math.ceil(width / n)), bool)
@@ -245,7 +245,7 @@ class LazySequence(Sequence[T]):
     """A sequence of `count` items, each made when it is first asked for; the `most` used last are kept."""
 
     def __init__(self, make: Callable[[int], T], count: int, most: int | None = None) -> None:
-        """most : None: all are kept."""
+        """Prepare without making any. most : None: all are kept."""
         self._made, self._count = functools.lru_cache(maxsize=most)(make), count
 
     def __len__(self) -> int:
