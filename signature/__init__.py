@@ -1,7 +1,7 @@
 """Submaps -> signatures -> database -> retrieval -> verified pose.
 
 The back of pc2grid: one file for each section of the paper (`boundary`, `freespace`, `symmetry`,
-`similarity`), the database behind one protocol, and localization. Importing this package loads no library:
+`paper`), the database behind one protocol, and localization. Importing this package loads no library:
 each name loads its module when it is first used. `help(signature.relocalize)` and so on explain them.
 
 >>> import pc2grid, signature

@@ -3,9 +3,7 @@
 Of a submap, and of what is seen from a viewpoint. A submap is cut out of a map and known whole; its points
 are spread evenly over its walls. The points of a view are the ends of its rays. What hides from it counts
 neither for nor against: each bin is a share of what *was seen*, so that a part has about the histogram of the
-whole.
-
-The steps of the description where compiling pays. The tests compare them with plain forms in numpy.
+whole. The tests compare the compiled steps with plain forms in numpy.
 """
 
 from __future__ import annotations
@@ -40,22 +38,22 @@ worth is in docs/method.md."""
 
 
 def boundary_edges(submap: Submap, config: SignatureConfig) -> BoolGrid:
-    """The edge map S^E (H, W): clearly occupied cells (III-B 1), thinned to one pixel (III-B 2)."""
+    """Return the edge map S^E (H, W): clearly occupied cells (III-B 1), thinned to one pixel (III-B 2)."""
     return thin(submap.grid.occupied, config.boundary_thinning)
 
 
 def boundary_points(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> I64:
-    """Evenly sampled boundary points P^B (N, 2) as (row, column) of the edge map (III-B 3)."""
+    """Return evenly sampled boundary points P^B (N, 2) as (row, column) of the edge map (III-B 3)."""
     return sample_evenly(cells_of(edges), config.boundary_spacing_m / resolution_m)
 
 
 def boundary_bins(radius_m: float, config: SignatureConfig) -> int:
-    """N_hb = ceil(2 r / delta_b)."""
+    """Return n_hb = ceil(2 r / delta_b)."""
     return math.ceil(2 * radius_m / config.boundary_bin_m - 1e-9)
 
 
 def boundary_histogram(points: I64, radius_m: float, resolution_m: float, config: SignatureConfig) -> F32:
-    """Distances of all pairs of boundary points as a histogram H^b, Eq. 1-2.
+    """Return the distances of all pairs of boundary points as a histogram H^b, Eq. 1-2.
 
     points : (N, 2) cells. Returns (N_hb,) float32, sum 1; all 0 if there are fewer than two points.
     Distances of 2 r and more count in the last bin.
@@ -68,7 +66,8 @@ def boundary_histogram(points: I64, radius_m: float, resolution_m: float, config
 
 @lru_cache(maxsize=8)
 def bins_of_squares(cell_bins: float, bins: int) -> NDArray[np.int32]:
-    """The bin of the distance of two cells by its square in cells: 0, 1, 2, ... up to that of the last bin.
+    """Return the bin of the distance of two cells by its square in cells: 0, 1, 2, ... up to that of the last
+    bin.
 
     cell_bins : width of a cell in bins.
     """
@@ -79,12 +78,13 @@ def bins_of_squares(cell_bins: float, bins: int) -> NDArray[np.int32]:
 
 
 def normalized(counts: NDArray[np.generic]) -> F32:
-    """Counts (N,) as shares, float32 of sum 1; all 0 stays all 0."""
+    """Return counts (N,) as shares, float32 of sum 1; all 0 stays all 0."""
     return np.asarray(counts / max(counts.sum(), 1), np.float32)
 
 
 def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
-    """The boundary of what is seen from N viewpoints: distances from there, and of all pairs of wall points.
+    """Return the boundary of what is seen from N viewpoints: distances from there, and of all pairs of wall
+    points.
 
     ranges_m, ends : (N, B) of isovists. Returns (N, Kb) square roots of shares: of the distances, and of the
     pairs within each of `RIMS`. A ray without a wall within sight, or within a rim, has no distance, but says
@@ -105,7 +105,8 @@ def boundary_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
 
 
 def within(share: NDArray[np.floating], full: float, none: float) -> F64:
-    """How much distances count, 0..1: in full up to `full`, less and less up to `none`, as a cosine."""
+    """Return how much distances count, 0..1: in full up to `full`, less and less up to `none`, as a
+    cosine."""
     if full == none:
         return np.where(share <= full, 1.0, 0.0)
     outside = np.clip((share - full) / (none - full), 0.0, 1.0)
@@ -113,27 +114,27 @@ def within(share: NDArray[np.floating], full: float, none: float) -> F64:
 
 
 def rim_columns(rim: tuple[float, float]) -> I64:
-    """The bins of pairs that a rim can fill: of two wall points within it, and of what is open."""
+    """Return the bins of pairs that a rim can fill: of two wall points within it, and of what is open."""
     bins = min(math.ceil(rim[1] * PAIR_BINS), PAIR_BINS)
     return np.array([*range(bins), PAIR_BINS, PAIR_BINS + 1])
 
 
 def shares(at: NDArray[np.int64], valid: NDArray[np.bool_], bins: int) -> F64:
-    """(N, bins) which share of the valid entries of each row of `at` (N, M) lies in each bin; all 0 without a
-    valid entry."""
+    """Return which share of the valid entries of each row of `at` (N, M) lies in each bin, (N, bins); all 0
+    without a valid entry."""
     rows = np.arange(len(at))[:, None] * bins
     counts = np.bincount((rows + at)[valid], minlength=len(at) * bins)
     return as_shares(counts.reshape(len(at), bins))
 
 
 def as_shares(counts: NDArray[np.number]) -> F64:
-    """Counts (N, bins) as shares of their row; all 0 stays all 0."""
+    """Return counts (N, bins) as shares of their row; all 0 stays all 0."""
     return np.asarray(counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0), np.float64)
 
 
 @compiled()
 def pair_counts(cells: I64, bin_of: NDArray[np.int32], bins: int) -> I64:
-    """How many pairs of cells (N, 2) lie in each bin of their distance: (bins,).
+    """Return how many pairs of cells (N, 2) lie in each bin of their distance: (bins,).
 
     bin_of : the bin of each squared distance in cells; longer distances count in the last bin.
 

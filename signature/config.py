@@ -117,18 +117,18 @@ class SignatureConfig(Section):
 
     @property
     def boundary_thinning(self) -> Thinning:
-        """Of the boundary (III-B 2, which cites another work than III-A)."""
+        """Return the thinning of the boundary (III-B 2, which cites another work than III-A)."""
         return "guo_hall" if self.thinning == "as_cited" else self.thinning
 
     @property
     def freespace_thinning(self) -> Thinning:
-        """Of the free space (III-C 1, which refers to III-A)."""
+        """Return the thinning of the free space (III-C 1, which refers to III-A)."""
         return "zhang_suen" if self.thinning == "as_cited" else self.thinning
 
     @classmethod
     def paper(cls) -> Self:
-        """The paper to the letter: two thinnings, free space not eroded (III-C) and at full resolution, no
-        limit in S^G, one vote for each segment.
+        """Return the paper to the letter: two thinnings, free space not eroded (III-C) and at full
+        resolution, no limit in S^G, one vote for each segment.
 
         The paper leaves open: which d of Eq. 6 it calls Bhattacharyya's (here OpenCV's, sqrt(1 - BC); the
         other reading is `histogram_distance="bhattacharyya"`); which of the two thinnings is which (Guo and
@@ -198,5 +198,5 @@ class Config(pc2grid.settings.Config):
 
     @classmethod
     def paper(cls) -> Self:
-        """The defaults, but with the submaps and signatures of the paper."""
+        """Return the defaults, but with the submaps and signatures of the paper."""
         return cls(partition=PartitionConfig.paper(), signature=SignatureConfig.paper())

@@ -43,7 +43,7 @@ NO_PATH = 1e6
 
 
 def freespace_nodes(submap: Submap, config: SignatureConfig) -> I64:
-    """Free-space nodes V^F (N, 2) as (row, column): evenly sampled pixels of the skeleton (III-C 1).
+    """Return free-space nodes V^F (N, 2) as (row, column): evenly sampled pixels of the skeleton (III-C 1).
 
     The skeleton is computed on blocks of cells, `config.freespace_cell_m` wide; a block is free if all its
     cells are. A finer skeleton would not move nodes that lie far apart, and thinning is expensive.
@@ -57,21 +57,21 @@ def freespace_nodes(submap: Submap, config: SignatureConfig) -> I64:
 
 
 def _all_in_blocks(mask: BoolGrid, block: int) -> BoolGrid:
-    """Whether all cells of each block x block square are set; incomplete blocks at the edges are dropped."""
+    """Return which blocks of block x block cells are all set; incomplete blocks at the edges are dropped."""
     height, width = mask.shape[0] // block * block, mask.shape[1] // block * block
     rows = functools.reduce(np.logical_and, [mask[k:height:block] for k in range(block)])
     return np.asarray(functools.reduce(np.logical_and, [rows[:, k:width:block] for k in range(block)]))
 
 
 def freespace_graph(submap: Submap, config: SignatureConfig = SignatureConfig()) -> nx.Graph:
-    """The undirected graph G(V, E) of III-C 2: free-space nodes, joined where they see each other."""
+    """Return the undirected graph G(V, E) of III-C 2: free-space nodes, joined where they see each other."""
     return visibility_graph(submap.grid, freespace_nodes(submap, config), config)
 
 
 def visibility_graph(
     grid: OccupancyGrid, cells: I64, config: SignatureConfig = SignatureConfig()
 ) -> nx.Graph:
-    """Places (N, 2) of a grid, as (row, column), joined by straight lines that meet no occupied cell.
+    """Join places (N, 2) of a grid, as (row, column), by straight lines that meet no occupied cell.
 
     Nodes are numbered from 0 and carry `center_m` (x, y in the map frame); edges carry `length_m`. The edges
     are the finite elements of the matrix A of III-C 2. Unknown cells do not block, as in the paper. Lines
@@ -93,7 +93,8 @@ def visibility_graph(
 def _edges(
     grid: OccupancyGrid, cells: I64, config: SignatureConfig
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], F64]:
-    """The edges of `visibility_graph`: their nodes i < j (E,) and (E,), and their lengths (E,) in metres."""
+    """Return the edges of `visibility_graph`: their nodes i < j (E,) and (E,), and their lengths (E,) in
+    metres."""
     from scipy.spatial.distance import pdist
 
     # Both list the pairs i < j in the same order.
@@ -108,7 +109,8 @@ def _edges(
 
 
 def shortest_paths(graph: nx.Graph) -> F64:
-    """Lengths L^F (N, N) in metres of the shortest paths between all nodes, Eq. 3; inf where there is none.
+    """Return lengths L^F (N, N) in metres of the shortest paths between all nodes, Eq. 3; inf where there is
+    none.
 
     graph : nodes numbered from 0, edges with `length_m`. The paper names Dijkstra's algorithm. Floyd and
     Warshall's finds the same lengths; with as many edges as a submap has, it takes half the time (2.3 against
@@ -128,7 +130,7 @@ def shortest_paths(graph: nx.Graph) -> F64:
 
 
 def freespace_paths(submap: Submap, config: SignatureConfig = SignatureConfig()) -> F64:
-    """Lengths (N, N) as of `shortest_paths(freespace_graph(submap, config))`, from its edges alone.
+    """Return lengths (N, N) as of `shortest_paths(freespace_graph(submap, config))`, from its edges alone.
 
     For experiments that describe tens of thousands of submaps: the graph takes a quarter of the time.
     """
@@ -145,12 +147,12 @@ def freespace_paths(submap: Submap, config: SignatureConfig = SignatureConfig())
 
 
 def freespace_bins(radius_m: float, config: SignatureConfig) -> int:
-    """N_hf = ceil(4 r / delta_f)."""
+    """Return n_hf = ceil(4 r / delta_f)."""
     return math.ceil(4 * radius_m / config.freespace_bin_m - 1e-9)
 
 
 def freespace_histogram(lengths_m: F64, radius_m: float, config: SignatureConfig) -> F32:
-    """Path lengths of all pairs of nodes as a histogram H^f, Eq. 4.
+    """Return the path lengths of all pairs of nodes as a histogram H^f, Eq. 4.
 
     lengths_m : (N, N). Returns (N_hf,) float32, sum 1; all 0 if no two nodes are connected. Pairs without a
     path do not count; paths longer than 4 r count in the last bin.
@@ -162,7 +164,7 @@ def freespace_histogram(lengths_m: F64, radius_m: float, config: SignatureConfig
 
 
 def freespace_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64:
-    """The free space of what is seen from N viewpoints: lengths of paths, detours, openings.
+    """Return the free space of what is seen from N viewpoints: lengths of paths, detours, openings.
 
     ranges_m, ends : (N, B) of isovists. Returns (N, Kf) square roots of the shares of the path lengths of all
     pairs of nodes of `seen_graph` (Eq. 3-4), of how much longer than the straight line these are, and of the
@@ -186,7 +188,8 @@ def freespace_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64
 
 
 def seen_graph(ranges_m: F32, ends: NDArray[np.int8]) -> nx.Graph:
-    """The free-space graph of one isovist (B,): node 0 is the viewpoint, node 1 + k the end of ray k `EVERY`.
+    """Return the free-space graph of one isovist (B,): node 0 is the viewpoint, node 1 + k the end of ray k
+    `EVERY`.
 
     Nodes of rays whose ends are hidden are left out. Edges with `length_m` join nodes whose straight line
     stays inside of what is seen (III-C 2).
@@ -202,7 +205,8 @@ def seen_graph(ranges_m: F32, ends: NDArray[np.int8]) -> nx.Graph:
 
 
 def path_lengths(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, F64]:
-    """Lengths (N, M, M) of the shortest paths and of the straight lines between the nodes of `seen_graph`.
+    """Return lengths (N, M, M) of the shortest paths and of the straight lines between the nodes of
+    `seen_graph`.
 
     Of nodes that are left out, the paths are `NO_PATH` long. All isovists together, by Floyd and Warshall's
     algorithm: 0.1 ms each, where networkx' Dijkstra takes 10.
@@ -216,8 +220,8 @@ def path_lengths(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, F64]:
 
 
 def _nodes(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Points (N, M, 2) of the nodes of `seen_graph`, which are known (N, M), and which pairs see each other
-    (N, M, M)."""
+    """Return points (N, M, 2) of the nodes of `seen_graph`, which are known (N, M), and which pairs see each
+    other (N, M, M)."""
     count, bearings = ranges_m.shape
     angles = 2.0 * math.pi * np.arange(bearings) / bearings
     at = np.arange(0, bearings, EVERY)
@@ -250,7 +254,8 @@ def _nodes(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, NDArray[np.bool_
 def in_sight(
     occupied: NDArray[np.bool_], cells: I64, first: NDArray[np.intp], second: NDArray[np.intp]
 ) -> NDArray[np.bool_]:
-    """Whether the straight lines between the centres of cells[first] and cells[second] meet no occupied cell.
+    """Return whether the straight lines between the centres of cells[first] and cells[second] meet no
+    occupied cell.
 
     occupied (H, W); cells (N, 2) as (row, column); first, second (P,) indices. Returns (P,).
 

@@ -1,7 +1,4 @@
-"""From a submap to its three signatures (paper III, Figure 1).
-
-How alike two submaps are (paper III-E, Eq. 6-8).
-"""
+"""The three signatures of a submap (paper III, Figure 1), and their distance (paper III-E, Eq. 6-8)."""
 
 from __future__ import annotations
 
@@ -45,7 +42,7 @@ class Signature:
 
 
 def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Signature:
-    """The three signatures of a submap; defined for every submap, never NaN.
+    """Return the three signatures of a submap; defined for every submap, never NaN.
 
     >>> import pc2grid
     >>> submaps = pc2grid.submaps_of(pc2grid.load_map("map.yaml"))
@@ -59,7 +56,8 @@ def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Sig
 
 
 def described(submap: Submap, paths_m: F64, config: SignatureConfig) -> Signature:
-    """The three signatures of a submap, given the lengths L^F (N, N) of the paths in its free space."""
+    """Return the three signatures of a submap, given the lengths L^F (N, N) of the paths in its free
+    space."""
     radius_m, resolution_m = submap.radius_m, submap.grid.resolution_m
     edges = boundary_edges(submap, config)
     points = boundary_points(edges, resolution_m, config)
@@ -122,7 +120,8 @@ class SignatureTable:
         submap_id: ArrayLike | None = None,
         session_index: ArrayLike | None = None,
     ) -> SignatureTable:
-        """A table of signatures with their centres (N, 2); ids default to 0 .. N - 1, sessions to 0."""
+        """Return a table of signatures with their centres (N, 2); ids default to 0 .. N - 1, sessions to
+        0."""
         n = len(signatures)
 
         def stack(name: str) -> F32:
@@ -142,7 +141,8 @@ class SignatureTable:
 
     @staticmethod
     def bare(center_m: F64, session_index: I32) -> SignatureTable:
-        """Places that are told apart by what is seen from them alone: centres (N, 2) of sessions (N,)."""
+        """Return places that are told apart by what is seen from them alone: centres (N, 2) of sessions
+        (N,)."""
         none = np.empty((len(center_m), 0), np.float32)
         return SignatureTable(
             boundary=none,
@@ -154,19 +154,20 @@ class SignatureTable:
         )
 
     def without_histograms(self) -> SignatureTable:
-        """The rows with their ids and positions, and no bins: 36 bytes instead of some 400 each."""
+        """Return the rows with their ids and positions, and no bins: 36 bytes instead of some 400 each."""
         none = np.empty((len(self), 0), np.float32)
         return replace(self, boundary=none, freespace=none)
 
     @staticmethod
     def concatenated(tables: Sequence[SignatureTable]) -> SignatureTable:
-        """The rows of several tables, one table after the other."""
+        """Return the rows of several tables, one table after the other."""
         names = [field.name for field in fields(SignatureTable)]
         return SignatureTable(**{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
 
 
 def distances(query: Signature, table: SignatureTable, config: SignatureConfig = SignatureConfig()) -> F64:
-    """The matching score s of Eq. 6 against every row of a table, (N,); smaller is more alike, never NaN.
+    """Return the matching score s of Eq. 6 against every row of a table, (N,); smaller is more alike, never
+    NaN.
 
     s = Omega * (omega_b d(H^b) + omega_f d(H^f)). An empty histogram shares no bin with any other, not
     even with another empty one: its distance is the largest possible.
@@ -185,20 +186,20 @@ def distances(query: Signature, table: SignatureTable, config: SignatureConfig =
 def score_matrix(
     boundary: F32, freespace: F32, symmetry: F32, table: SignatureTable, config: SignatureConfig
 ) -> F64:
-    """Eq. 6 of M queries, given as (M, Nb), (M, Nf), (M, 2), against N rows: (M, N)."""
+    """Return Eq. 6 of M queries, given as (M, Nb), (M, Nf), (M, 2), against N rows: (M, N)."""
     geometric = config.weight_boundary * histogram_distance(boundary, table.boundary, config)
     geometric += (1.0 - config.weight_boundary) * histogram_distance(freespace, table.freespace, config)
     return structural_factor(symmetry, table.symmetry, config) * geometric
 
 
 def similarity(score: F64) -> F64:
-    """The submap similarity rho, the reciprocal of the matching score; inf for identical submaps."""
+    """Return the submap similarity rho, the reciprocal of the matching score; inf for identical submaps."""
     with np.errstate(divide="ignore"):
         return np.asarray(1.0 / np.asarray(score, np.float64))
 
 
 def histogram_distance(a: F32, b: F32, config: SignatureConfig) -> F64:
-    """d of Eq. 6 between histograms (M, K) and (N, K): (M, N).
+    """Return d of Eq. 6 between histograms (M, K) and (N, K): (M, N).
 
     From the Bhattacharyya coefficient BC = sum sqrt(a b), 1 for equal histograms and 0 without a shared bin:
     sqrt(1 - BC) in [0, 1] or -ln BC in [0, 20], by `config.histogram_distance`.
@@ -217,7 +218,7 @@ def histogram_distance(a: F32, b: F32, config: SignatureConfig) -> F64:
 
 
 def structural_factor(a: F32, b: F32, config: SignatureConfig) -> F64:
-    """Omega of Eq. 7-8 between symmetry scores (M, 2) and (N, 2): (M, N), at least eta^2.
+    """Return omega of Eq. 7-8 between symmetry scores (M, 2) and (N, 2): (M, N), at least eta^2.
 
     Eq. 8 as printed is the reciprocal of an exponential with a negative exponent. That agrees with Eq. 6,
     where the score must grow with the difference of the symmetries: phi = eta exp(+(s_i - s_j)^2 / (2

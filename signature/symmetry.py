@@ -41,7 +41,8 @@ class Axes(NamedTuple):
 
 
 def line_segments(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F64:
-    """Line segments L^S longer than lambda_theta (III-D 1), (N, 4) as column, row of both ends, cells.
+    """Return the line segments L^S longer than lambda_theta (III-D 1), (N, 4) as column, row of both ends,
+    cells.
 
     By OpenCV's probabilistic Hough transform, which starts from the same random seed on every call.
     """
@@ -57,7 +58,7 @@ def line_segments(edges: BoolGrid, resolution_m: float, config: SignatureConfig)
 
 
 def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
-    """The two directions with the most votes (III-D 2); None without segments.
+    """Return the two directions with the most votes (III-D 2); None without segments.
 
     segments : (N, 4) as of `line_segments`. Beta is the best direction at least `config.axis_separation_deg`
     from alpha, or the perpendicular of alpha if no segment has such a direction.
@@ -90,7 +91,7 @@ def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
 
 
 def _mean_direction(peak_deg: int, angles_rad: F64, lengths: F64, config: SignatureConfig) -> float:
-    """Mean direction, radians in [0, pi), of the segments near a peak of the vote.
+    """Return the mean direction, radians in [0, pi), of the segments near a peak of the vote.
 
     It is finer than the degrees of the vote. Near means within two standard deviations of the blur. The
     weights are the squared lengths, which are proportional to the inverse variances of the directions.
@@ -103,7 +104,8 @@ def _mean_direction(peak_deg: int, angles_rad: F64, lengths: F64, config: Signat
 
 
 def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
-    """S^G (H, W): the edge map under a Gaussian, scaled so that a straight line peaks at `symmetry_peak`.
+    """Return S^G (H, W): the edge map under a Gaussian, scaled so that a straight line peaks at
+    `symmetry_peak`.
 
     With `config.symmetry_limited` values above the peak, where lines meet, are cut to it. The paper does not
     do so.
@@ -117,7 +119,7 @@ def blurred(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F3
 
 
 def reflection_score(cells: I64, image: F32, axis_rad: float) -> float:
-    """Eq. 5: mean of the blurred image at the mirror images of the boundary pixels.
+    """Return Eq. 5: the mean of the blurred image at the mirror images of the boundary pixels.
 
     cells : (N, 2) as (row, column); they are mirrored at the line with direction `axis_rad` through the
     centre of the image (H, W). The paper rotates the image until the axis is vertical and flips it. To mirror
@@ -135,7 +137,8 @@ def reflection_score(cells: I64, image: F32, axis_rad: float) -> float:
 
 
 def symmetry_scores(edges: BoolGrid, resolution_m: float, config: SignatureConfig) -> F32:
-    """Both reflection symmetry scores (s^alpha, s^beta), (2,), 0 .. `symmetry_peak` if limited (III-D 3).
+    """Return both reflection symmetry scores (s^alpha, s^beta), (2,), 0 .. `symmetry_peak` if limited (III-D
+    3).
 
     Without any line segment there is no axis, and both are 0.
     """
@@ -148,8 +151,8 @@ def symmetry_scores(edges: BoolGrid, resolution_m: float, config: SignatureConfi
 
 
 def symmetry_seen(ranges_m: F32, ends: NDArray[np.int8]) -> F64:
-    """The symmetry of what is seen from N viewpoints: agreement, 0..1, with its mirror image and with half a
-    turn.
+    """Return the symmetry of what is seen from N viewpoints: agreement, 0..1, with its mirror image and with
+    half a turn.
 
     ranges_m, ends : (N, B) of isovists, B a multiple of 8. Returns (N, Ks). The mirror axes pass through the
     viewpoint, one every half ray. The columns: at the best axis, at those of `BESIDE` beside it (of the two
@@ -175,15 +178,15 @@ def symmetry_seen(ranges_m: F32, ends: NDArray[np.int8]) -> F64:
 
 
 def mirror_agreement(ranges_m: F32, ends: NDArray[np.int8]) -> F64:
-    """(N, B) agreement, 0..1, of the ranges with their mirror image at each axis through the viewpoint; axis
-    k lies pi k / B from the first ray."""
+    """Return the agreement, 0..1, of the ranges with their mirror image at each axis through the viewpoint,
+    (N, B); axis k lies pi k / B from the first ray."""
     rays, seen = np.arange(ranges_m.shape[1]), ends != HIDDEN
     at_each = [_agreement(ranges_m, seen, (axis - rays) % len(rays)) for axis in rays]
     return np.stack(at_each, axis=1)
 
 
 def _agreement(ranges_m: F32, seen: NDArray[np.bool_], partner: NDArray[np.intp]) -> F64:
-    """(N,) mean agreement of each range with that of its partner (B,), where both are known."""
+    """Return the mean agreement (N,) of each range with that of its partner (B,), where both are known."""
     both = seen & seen[:, partner]
     apart = np.abs(ranges_m - ranges_m[:, partner]) / MIRROR_M
     total = (np.maximum(0.0, 1.0 - apart) * both).sum(axis=1)

@@ -7,14 +7,11 @@ counts neither for nor against. A part then has about the histogram of the whole
 rotation, as in the paper. Each stands beside that of a submap, in `signature.boundary`, `signature.freespace`
 and `signature.symmetry`.
 
-What is seen from the places of a map, as it is stored and searched: the three signatures at viewpoints.
-
-A place is a point of the junction graph or of the skeleton, and signatures are compared where a query may
-stand: at viewpoints on a lattice over the free space around the places. A number takes 8 bits: a signature
-is exact to 0.002, which moves the vectors of `signature.weights` by at most a tenth of the standard
-deviation of two views of one place.
-
-A query as retrieval takes it: described at a few places.
+`SeenPlaces` are those of a map, as they are stored and searched. A place is a point of the junction graph or
+of the skeleton, and signatures are compared where a query may stand: at viewpoints on a lattice over the free
+space around the places. A number takes 8 bits: a signature is exact to 0.002, which moves the vectors of
+`signature.weights` by at most a tenth of the standard deviation of two views of one place. `View` is a
+viewpoint of a query.
 """
 
 from __future__ import annotations
@@ -37,7 +34,7 @@ _AT_ONCE = 4096
 
 
 def parts() -> dict[str, slice]:
-    """Which columns of `seen_signatures` belong to which of the three signatures."""
+    """Return which columns of `seen_signatures` belong to which of the three signatures."""
     sizes = {
         "boundary": RANGE_BINS + 1 + sum(len(rim_columns(rim)) for rim in RIMS),
         "freespace": PATH_BINS + DETOUR_BINS + len(STEPS_M) + 1,
@@ -48,12 +45,13 @@ def parts() -> dict[str, slice]:
 
 
 def signature_columns() -> slice:
-    """All columns of the three signatures; the last one, the share of rays that were seen, is left out."""
+    """Return all columns of the three signatures; the last one, the share of rays that were seen, is left
+    out."""
     return slice(0, -1)
 
 
 def seen_signatures(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F32:
-    """The signatures of what was seen, side by side, and the share that was seen: (N, K) float32.
+    """Return the signatures of what was seen, side by side, and the share that was seen: (N, K) float32.
 
     ranges_m, ends : (N, B) of isovists, as of `pc2grid.submaps.submaps.look_around` with `sight_m`, B a
     multiple of 8. The columns of each signature are those of `parts`. Histograms are square roots of shares,
@@ -122,13 +120,14 @@ class SeenPlaces:
 
     @property
     def shares(self) -> F32:
-        """The signatures (K, C) as `signature.visible.seen_signatures` makes them, but for rounding."""
+        """Return the signatures (K, C) as `signature.visible.seen_signatures` makes them, but for
+        rounding."""
         return self.signatures.astype(np.float32) / np.float32(SIGNATURE_UNITS)
 
 
 def viewpoints_of(grid: OccupancyGrid, centers_m: F64) -> tuple[F32, I64]:
-    """The points (K, 2) of the lattice that a robot may stand at near the places (N, 2) of a map, and the
-    nearest place of each (K,), ascending. A place that is too narrow for any is its own viewpoint."""
+    """Return the points (K, 2) of the lattice that a robot may stand at near the places (N, 2) of a map, and
+    the nearest place of each (K,), ascending. A place that is too narrow for any is its own viewpoint."""
     from scipy.spatial import cKDTree
 
     if not len(centers_m):
@@ -151,7 +150,7 @@ def viewpoints_of(grid: OccupancyGrid, centers_m: F64) -> tuple[F32, I64]:
 
 
 def _roomy(grid: OccupancyGrid) -> BoolGrid:
-    """Cells (H, W) with free cells around them."""
+    """Return the cells (H, W) that have free cells around them."""
     n = round(CLEARANCE_M / grid.resolution_m)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * n + 1, 2 * n + 1))
     return np.asarray(cv2.erode(grid.ground.astype(np.uint8), kernel), bool)

@@ -88,13 +88,13 @@ class SeenStatistics:
 
     @staticmethod
     def of(pairs: Pairs, *, seed: int = 0) -> SeenStatistics:
-        """The weights from pairs of which enough was seen, how much a distance says from all; pairs of one
-        recording are side by side."""
+        """Measure the weights from pairs of which enough was seen, and the evidence of a distance from all;
+        pairs of one recording are side by side."""
         return replace(SeenStatistics.without_spreads(pairs), spreads=fitted_spreads(pairs, seed=seed))
 
     @staticmethod
     def without_spreads(pairs: Pairs) -> SeenStatistics:
-        """What the weights are made of, alone."""
+        """Return the moments that the weights are made of, alone."""
         enough = (pairs.queries[:, -1] >= _LEAST_SEEN) & (pairs.same[:, -1] >= _LEAST_SEEN)
         queries, same = (rows[enough][:, signature_columns()].astype(np.float64) for rows in pairs[:2])
         apart = (queries - queries.mean(axis=0)) - (same - same.mean(axis=0))
@@ -109,11 +109,11 @@ class SeenStatistics:
         )
 
     def columns(self, names: Sequence[str] = ()) -> I64:
-        """The columns of the signatures `names`, by default of all."""
+        """Return the columns of the signatures `names`, by default of all."""
         return np.concatenate([np.r_[part] for name, part in parts().items() if not names or name in names])
 
     def spread(self, names: Sequence[str] = ()) -> Spread:
-        """How much the distance by some of the signatures says."""
+        """Return the evidence of the distance by some of the signatures."""
         chosen = tuple(name for name in parts() if not names or name in names)
         a, b, c, d, e, one, two = self.spreads[COMBINATIONS.index(chosen)].tolist()
         return Spread(one_place=(a, b, c), two_places=(d, e), one_shape=one, two_shape=two)
@@ -147,7 +147,8 @@ class SeenWeights:
 
     @staticmethod
     def of(statistics: SeenStatistics, names: Sequence[str] = ()) -> SeenWeights:
-        """The best weights of the signatures `names`, by default of all of `signature.visible.parts`."""
+        """Return the best weights of the signatures `names`, by default of all of
+        `signature.visible.parts`."""
         from scipy.linalg import eigh
 
         columns = statistics.columns(names)
@@ -161,11 +162,11 @@ class SeenWeights:
         return SeenWeights(query_mean=statistics.query_mean, place_mean=statistics.place_mean, matrix=matrix)
 
     def of_queries(self, signatures: F32) -> F32:
-        """Vectors (N, D) of views of queries, given as (N, K)."""
+        """Return vectors (N, D) of views of queries, given as (N, K)."""
         return np.asarray((signatures[:, signature_columns()] - self.query_mean) @ self.matrix, np.float32)
 
     def of_places(self, signatures: F32) -> F32:
-        """Vectors (N, D) of places of maps, given as (N, K)."""
+        """Return vectors (N, D) of places of maps, given as (N, K)."""
         return np.asarray((signatures[:, signature_columns()] - self.place_mean) @ self.matrix, np.float32)
 
 
@@ -175,13 +176,14 @@ learned = functools.cache(SeenStatistics.load)
 
 @functools.cache
 def seen_weights(*names: str) -> SeenWeights:
-    """The weights of all three signatures, or of those named, by the statistics that come with the
+    """Return the weights of all three signatures, or of those named, by the statistics that come with the
     program."""
     return SeenWeights.of(learned(), names)
 
 
 def fitted_spreads(pairs: Pairs, *, seed: int = 0) -> F64:
-    """(7, 7) the numbers of a `Spread` for each of `COMBINATIONS`, by pairs in `_FOLDS` parts, see there."""
+    """Return the numbers of a `Spread` for each of `COMBINATIONS`, (7, 7), by pairs in `_FOLDS` parts, see
+    there."""
     rng, every = np.random.default_rng(seed), np.arange(len(pairs.queries))
     folds = []
     for held in np.array_split(every, _FOLDS):
@@ -199,8 +201,8 @@ def fitted_spreads(pairs: Pairs, *, seed: int = 0) -> F64:
 def squared_distances(
     pairs: Pairs, weights: SeenWeights, rng: np.random.Generator
 ) -> tuple[F64, F64, F64, F64]:
-    """The arguments of `Spread.of`: of pairs at one place, and of as many at two, with a place of another
-    building, and of another pair.
+    """Return the arguments of `Spread.of`: of pairs at one place, and of as many at two, with a place of
+    another building, and of another pair.
 
     Pairs of which one side has seen less than `_TOO_LITTLE` are left out.
     """
@@ -221,7 +223,7 @@ def squared_distances(
 
 @functools.cache
 def seen_spread(*names: str) -> Spread:
-    """How much the distance by the signatures of `seen_weights` says."""
+    """Return the evidence of the distance by the signatures of `seen_weights`."""
     return learned().spread(names)
 
 
@@ -239,7 +241,7 @@ class Spread:
 
     @staticmethod
     def of(one_place: F64, one_hidden: F64, two_places: F64, two_hidden: F64) -> Spread:
-        """From squared distances (N,) and (M,) with the hidden shares u of each.
+        """Return the spread of squared distances (N,) and (M,) with the hidden shares u of each.
 
         The variance of the logarithm of a gamma variable of shape k is about 1 / (k - 1/2).
         """
@@ -259,12 +261,12 @@ class Spread:
         )
 
     def numbers(self) -> tuple[float, ...]:
-        """All seven, in the order of the fields."""
+        """Return all seven, in the order of the fields."""
         return (*self.one_place, *self.two_places, self.one_shape, self.two_shape)
 
     def log_ratio(self, squared: FloatArray, hidden: FloatArray) -> FloatArray:
-        """Natural logarithm of the ratio of the likelihoods of one place and of two, elementwise, as exact as
-        the arguments: float32 takes a quarter of the time.
+        """Return natural logarithm of the ratio of the likelihoods of one place and of two, elementwise, as
+        exact as the arguments: float32 takes a quarter of the time.
 
         squared : D^2. hidden : u, 0..2.
         """

@@ -56,7 +56,8 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
 
 
 def command_pages() -> Iterator[tuple[str, str]]:
-    """Path and text of a page for each command with what `--help` prints of it, and of one that lists all."""
+    """Yield path and text of a page for each command with what `--help` prints of it, and of one that lists
+    all."""
     from typer.main import get_command
 
     from pc2grid_cli.main import app
@@ -84,13 +85,13 @@ def _file(command: str) -> str:
 
 
 def _sentence(text: str) -> str:
-    """The first sentence of a help or of a docstring, behind its usage."""
+    """Return the first sentence of a help or of a docstring, behind its usage."""
     said = next((part for part in text.split("\n\n") if not part.startswith("Usage:")), "")
     return re.split(r"(?<=[.?!])\s", " ".join(said.split()), maxsplit=1)[0]
 
 
 def settings_page() -> str:
-    """What `pc2grid config dump` prints."""
+    """Return the page of what `pc2grid config dump` prints."""
     from pc2grid.settings import dump_settings
     from signature.config import Config
 
@@ -114,7 +115,7 @@ _ABOUT_NEEDED = (
 
 
 def python_pages(package: str) -> Iterator[tuple[str, str]]:
-    """Path and text of a page for each public name of a package, and of one that lists them.
+    """Yield path and text of a page for each public name of a package, and of one that lists them.
 
     What another package has, and what people need, has its page there.
     """
@@ -145,12 +146,12 @@ def _row(package: str, name: str) -> str:
 
 
 def _home(thing: Any, name: str) -> str:
-    """The package whose reference has the page of a public name."""
+    """Return the package whose reference has the page of a public name."""
     return "pc2grid" if name in NEEDED else thing.__module__.split(".")[0]
 
 
 def notebook_page(path: Path) -> str:
-    """A notebook with what its cells have shown."""
+    """Return a notebook with what its cells have shown."""
     parts = []
     for cell in json.loads(path.read_text("utf-8"))["cells"]:
         text = "".join(cell["source"])
@@ -163,7 +164,7 @@ def notebook_page(path: Path) -> str:
 
 
 def _shown(output: dict[str, Any]) -> str:
-    """The richest form of what a cell has shown."""
+    """Return the richest form of what a cell has shown."""
     data = output.get("data", {"text/plain": output.get("text", [])})
     if "text/html" in data:
         return "".join(data["text/html"])
@@ -183,7 +184,7 @@ _BEFORE_INDENTED = re.compile(rf"^(?!{_NAMES} : )(\S.*)\n(?=    )", re.MULTILINE
 
 
 def as_markdown(docstring: str) -> str:
-    """A docstring of this project as Markdown: its examples as code, its parameters as a list."""
+    """Return a docstring of this project as Markdown: its examples as code, its parameters as a list."""
     parts = _EXAMPLE.split(docstring)
     parts[::2] = [_text_as_markdown(text) for text in parts[::2]]
     parts[1::2] = [f"\n```pycon\n{example}\n```" for example in parts[1::2]]
@@ -201,6 +202,6 @@ class Docstrings(griffe.Extension):
     """Rewrites the docstrings that mkdocstrings shows."""
 
     def on_instance(self, *, obj: griffe.Object, **_: Any) -> None:
-        """Of every class, function and attribute."""
+        """Rewrite the docstring of every class, function and attribute."""
         if obj.docstring is not None:
             obj.docstring.value = as_markdown(obj.docstring.value)

@@ -76,7 +76,7 @@ class PoseInSpace:
 
     @property
     def rpy_rad(self) -> tuple[float, float, float]:
-        """Roll, pitch and yaw, radians (REP-103: about the fixed axes x, y, z in this order)."""
+        """Return roll, pitch and yaw, radians (REP-103: about the fixed axes x, y, z in this order)."""
         R = self.T_map_base[:3, :3]
         pitch = math.asin(float(np.clip(-R[2, 0], -1.0, 1.0)))
         return math.atan2(R[2, 1], R[2, 2]), pitch, math.atan2(R[1, 0], R[0, 0])
@@ -258,7 +258,7 @@ class Answer:
         return table if picture is None else table + html_picture(picture, "the query's walls in the map")
 
     def _repr_png_(self) -> bytes | None:
-        """The map, with the walls of the query at the best hypothesis; None without one."""
+        """Return the map, with the walls of the query at the best hypothesis; None without one."""
         if self.map is None:
             return None
         walls_m = self.local_map.to_point(np.argwhere(self.local_map.occupied))
@@ -267,12 +267,12 @@ class Answer:
 
     @property
     def beside_map(self) -> OffMap | None:
-        """Where the robot is, beside the map, if that is more likely than all else together."""
+        """Return where the robot is, beside the map, if that is more likely than all else together."""
         return next((away for away in self.off_map if away.mass >= POSTERIOR.likely), None)
 
     @property
     def line(self) -> AmbiguousLine | None:
-        """The line on which an ambiguous base is likely to be; None: there is none."""
+        """Return the line on which an ambiguous base is likely to be; None: there is none."""
         if self.status != "ambiguous" or not self.masses:
             return None
         firsts = [self.hypotheses[self.places.index(place)] for place in range(len(self.masses))]
@@ -282,21 +282,21 @@ class Answer:
 
     @property
     def label(self) -> Label:
-        """Building and floor of the session it was located in, as far as they are known."""
+        """Return building and floor of the session it was located in, as far as they are known."""
         return Label() if self.status != "located" else self.labels[self.hypotheses[0].session_index]
 
     def frame_of(self, hypothesis: Hypothesis) -> str | None:
-        """The frame of the building that a hypothesis is in; None: the map frame of its session."""
+        """Return the frame of the building that a hypothesis is in; None: the map frame of its session."""
         return self.frames[hypothesis.session_index] if self.frames else None
 
     @property
     def frame(self) -> str | None:
-        """The frame of the building that the pose is in; None: the map frame of the session."""
+        """Return the frame of the building that the pose is in; None: the map frame of the session."""
         return self.frame_of(self.hypotheses[0]) if self.status == "located" else None
 
     @property
     def stamped_pose(self) -> dict[str, Any] | None:
-        """The pose of the base as plain types; None unless it is located."""
+        """Return the pose of the base as plain types; None unless it is located."""
         if self.T_map_base is None or self.covariance is None:
             return None
         pose = _planar(self.T_map_base)
@@ -304,7 +304,7 @@ class Answer:
 
     @property
     def off_map_pose(self) -> dict[str, Any] | None:
-        """Where the base is beside the map, as plain types; None if it is not most likely there."""
+        """Return where the base is beside the map, as plain types; None if it is not most likely there."""
         away = self.beside_map
         if away is None:
             return None

@@ -47,7 +47,7 @@ class Console:
         self.compiling = False
 
     def note(self, message: str, *, level: int = 0) -> None:
-        """A line for the user, unless -q is given; one of level 1 is only printed with -v."""
+        """Print a line for the user, unless -q is given; one of level 1 only with -v."""
         if not self.quiet and self.verbose >= level:
             print(f"pc2grid: {message}", file=sys.stderr)
 
@@ -85,7 +85,7 @@ class Console:
             self.note(_COMPILING)
 
     def observer(self) -> ConsoleObserver:
-        """Shows the news of some work on this console."""
+        """Return an observer that shows the news of some work on this console."""
         return ConsoleObserver(self)
 
     def report_error(self, error: BaseException) -> int:
@@ -129,7 +129,8 @@ class Console:
         return code
 
     def _ended_by(self, error: BaseException, signal_number: int | None) -> int:
-        """The exit code of a command that ended by an error or a signal; what is to be said is printed."""
+        """Return the exit code of a command that ended by an error or a signal, after printing what is to be
+        said."""
         if isinstance(error, KeyboardInterrupt) or signal_number == signal.SIGINT:
             print("pc2grid: interrupted: each file is complete, or as it was before", file=sys.stderr)
             return INTERRUPTED
@@ -157,7 +158,7 @@ def _leave(code: int) -> None:
 
 
 def of(context: typer.Context) -> Console:
-    """The console of the run that a command belongs to."""
+    """Return the console of the run that a command belongs to."""
     return context.ensure_object(Console)
 
 
@@ -172,7 +173,7 @@ def print_result(result: Any, indent: int | None = 1) -> None:
 
 
 def json_text(document: Any, indent: int | None = 1) -> str:
-    """A document as JSON. JSON has no NaN and no infinity: such a value becomes null."""
+    """Return a document as JSON. JSON has no NaN and no infinity: such a value becomes null."""
     return json.dumps(_finite(document), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
@@ -195,7 +196,7 @@ class ConsoleObserver(Observer):
 
     @contextlib.contextmanager
     def step(self, what: str, recorded_s: float | None = None) -> Iterator[None]:
-        """Shows the progress of a step."""
+        """Show the progress of a step."""
         with self._console.progress(what, recorded_s) as self._update, _compiling_noted(self._console):
             yield
         self._update = None
@@ -224,14 +225,15 @@ def _compiling_noted(console: Console) -> Iterator[None]:
             console.compiling_begins()
 
         def on_end(self, event: Any) -> None:
-            """Nothing more is said."""
+            """Do nothing."""
 
     with event.install_listener("numba:compile", Note()):
         yield
 
 
 def _pace(task: Task, recorded_s: float | None) -> str:
-    """How fast the work goes, and how long the rest takes at that pace; nothing while that is not known.
+    """Return how fast the work goes, and how long the rest takes at that pace; nothing while that is not
+    known.
 
     The pace is that of the last half minute, as rich measures it. It begins with the first share reported,
     because the preparations before are not part of it.
@@ -243,7 +245,7 @@ def _pace(task: Task, recorded_s: float | None) -> str:
 
 
 def _pipe_closed() -> int:
-    """The exit code after the reader of our output has closed it, as of any other program in a pipe.
+    """Return the exit code after the reader of our output has closed it, as of any other program in a pipe.
 
     Nothing is printed. The code is not 0, because the rest of the output (of `db check`) was not read.
     """
@@ -290,7 +292,7 @@ class _StopSignal:
         raise SystemExit(128 + number)
 
     def _dropped(self, unraisable: Any) -> None:
-        """What Python calls (`sys.unraisablehook`) for an exception that it cannot raise further."""
+        """Send the signal again if Python could not raise its exception further (`sys.unraisablehook`)."""
         if self.number is None or not isinstance(unraisable.exc_value, KeyboardInterrupt | SystemExit):
             self._report(unraisable)
             return

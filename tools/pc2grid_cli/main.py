@@ -115,7 +115,9 @@ class LateCommand(TyperCommand):
     """A command that is known by its name and one sentence until it is used."""
 
     def __init__(self, name: str, sentence: str, declaration: str, work: str = "") -> None:
-        """declaration : "package.module:name". work : see `_callback`; empty: the declaration is a function.
+        """Name a command without importing it.
+
+        declaration : "package.module:name". work : see `_callback`; empty: the declaration is a function.
 
         sentence : for lists of commands.
         """
@@ -124,7 +126,7 @@ class LateCommand(TyperCommand):
 
     @cached_property
     def command(self) -> Any:
-        """The command itself."""
+        """Return the command itself."""
         try:
             declared = pkgutil.resolve_name(self._declaration)
         except ModuleNotFoundError as error:
@@ -256,7 +258,7 @@ of a laser."""
 
 
 def main() -> None:
-    """Entry point of the console script."""
+    """Run the program: the entry point of the console script."""
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for them in all packages
     libraries.use_one()
     # Imports make more than 100,000 objects, which stay. Python's collector of cycles would walk through them

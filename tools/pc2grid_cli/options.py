@@ -72,7 +72,7 @@ class Part:
 
     @property
     def span(self) -> TimeSpan:
-        """The part between `start` and `duration` later."""
+        """Return the part between `start` and `duration` later."""
         return TimeSpan(self.start, self.duration)
 
 

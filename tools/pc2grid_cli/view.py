@@ -167,7 +167,7 @@ class Locator:
 
     @cached_property
     def _index(self) -> MapIndex:
-        """The maps, prepared once for all recordings."""
+        """Return the maps, prepared once for all recordings."""
         return MapIndex.of(self._database, query_config(self._database, self._settings))
 
 
@@ -237,7 +237,7 @@ class Events:
 
     @property
     def looking_on(self) -> int:
-        """The number of pages that get the events."""
+        """Return the number of pages that get the events."""
         return len(self._pages)
 
     def publish(self, kind: str, data: Any) -> None:
@@ -258,7 +258,7 @@ class Events:
 
     @contextlib.contextmanager
     def subscribed(self) -> Iterator[queue.Queue[bytes | None]]:
-        """What was, then the events as they come, then None at the end."""
+        """Yield what was, then the events as they come, then None at the end."""
         page: queue.Queue[bytes | None] = queue.Queue(_MOST_WAITING)
         with self._lock:
             for kind, event in self._last.items():
@@ -387,7 +387,10 @@ class ViewServer(http.server.ThreadingHTTPServer):
     allow_reuse_address = True
 
     def __init__(self, port: int, events: Events, folder: Path, work: Work, *, most_bytes: int) -> None:
-        """port : 0 for any that is free. Raises OSError if the port is taken."""
+        """Listen on this machine alone.
+
+        port : 0 for any that is free. Raises OSError if the port is taken.
+        """
         super().__init__((_ADDRESS, port), _Handler)
         self.token = secrets.token_urlsafe(16)
         self.pages: dict[str, bytes] = {}
@@ -397,7 +400,7 @@ class ViewServer(http.server.ThreadingHTTPServer):
 
     @property
     def url(self) -> str:
-        """The address of the first page."""
+        """Return the address of the first page."""
         return f"http://{_ADDRESS}:{self.server_port}/{self.token}/"
 
     def serve_forever(self, poll_interval: float = _POLL_S) -> None:

@@ -93,7 +93,7 @@ class Following:
 
     @property
     def index(self) -> MapIndex:
-        """The maps, prepared for searches."""
+        """Return the maps, prepared for searches."""
         return MapIndex.of(self.database, self.config, self.terminal.observer())
 
     def run(self, searcher: Any, use: Callable[[EstimateT, threading.Lock], bool]) -> None:
@@ -376,7 +376,7 @@ class WholeRecording:
 
     @property
     def believed(self) -> MapPose | None:
-        """The newest pose that was recorded before the last scan."""
+        """Return the newest pose that was recorded before the last scan."""
         if self._pose is None:
             return None
         while self._next is not None and self._next.log_time_ns <= self._log.last_scan_ns:

@@ -132,7 +132,7 @@ def compare_peers_command(
         bool, typer.Option("--of-base", help="the true poses are of the base, not of the sensor")
     ] = False,
 ) -> None:
-    """Other programs and pc2grid locate later parts of real recordings in maps of earlier parts.
+    """Locate later parts of real recordings in maps of earlier parts, by pc2grid and by other programs.
 
     MRPT's particle filter gets recordings of a laser; KISS-Matcher, MapClosures and Open3D's FPFH + RANSAC
     those of a lidar. Each query is also located in another building, where every answer is wrong.

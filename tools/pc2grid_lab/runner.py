@@ -153,7 +153,7 @@ class Finished:
 
     @property
     def failed(self) -> bool:
-        """Whether there is no result."""
+        """Return whether there is no result."""
         return self.code not in _ANSWERED or self.document is None
 
 

@@ -105,7 +105,7 @@ class RegisteredSession:
         return replace(self, **{name: getattr(self, name)[:count] for name in names})
 
     def scans(self) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
-        """Return each scan (without its points) and its planar scan, in order of time."""
+        """Yield each scan (without its points) and its planar scan, in order of time."""
         no_points = np.empty((0, 3), np.float32)
         for planar_scan, pose, lost in zip(self.planar_scans, self.T_odom_base, self.lost, strict=True):
             scan = Scan(
@@ -204,7 +204,7 @@ class PlanDrives:
 
     @property
     def mapping(self) -> SimulationConfig:
-        """The configuration of the drive that makes a map."""
+        """Return the configuration of the drive that makes a map."""
         return self.simulation(dict(self.setting)["map_length"], MAP_SEED)
 
     def map(self, plan: Path, sensor: SensorKind) -> PlanMap:

@@ -1,29 +1,22 @@
-"""Which pose belongs to a scan, how poses differ, and how frames lie to each other by poses known in both.
+"""The truth about trajectories and answers.
 
-The absolute error of a trajectory (ATE).
-
-Sturm et al., "A benchmark for the evaluation of RGB-D SLAM systems" (2012); computed as evo does, with
-alignment and without scale.
-
-The SLAM benchmark's measure of a trajectory, which needs neither a map nor a reference frame.
-
-Kuemmerle et al., "On measuring the accuracy of SLAM algorithms" (2009), section III: the relative poses
-of a trajectory between chosen pairs of times are compared with relative poses that people have verified.
-
-Answers to one drive judge each other: they lie on one rigid transform of the drive's own trajectory.
-
-Where nobody knows how a recording and a map lie to each other, every right answer still says the same about
-it: the pose in the map, and the pose in the recording's own trajectory, differ by one rigid transform. Wrong
-answers scatter. The transform that most answers agree with is taken for the truth, if at least three agree
-and no other transform has half as many. Neither map nor trajectory is rigid over a whole building, so what
-agrees may differ by a share of the distance between the two places, and an answer is judged by the others
-around it, never by itself.
-
-How two recordings of one room lie to each other, by their clouds: a truth that no answer has a part in.
-
-Each recording is one cloud along its own trajectory. The clouds are level, and stand on one floor, so that
-only a heading and a shift in the plane are searched for; the best few are refined in space by Open3D's
-point-to-plane ICP. The best is the truth if no other place has nearly as many points on surfaces.
+- Poses that belong to a stamp, the difference of two poses, and the transform of two frames by poses that are
+  known in both.
+- The absolute error of a trajectory (ATE): Sturm et al., "A benchmark for the evaluation of RGB-D SLAM
+  systems" (2012); computed as evo does, with alignment and without scale.
+- The SLAM benchmark's error of a trajectory, which needs neither a map nor a reference frame: Kuemmerle et
+  al., "On measuring the accuracy of SLAM algorithms" (2009), section III. The relative poses of a trajectory
+  between chosen pairs of times are compared with relative poses that people have verified.
+- Answers to one drive judge each other. Where nobody knows how a recording and a map lie to each other, every
+  right answer still gives the same transform: that between the pose in the map and the pose in the
+  recording's own trajectory. Wrong answers scatter. The transform that most answers agree with is taken for
+  the truth, if at least three agree and no other transform has half as many. Neither map nor trajectory is
+  rigid over a whole building, so what agrees may differ by a share of the distance between the two places,
+  and an answer is judged by the others around it, never by itself.
+- The transform of two recordings of one room by their clouds, in which no answer has a part. Each recording
+  is one cloud along its own trajectory. The clouds are level, and stand on one floor, so that only a heading
+  and a shift in the plane are searched for; the best few are refined in space by Open3D's point-to-plane ICP.
+  The best is the truth if no other place has nearly as many points on surfaces.
 """
 
 from __future__ import annotations
@@ -72,8 +65,8 @@ AHEAD_M = 3.0
 
 
 def nearest(stamps_ns: I64, wanted_ns: I64, within_ns: float = SAME_NS) -> I64:
-    """(N,) numbers of the stamps (M,), increasing, that are nearest to the wanted ones (N,); -1 where none is
-    so near."""
+    """Return the numbers (N,) of the stamps (M,), increasing, that are nearest to the wanted ones (N,); -1
+    where none is so near."""
     if not len(stamps_ns):
         return np.full(len(wanted_ns), -1)
     after = np.searchsorted(stamps_ns, wanted_ns).clip(max=len(stamps_ns) - 1)
@@ -84,8 +77,8 @@ def nearest(stamps_ns: I64, wanted_ns: I64, within_ns: float = SAME_NS) -> I64:
 
 
 def pose_at(trajectory: Trajectory, stamp_ns: int, *, same_ns: float, gap_ns: float) -> F64 | None:
-    """T_session_base (4, 4) at a stamp: the pose whose stamp differs by no more than `same_ns`, else between
-    two poses no more than `gap_ns` apart; None if there are none."""
+    """Return t_session_base (4, 4) at a stamp: the pose whose stamp differs by no more than `same_ns`, else
+    between two poses no more than `gap_ns` apart; None if there are none."""
     stamps_ns, poses = trajectory.stamps_ns, trajectory.T_session_base
     number = int(nearest(stamps_ns, np.array([stamp_ns]), same_ns)[0])
     if number >= 0:
@@ -100,13 +93,13 @@ def pose_at(trajectory: Trajectory, stamp_ns: int, *, same_ns: float, gap_ns: fl
 
 
 def apart(a: SE2, b: SE2) -> tuple[float, float]:
-    """Metres and radians between two poses in one frame."""
+    """Return metres and radians between two poses in one frame."""
     error = a.inverse() @ b
     return math.hypot(error.x, error.y), abs(float(wrap_angle(error.yaw)))
 
 
 def fit_frame(pairs: Sequence[tuple[SE2, SE2]], ahead_m: float) -> SE2:
-    """T_b_a that brings poses in a frame a nearest to the same poses in a frame b, least squares.
+    """Return t_b_a that brings poses in a frame a nearest to the same poses in a frame b, least squares.
 
     pairs : of poses in a and in b. ahead_m : a heading counts as much as the position of a point so far
         ahead.
@@ -132,7 +125,7 @@ class TrajectoryError:
 
 
 def trajectory_error(estimated: Trajectory, truth: Trajectory) -> TrajectoryError | None:
-    """The error of a trajectory with respect to the truth, which is interpolated at its stamps.
+    """Return the error of a trajectory with respect to the truth, which is interpolated at its stamps.
 
     None if fewer than three poses have a true pose.
     """
@@ -208,7 +201,7 @@ def relation_error(
     *,
     base_to_reference_m: tuple[float, float] = (0.0, 0.0),
 ) -> RelationError:
-    """The errors of a trajectory with respect to the relations.
+    """Return the errors of a trajectory with respect to the relations.
 
     base_to_reference_m : position on the base of the point that the relations describe (the benchmark's poses
         are those of the laser, not of the base).
@@ -235,7 +228,7 @@ def relation_error(
 
 
 def _relative(a: F64, b: F64) -> F64:
-    """T_a_b (N, 3) of poses (N, 3) in one frame."""
+    """Return t_a_b (N, 3) of poses (N, 3) in one frame."""
     c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
     dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
     return np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]))
@@ -278,7 +271,7 @@ class Clue:
 
     @property
     def T_map_drive(self) -> SE2:
-        """The transform that it says."""
+        """Return the transform that the clue stands for."""
         return self.T_map_base @ self.T_drive_base.inverse()
 
 
@@ -294,7 +287,8 @@ class Frame:
     within_m: float = JUDGEMENT.right_recorded_m
 
     def place(self, T_drive_base: SE2, *, without: tuple[str, int] | None = None) -> tuple[SE2, float]:
-        """Where a pose of the recording is in the map, and how far from there a right answer may be, metres.
+        """Return where a pose of the recording is in the map, and how far from there a right answer may be,
+        metres.
 
         By the clues around it, or by the nearest ones, leaving out that of one query.
         """
@@ -308,7 +302,8 @@ class Frame:
 
 
 def agreed_frame(clues: Sequence[Clue]) -> Frame | None:
-    """The transform that most answers say, as those that say it; None if that does not tell the truth.
+    """Return the transform that most answers agree on, with those that do; None if that does not settle the
+    truth.
 
     clues : the best place of every answer, sure or not.
     """
@@ -326,13 +321,13 @@ def agreed_frame(clues: Sequence[Clue]) -> Frame | None:
 
 
 def is_right(T_map_base: SE2, expected: SE2, within_m: float) -> tuple[bool, float]:
-    """Whether an answer is right, and how far it is from the expected pose, metres."""
+    """Return whether an answer is right, and how far it is from the expected pose, metres."""
     apart_m, apart_rad = apart(expected, T_map_base)
     return apart_m <= within_m and apart_rad <= JUDGEMENT.right_rad, apart_m
 
 
 def _agreement(clues: Sequence[Clue]) -> NDArray[np.bool_]:
-    """(N, N) whether two clues say the same transform, as exactly as their distance lets expect."""
+    """Return whether two clues agree on the transform, as exactly as their distance allows, (N, N)."""
     agree = np.eye(len(clues), dtype=bool)
     for i, a in enumerate(clues):
         for j, b in enumerate(clues[:i]):
@@ -345,7 +340,7 @@ def _agreement(clues: Sequence[Clue]) -> NDArray[np.bool_]:
 
 
 def _heaviest(agree: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """The clues that agree with the one whose agreeing clues weigh most; of equals, the first."""
+    """Return the clues that agree with the one whose agreeing clues weigh most; of equals, the first."""
     if not len(weights):
         return np.zeros(0, bool)
     best: NDArray[np.bool_] = agree[int(np.argmax(agree @ weights))]
@@ -353,7 +348,7 @@ def _heaviest(agree: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray
 
 
 def _places(clues: Sequence[Clue]) -> int:
-    """How many different places the robot was at."""
+    """Return the number of different places the robot was at."""
     kept: list[SE2] = []
     for clue in clues:
         if all(_apart_m(clue.T_drive_base, other) >= AGREEMENT.place_m for other in kept):
@@ -362,7 +357,7 @@ def _places(clues: Sequence[Clue]) -> int:
 
 
 def _fit(clues: Sequence[Clue]) -> SE2:
-    """The transform nearest to what the clues say, least squares."""
+    """Return the transform nearest to the clues, least squares."""
     return fit_frame([(clue.T_drive_base, clue.T_map_base) for clue in clues], AGREEMENT.lever_m)
 
 
@@ -399,7 +394,7 @@ REGISTERED_CLOUDS = RegisteredCloudsParameters()
 
 
 def cloud_along(log: Log, trajectory: Trajectory, p: RegisteredCloudsParameters = REGISTERED_CLOUDS) -> F64:
-    """The points (N, 3) of a recording, thinned, in the frame of its trajectory."""
+    """Return the points (N, 3) of a recording, thinned, in the frame of its trajectory."""
     cloud = VoxelCloud(p.voxel_m)
     for number, scan in enumerate(log.scans()):
         k = int(np.searchsorted(trajectory.stamps_ns, scan.stamp_ns))
@@ -414,7 +409,7 @@ def cloud_along(log: Log, trajectory: Trajectory, p: RegisteredCloudsParameters 
 def registered_clouds(
     source: F64, target: F64, p: RegisteredCloudsParameters = REGISTERED_CLOUDS
 ) -> SE2 | None:
-    """T_target_source of two clouds (N, 3) and (M, 3) of one room, z up; None if it is not clear.
+    """Return t_target_source of two clouds (N, 3) and (M, 3) of one room, z up; None if it is not clear.
 
     Neither cloud is preferred: each is registered to the other one, as one of the two ways may end beside the
     place, and a place counts by the points on surfaces of both (geometric mean).
@@ -434,7 +429,7 @@ def registered_clouds(
 
 
 def _refined(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F64]:
-    """The poses (4, 4) at which a search ends, refined."""
+    """Refine the poses (4, 4) at which a search ends."""
     steps = o3d.pipelines.registration
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
     clouds[1].estimate_normals()
@@ -448,7 +443,8 @@ def _refined(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F6
 
 
 def _starts(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F64]:
-    """The poses (4, 4) of a grid at which most points of the source are near the target, best first."""
+    """Return the poses (4, 4) of a grid at which most points of the source are near the target, best
+    first."""
     tree = cKDTree(target)
     few = source[random_subset(len(source), p.points)]
     (x0, y0), (x1, y1) = (_middle(points) for points in (source, target))
@@ -469,13 +465,13 @@ def _starts(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F64
 
 
 def _middle(points: F64) -> tuple[float, float]:
-    """The middle of the ground that points (N, 3) lie on."""
+    """Return the middle of the ground that points (N, 3) lie on."""
     x, y = (0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))).tolist()
     return x, y
 
 
 def _lifted(pose: SE2, floors_m: list[float]) -> F64:
-    """A planar pose in space, that brings one floor onto the other."""
+    """Return a planar pose in space, that brings one floor onto the other."""
     T = pose.lift()
     T[2, 3] = floors_m[1] - floors_m[0]
     return T

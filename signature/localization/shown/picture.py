@@ -69,12 +69,12 @@ class _Box:
 
     @property
     def width_m(self) -> float:
-        """In x."""
+        """Return the width, in x."""
         return self.right - self.left
 
     @property
     def height_m(self) -> float:
-        """In y."""
+        """Return the height, in y."""
         return self.top - self.bottom
 
     def with_ratio(self, height_by_width: float) -> _Box:

@@ -71,16 +71,16 @@ class Known:
 
     @property
     def right(self) -> bool:
-        """Whether the best place is where the query truly was."""
+        """Return whether the best place is where the query truly was."""
         return self.first == 0
 
     def probability(self, p: PosteriorParameters) -> float:
-        """Mass of the best place."""
+        """Return the mass of the best place."""
         return float(masses(self.places, p=p)[0]) if self.places else 0.0
 
 
 def known_of(rows: Iterable[dict[str, Any]]) -> Iterator[Known]:
-    """Answers to real logs, without those to queries whose true pose is not known."""
+    """Yield the answers to real logs, without those to queries whose true pose is not known."""
     for row in rows:
         errors, own, blanked = row["errors"], row["log"] == row["map"], row["place"] == "blanked"
         beside = blanked and any(error_m < NEAR_M for error_m, _ in errors)
@@ -100,12 +100,13 @@ P = TypeVar("P")
 
 
 def is_right(error: Sequence[float]) -> bool:
-    """Whether a place is right, by metres and radians from the truth."""
+    """Return whether a place is right, by metres and radians from the truth."""
     return error[0] <= RIGHT_M and error[1] <= RIGHT_RAD
 
 
 def fit(answers: Sequence[Known]) -> PosteriorParameters:
-    """The parameters bias, fit and lead under which the truth is likeliest; only the bias may be negative.
+    """Fit the parameters bias, fit and lead under which the truth is likeliest; only the bias may be
+    negative.
 
     Raises ValueError unless there are both queries whose place was found and others.
     """
@@ -147,7 +148,7 @@ class _Likelihood:
         return _Likelihood(terms, first)
 
     def of_truth(self, x: F64) -> F64:
-        """(N,) probability of what is true, by bias, fit and lead."""
+        """Return the probability (N,) of what is true, by bias, fit and lead."""
         given = np.isfinite(self.terms[:, :, 0])
         z = np.where(given, np.nan_to_num(self.terms, posinf=0.0) @ x, -700.0)
         odds = np.exp(np.clip(z, -700.0, 300.0))
@@ -170,7 +171,7 @@ def left_out(queries: Sequence[Q], fit: Callable[[Sequence[Q]], P]) -> list[P]:
 
 
 def log_loss(answers: Sequence[Known], probabilities: F64) -> float:
-    """Mean negative logarithm of the probability (N,) of what is true."""
+    """Return the mean negative logarithm of the probability (N,) of what is true."""
     right = np.array([answer.right for answer in answers])
     return float(-np.log(np.clip(np.where(right, probabilities, 1.0 - probabilities), 1e-4, 1.0)).mean())
 
@@ -213,17 +214,17 @@ class Compared:
     right: frozenset[int]
 
     def masses(self, x: F64) -> F64:
-        """(P,) by the parameters on, through, before and left."""
+        """Return the masses (P,) by the parameters on, through, before and left."""
         return masses_in_space(self.in_plane, self.terms @ x)[0]
 
     def of_truth(self, x: F64) -> float:
-        """The probability of what is true."""
+        """Return the probability of what is true."""
         masses = self.masses(x)
         return float(masses[min(self.right)] if self.right else max(1.0 - masses.sum(), 0.0))
 
 
 def compared_of(rows: Iterable[dict[str, Any]]) -> Iterator[Compared]:
-    """The queries whose places were compared in space, each once in a map."""
+    """Yield the queries whose places were compared in space, each once in a map."""
     compared = (row for row in rows if row.get("in_space"))
     # Two maps of one building have one name, but other evidence.
     once = {(row["start"], row["map"], str(row["evidence"])): row for row in compared}
@@ -242,7 +243,7 @@ def compared_of(rows: Iterable[dict[str, Any]]) -> Iterator[Compared]:
 
 
 def fit_in_space(queries: Sequence[Compared]) -> F64:
-    """(4,) the parameters under which the truth is likeliest."""
+    """Fit the parameters (4,) under which the truth is likeliest."""
     weights = balanced(np.array([bool(q.right) for q in queries]))
 
     def loss(x: F64) -> float:
@@ -254,7 +255,7 @@ def fit_in_space(queries: Sequence[Compared]) -> F64:
 
 
 def shuffled(queries: Sequence[Compared]) -> list[Compared]:
-    """The control that must fail: each place gets what the points tell for a place drawn at random."""
+    """Return the control that must fail: each place gets the rays of a place drawn at random."""
     rng = np.random.default_rng(0)
     every = np.concatenate([q.terms for q in queries])
     every = every[np.isfinite(every).all(axis=1)]

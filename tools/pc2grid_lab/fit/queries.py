@@ -1,28 +1,21 @@
-"""Queries of which the true place is known, and pairs of descriptions of one place.
-
-The weights of the signatures are learned from them.
-
-The map of a real log is drawn at the poses of the ground truth, so that mapping has no part in it; the
-queries are its later parts, registered as a user's would be. DATA holds `laser/NAME.mcap` and
-`laser/NAME_corrected.tum`.
-
-The windows of `pc2grid compare recordings`, asked once more: what tells for each place that is found.
+"""Queries of which the true place is known: the evidence for their places, and the weights of the signatures.
 
     python -m pc2grid_lab.fit.queries evidence DATA WORK OUT.json [--only PATTERN] [--everywhere]
 
-DATA is the folder of recordings, WORK the one in which `compare recordings` has kept its maps and answers.
-Each window is asked in its map and in that of another building, with --everywhere in all of these;
-where the map knows its place, also with all that it sees there made unknown ("blanked"), and standing, by its
-last scan alone. Where both have points, the likeliest places are compared in space, too. `posterior` is
-fitted to them.
+asks the windows of `pc2grid compare recordings` once more. DATA is the folder of recordings, WORK the one in
+which `compare recordings` has kept its maps and answers. Each window is asked in its map and in that of
+another building, with --everywhere in all of these; where the map knows its place, also with all that it sees
+there made unknown ("blanked"), and standing, by its last scan alone. Where both have points, the likeliest
+places are compared in space, too. `posterior` is fitted to them.
 
     python -m pc2grid_lab.fit.queries weights DATA WORK OUT.npz [--without BUILDING]
 
 learns the weights of the signatures. Pairs of views and of the same points of a map are of two kinds: later
-parts of a log in the map of its first part, drawn at true poses, and the windows of `compare recordings` in
-the map of another day, whose places WORK knows. Other places are those of these maps, of drawn maps
-(`maps/NAME.yaml`), and of office floors. --without leaves a building out, so that what has been learned can
-be judged there.
+parts of a log in the map of its first part, and the windows of `compare recordings` in the map of another
+day, whose places WORK knows. The map of a log is drawn at its true poses, so that mapping has no part in it;
+its later parts are registered as a user's would be (`laser/NAME.mcap`, `laser/NAME_corrected.tum` of DATA).
+Other places are those of these maps, of drawn maps (`maps/NAME.yaml`), and of office floors. --without leaves
+a building out, so that what has been learned can be judged there.
 """
 
 from __future__ import annotations
@@ -80,7 +73,8 @@ _WALL_M = 0.4
 
 
 def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
-    """An office floor of 36 x 26 to 59 x 39 m, with things standing about, as a map that knows everything."""
+    """Return an office floor of 36 x 26 to 59 x 39 m, with things standing about, as a map that knows
+    everything."""
     rng = np.random.default_rng(seed)
     plan = office_floorplan(seed, float(rng.integers(36, 60)), float(rng.integers(26, 40)))
     things = place_clutter(plan, clutter, rng, robot_m=0.35)
@@ -90,7 +84,7 @@ def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
 
 
 def queries_of(session: RegisteredSession, config: Config) -> Iterator[tuple[QueryMap, SE2]]:
-    """The query after each of `TRAVELS_M`: what has been seen, and its true frame in the plan.
+    """Yield the query after each of `TRAVELS_M`: what has been seen, and its true frame in the plan.
 
     Without those whose true pose is not known.
     """
@@ -113,7 +107,7 @@ Drawn = tuple[OccupancyGrid, list[RegisteredSession]]
 
 
 def read(data: Path, name: str, queries: int, kept: Path, config: Config) -> Drawn:
-    """The map of the first part of a log, and its later parts as registered queries; `kept` has them."""
+    """Read the map of the first part of a log, and its later parts as registered queries; `kept` has them."""
     log = data / "laser" / f"{name}.mcap"
     travel_m, mapped_s = TRAVELS_M[-1] + 2.0, MAPPED_S[name]
     site = recorded_site(log, kept / name, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s)
@@ -130,7 +124,7 @@ def pairs_of(
     floors: Sequence[OccupancyGrid],
     config: Config,
 ) -> Pairs:
-    """Views of queries, and what the maps show at the same points.
+    """Return views of queries, and what the maps show at the same points.
 
     floors : maps of other buildings, taken at their viewpoints.
     """
@@ -188,7 +182,7 @@ class Window:
 
 
 def windows(catalogue: Catalogue, folder: Folder) -> Iterator[Window]:
-    """Every window whose place is known, or that is of another building."""
+    """Yield every window whose place is known, or that is of another building."""
     judge = Judge(catalogue, folder)
     for pair in catalogue.pairs:
         recording = catalogue.recordings[pair.query]
@@ -211,7 +205,7 @@ def windows(catalogue: Catalogue, folder: Folder) -> Iterator[Window]:
 def rows(
     window: Window, index: MapIndex, others: Mapping[str, MapIndex], catalogue: Catalogue
 ) -> Iterator[dict[str, Any]]:
-    """What tells for the places of a window, asked in its map and in those of other buildings, by name."""
+    """Yield the evidence of the places of a window, in its map and in those of other buildings, by name."""
     building = {name: r.building for name, r in catalogue.recordings.items()}
     row = {
         "log": building[window.pair.query],
@@ -248,7 +242,7 @@ def _asked(
 def _in_space(
     index: MapIndex, query: QueryInSpace, place: Hypothesis, truth: Mapping[str, SE2]
 ) -> dict[str, Any] | None:
-    """What the points tell for a place, and how far it is then from the truth; None: nothing."""
+    """Return the evidence of the points for a place, and how far it is then from the truth; None: nothing."""
     assert query.T_odom_base is not None
     fit = fit_in_space(query, index.surface(place.session_index), place)
     if fit == "unknown":
@@ -261,7 +255,8 @@ def _in_space(
 def error_of(
     index: MapIndex, query: QueryMap, place: Hypothesis, truth: Mapping[str, SE2]
 ) -> tuple[float, float]:
-    """Metres and radians of a place from the truth, of which there is none in the sessions without a pose."""
+    """Return metres and radians of a place from the truth, of which there is none in the sessions without a
+    pose."""
     return _error(index, place.session_index, place.fit.T_map_query @ query.T_odom_base, truth)
 
 
@@ -273,7 +268,7 @@ def _error(
 
 
 def _blanked(index: MapIndex, window: Window) -> MapIndex:
-    """The index with all that the window sees made unknown."""
+    """Return the index with all that the window sees made unknown."""
     query, grids = window.whole, dict(zip(index.sessions, index.grids, strict=True))
     for name, T_map_base in window.truth.items():
         grids[name] = unseen_by(query, grids[name], T_map_base @ query.T_odom_base.inverse())
@@ -281,7 +276,7 @@ def _blanked(index: MapIndex, window: Window) -> MapIndex:
 
 
 def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:
-    """A map in which all that a query has seen, placed at a pose, is made unknown."""
+    """Return a map in which all that a query has seen, placed at a pose, is made unknown."""
     n = math.ceil(_WALL_M / grid.resolution_m)
     known = (query.grid.cells != UNKNOWN).astype(np.uint8)
     known = cv2.dilate(known, np.ones((2 * n + 1, 2 * n + 1), np.uint8))
@@ -296,7 +291,7 @@ def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> Occupan
 
 @functools.cache
 def index_of(database: Path) -> MapIndex:
-    """The maps of a database, which stays open: they are read when they are first used."""
+    """Return the maps of a database, which stays open: they are read when they are first used."""
     opened = open_database(database)
     return MapIndex.of(opened, opened.config())
 
@@ -309,7 +304,7 @@ _FIRST_FLOOR, _FLOORS = 30_010, 10
 
 
 def in_logs(logs: Mapping[str, Drawn], config: Config) -> Iterator[Asked]:
-    """The later parts of logs in the maps of their first parts."""
+    """Yield the later parts of logs in the maps of their first parts."""
     for grid, driven in logs.values():
         for session in driven:
             for query, T_map_query in queries_of(session, config):
@@ -317,8 +312,8 @@ def in_logs(logs: Mapping[str, Drawn], config: Config) -> Iterator[Asked]:
 
 
 def in_maps(known: Iterable[Window], folder: Folder) -> Iterator[Asked]:
-    """Windows of recordings, each in the session of its map that shows its place; one is in memory at a time,
-    as those of a lidar hold its points."""
+    """Yield windows of recordings, each in the session of its map that shows its place; one is in memory at a
+    time, as those of a lidar hold its points."""
     for window in known:
         if window.covered:
             index = index_of(folder.map(window.pair.map_name))

@@ -1,11 +1,9 @@
-"""The paper's experiment: queries cut from the map, matched against its submaps (paper IV-B).
+"""The paper's experiment (IV-B): queries cut from the map, with noise, matched against its submaps.
 
-Noise of the paper's experiments: mapping errors at walls, and objects in the free space (paper IV-B).
-
-The paper gives the counts and Figure 8, not the sizes. These were chosen before any result was known, and are
-not tuned: a person or a chair is half a metre wide, a speckle spreads over two cells of 0.05 m.
-
-What a method of the comparison does: describe the submaps of a map, and compare queries with them.
+The noise is mapping errors at walls, and objects in the free space. The paper gives the counts and Figure 8,
+not the sizes. These were chosen before any result was known, and are not tuned: a person or a chair is half a
+metre wide, a speckle spreads over two cells of 0.05 m. A `Method` describes the submaps of a map, and
+compares queries with them.
 """
 
 from __future__ import annotations
@@ -58,16 +56,16 @@ class BestMatches:
     correct: NDArray[np.bool_]
 
     def curve(self) -> PrecisionRecall:
-        """Precision and recall as functions of the similarity threshold."""
+        """Return precision and recall as functions of the similarity threshold."""
         return precision_recall(self.similarity, self.correct)
 
     def measures(self) -> MatchMeasures:
-        """All measures of these matches."""
+        """Return all measures of these matches."""
         curve = self.curve()
         return MatchMeasures(curve.auc, float(self.correct.mean()), curve.recall_at_90, curve.f1)
 
     def half_widths(self, resamples: int = 300, seed: int = 0) -> MatchMeasures:
-        """Half of the interval from 5 to 95 % of each measure, by bootstrap over the queries."""
+        """Return half of the interval from 5 to 95 % of each measure, by bootstrap over the queries."""
         rng = np.random.default_rng(seed)
         drawn = np.array(
             [
@@ -105,26 +103,26 @@ class PrecisionRecall:
 
     @property
     def auc(self) -> float:
-        """Area under the curve (AUPRC), trapezoids from (0, precision of the first point)."""
+        """Return the area under the curve (AUPRC), trapezoids from (0, precision of the first point)."""
         if len(self.recall) == 0:
             return 0.0
         return float(auc([0.0, *self.recall], [self.precision[0], *self.precision]))
 
     @property
     def recall_at_90(self) -> float:
-        """RP9: largest recall at a precision of at least 0.9; 0 if there is none."""
+        """Return RP9, the largest recall at a precision of at least 0.9; 0 if there is none."""
         return float(self.recall[self.precision >= 0.9].max(initial=0.0))
 
     @property
     def f1(self) -> float:
-        """Largest F1 score over the thresholds."""
+        """Return the largest F1 score over the thresholds."""
         total = self.precision + self.recall
         scores = np.divide(2 * self.precision * self.recall, total, out=np.zeros_like(total), where=total > 0)
         return float(scores.max(initial=0.0))
 
 
 def precision_recall(similarity: F64, correct: NDArray[np.bool_]) -> PrecisionRecall:
-    """The curve of best matches with similarity (Q,) and truth (Q,); empty if no match is true."""
+    """Return the curve of best matches with similarity (Q,) and truth (Q,); empty if no match is true."""
     if not correct.any():
         return PrecisionRecall(recall=np.empty(0), precision=np.empty(0))
     precision, recall, _ = precision_recall_curve(correct, similarity)
@@ -151,7 +149,7 @@ def draw_queries(
 def _free_place(
     grid: OccupancyGrid, centers_m: F64, offset_m: float, rng: np.random.Generator
 ) -> tuple[float, float]:
-    """A place drawn from the disc of `offset_m` around a random centre, until its cell is free."""
+    """Draw a place from the disc of `offset_m` around a random centre, until its cell is free."""
     for _ in range(1000):
         angle, reach = rng.uniform(0, 2 * math.pi), offset_m * math.sqrt(rng.random())
         place = centers_m[rng.integers(len(centers_m))] + reach * np.array([math.cos(angle), math.sin(angle)])
@@ -163,7 +161,8 @@ def _free_place(
 def rotated_submap(
     grid: OccupancyGrid, center_m: tuple[float, float], radius_m: float, angle_rad: float, submap_id: int = 0
 ) -> Submap:
-    """The disc around a place, in a frame turned by `angle_rad`; cells are copied from the nearest ones."""
+    """Return the disc around a place, in a frame turned by `angle_rad`; cells are copied from the nearest
+    ones."""
     resolution = grid.resolution_m
     n = round(radius_m / resolution)
     # A square that contains every rotation is cut first, because warpAffine reads its whole input.
@@ -197,7 +196,7 @@ def evaluate(
     experiment: Experiment,
     noise: Noise,
 ) -> dict[str, BestMatches]:
-    """Cells of Table III: the methods on one map at one noise level, all on the same queries.
+    """Return cells of Table III: the methods on one map at one noise level, all on the same queries.
 
     submaps : the map's partition, all of one radius. Raises ValueError if there are no submaps.
     """
@@ -214,7 +213,7 @@ def best_matches(
     experiment: Experiment,
     noise: Noise,
 ) -> dict[Key, BestMatches]:
-    """The same of methods that were fitted to the submaps."""
+    """Return the best matches of methods that were fitted to the submaps."""
     centers_m = np.array([submap.center_m for submap in submaps])
     similarity = {key: np.empty(experiment.queries) for key in matchers}
     correct = {key: np.empty(experiment.queries, np.bool_) for key in matchers}
@@ -256,9 +255,8 @@ NOISE_LEVELS = (
 
 
 def add_noise(submap: Submap, noise: Noise, rng: np.random.Generator) -> Submap:
-    """The submap with noise inside its radius. Boundary noise needs occupied cells, free-space noise
-    unoccupied ones.
-    """
+    """Return the submap with noise inside its radius. Boundary noise needs occupied cells, free-space noise
+    unoccupied ones."""
     grid = submap.grid
     image = np.ascontiguousarray(grid.cells).astype(np.int16)
     center = (np.array(image.shape) - 1) / 2
@@ -296,7 +294,8 @@ class Matcher(Protocol):
     """A method that is fitted to the submaps of a map."""
 
     def similarities(self, query: Submap) -> F64:
-        """Similarity of the query to each of the N fitted submaps: (N,), larger is more alike, never NaN."""
+        """Return the similarity of the query to each of the N fitted submaps: (N,), larger is more alike,
+        never NaN."""
         ...
 
 
@@ -311,7 +310,8 @@ class Method(Protocol):
 
 @compiled()
 def weighed_pairs(cells: I64, weights: F64, bin_of: NDArray[np.int32], bins: int) -> F64:
-    """Products of the weights of all pairs of cells (N, 2), summed by the bin of their distance: (W, bins).
+    """Return the products of the weights of all pairs of cells (N, 2), summed by the bin of their distance:
+    (W, bins).
 
     weights (W, N). bin_of : as of `signature.boundary.pair_counts`.
     """

@@ -39,7 +39,7 @@ class Signatures:
     _found: dict[str, Signature] = field(default_factory=dict)
 
     def of(self, submap: Submap, config: SignatureConfig) -> Signature:
-        """The signature that `signature.paper` gives, without a graph that would only be unpacked."""
+        """Return the signature that `signature.paper` gives, without a graph that would only be unpacked."""
         if self._read is not submap:
             self._read, self._found = submap, {}
         key = config.model_dump_json(exclude=_OF_COMPARING)
@@ -103,12 +103,13 @@ COLUMNS: Mapping[str, slice] = MappingProxyType(
 
 
 def weight(distance_m: F64, full_m: float, none_m: float) -> F64:
-    """1 up to `full_m` from the centre, 0 from `none_m` on, half a cosine between."""
+    """Return 1 up to `full_m` from the centre, 0 from `none_m` on, half a cosine between."""
     return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip((distance_m - full_m) / (none_m - full_m), 0, 1)))
 
 
 def vector(submap: Submap) -> F64:
-    """All parts of a submap of 8 m (SIZE,): square roots of shares, and the symmetry as a share of white.
+    """Return all parts of a submap of 8 m (SIZE,): square roots of shares, and the symmetry as a share of
+    white.
 
     Free space and symmetry are the paper's.
     """
@@ -117,7 +118,7 @@ def vector(submap: Submap) -> F64:
 
 
 def boundary_vector(submap: Submap) -> F64:
-    """Its first parts, `BOUNDARY_PARTS`."""
+    """Return the first parts of the vector, `BOUNDARY_PARTS`."""
     resolution_m = submap.grid.resolution_m
     edges = boundary_edges(submap, CONFIG)
     cells = boundary_points(edges, resolution_m, CONFIG)
@@ -156,14 +157,15 @@ class Vectors:
     _vector: F64 = field(default_factory=lambda: np.empty(0))
 
     def of(self, submap: Submap) -> F64:
-        """The vector of a submap."""
+        """Return the vector of a submap."""
         if self._read is not submap:
             self._read, self._vector = submap, vector(submap)
         return self._vector
 
 
 def differences(grid: OccupancyGrid, submaps: Sequence[Submap], seed: int) -> F64:
-    """(Q, SIZE) vectors of queries of a map, without noise, less those of the submaps of their places."""
+    """Return the vectors (Q, SIZE) of queries of a map, without noise, less those of the submaps of their
+    places."""
     centers_m = np.array([submap.center_m for submap in submaps])
     table = np.array([vector(submap) for submap in submaps])
     experiment = Experiment(queries=LEARNED_FROM, seed=seed)
@@ -173,7 +175,8 @@ def differences(grid: OccupancyGrid, submaps: Sequence[Submap], seed: int) -> F6
 
 
 def metric(within: F64) -> F64:
-    """(K, K): Mahalanobis's distance is the Euclidean one of vectors times it. within : `differences`."""
+    """Return the metric (K, K): Mahalanobis's distance is the Euclidean one of vectors times it. within :
+    `differences`."""
     covariance = within.T @ within / len(within)
     variances = np.diag(covariance)
     covariance = (1 - _SHRUNK) * covariance + np.diag(_SHRUNK * variances + _RIDGE * variances.mean())
@@ -272,7 +275,7 @@ ABLATION = tuple(VARIANTS)[:-1]
 
 
 def make_methods(names: Iterable[str], within: F64 | None = None) -> dict[str, Method]:
-    """Methods by name, with the paper's parameters.
+    """Make methods by name, with the paper's parameters.
 
     Methods with the same features share them when they are made together, so that the features of a submap
     are extracted once. within : `learned.differences` of other maps, without which no method can be made that

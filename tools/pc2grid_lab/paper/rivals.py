@@ -1,27 +1,21 @@
-"""Shape Context of a whole submap: 24 angular, 12 radial bins (paper IV-A, "describes global shapes").
+"""The rivals of the paper (IV-A), and the free-space features of Millane et al.
 
-One log-polar histogram of the boundary around the submap's centre (the descriptor of Belongie et al. 2002),
-compared by the chi-square statistic in every of the 24 turns. The paper does not describe how it treats
-rotation.
+Shape Context of a whole submap ("describes global shapes"): one log-polar histogram of the boundary around
+the submap's centre, 24 angular and 12 radial bins (the descriptor of Belongie et al. 2002), compared by the
+chi-square statistic in every of the 24 turns. The paper does not describe how it treats rotation.
 
-Free-space features: global localization in distance function maps (Millane et al., IROS 2019).
+Bags of visual words: SIFT or SURF features, at most 300 a submap, counted (BoW) or weighted by rarity
+(TF-IDF). The 1024 words are learned from the submaps of the map itself. OpenCV's wheels do not contain SURF
+(Bay et al. 2008). The detector of mahotas finds 96 % of its points again after half a turn of the image, but
+its descriptors do not turn with the points: only 27 % of the points match themselves. So orientations and
+descriptors are computed here, from Haar wavelets on the integral image as published.
 
-The distance function D of a submap is the distance of every place to the nearest wall. Keypoints are the
-places where D is strongly curved in two directions: peaks in the middle of rooms, saddles in doors, creases
-in corners. A keypoint is described by the directions of D's gradient around it (SIFT's orientation
-histograms) and by the mean of D, so that wide places do not match narrow ones. The similarity of two
-submaps is the share of keypoints that one rigid motion, found by RANSAC, brings together.
-
-Bags of visual words: SIFT or SURF features, counted (BoW) or weighted by rarity (TF-IDF) (paper IV-A).
-
-At most 300 features a submap, 1024 words. The words are learned from the submaps of the map itself.
-
-SURF (Bay et al. 2008): the detector of mahotas with a descriptor of our own.
-
-OpenCV's wheels do not contain SURF. The detector of mahotas finds 96 % of its points again after half a
-turn of the image, but its descriptors do not turn with the points: only 27 % of the points match
-themselves. So orientations and descriptors are computed here, from Haar wavelets on the integral image as
-published.
+Free-space features: global localization in distance function maps (Millane et al., IROS 2019). The distance
+function D of a submap is the distance of every place to the nearest wall. Keypoints are the places where D is
+strongly curved in two directions: peaks in the middle of rooms, saddles in doors, creases in corners. A
+keypoint is described by the directions of D's gradient around it (SIFT's orientation histograms) and by the
+mean of D, so that wide places do not match narrow ones. The similarity of two submaps is the share of
+keypoints that one rigid motion, found by RANSAC, brings together.
 """
 
 from __future__ import annotations
@@ -59,7 +53,7 @@ class ShapeContext:
         return _Shapes(self, np.stack(shapes) if shapes else np.empty((0, *bins), np.float32))
 
     def context(self, submap: Submap) -> F32:
-        """Shares of the boundary pixels, (radial, angular); sum 1, or all 0 without any."""
+        """Return the shares of the boundary pixels, (radial, angular); sum 1, or all 0 without any."""
         edges = thin(submap.grid.occupied)
         y, x = ((cells_of(edges) - (np.array(edges.shape) - 1) / 2) * submap.grid.resolution_m).T
         rings = np.geomspace(self.inner_m, submap.radius_m, self.radial_bins)
@@ -148,7 +142,8 @@ class DistanceFeatures:
         )
 
     def features(self, submap: Submap) -> Features:
-        """Keypoints of a submap and their descriptors; none where nothing is occupied or curved."""
+        """Return the keypoints of a submap and their descriptors; none where nothing is occupied or
+        curved."""
         resolution = submap.grid.resolution_m
         if not submap.grid.occupied.any() or min(submap.grid.cells.shape) < 3:
             return Features(np.empty((0, 2), np.float32), np.empty((0, 129), np.float32))
@@ -166,7 +161,7 @@ class DistanceFeatures:
         return Features((keypoints[:, ::-1] * resolution).astype(np.float32), descriptors)
 
     def _keypoints(self, distance: F32, submap: Submap) -> I64:
-        """Cells (K, 2) where |det Hessian of D| is a local maximum in known free space."""
+        """Return the cells (K, 2) where |det Hessian of D| is a local maximum in known free space."""
         resolution = submap.grid.resolution_m
         dy, dx = np.gradient(distance, resolution)
         (dyy, dyx), (dxy, dxx) = np.gradient(dy, resolution), np.gradient(dx, resolution)
@@ -182,7 +177,8 @@ class DistanceFeatures:
 
 
 def distance_function(submap: Submap, smooth_m: float) -> F32:
-    """D (H, W) in metres: distance to the nearest occupied cell, smoothed; unknown cells are no walls."""
+    """Return D (H, W) in metres: the distance to the nearest occupied cell, smoothed; unknown cells are no
+    walls."""
     resolution = submap.grid.resolution_m
     cells = cv2.distanceTransform((~submap.grid.occupied).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(cv2.GaussianBlur(cells, (0, 0), smooth_m / resolution) * resolution, np.float32)
@@ -218,12 +214,13 @@ class _FeatureTable:
 
 
 def _turns(gx: F32, gy: F32) -> F64:
-    """Directions (H, W) of a gradient as shares of a turn, 0 .. 1."""
+    """Return the directions (H, W) of a gradient as shares of a turn, 0 .. 1."""
     return np.asarray(np.arctan2(gy.astype(np.float64), gx) / (2 * math.pi) % 1.0)
 
 
 def _directions(keypoints: I64, strength: F32, turns: F64, radius: float) -> F64:
-    """Main direction (K,), radians, of the gradient (H, W) in the `radius` (cells) of keypoints (K, 2)."""
+    """Return the main direction (K,), radians, of the gradient (H, W) in the `radius` (cells) of keypoints
+    (K, 2)."""
     bins, reach = _DIRECTION_BINS, int(radius)
     offsets = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
     squared = (offsets**2).sum(axis=1)
@@ -242,8 +239,8 @@ def _directions(keypoints: I64, strength: F32, turns: F64, radius: float) -> F64
 def _samples(
     keypoints: I64, directions: F64, shape: tuple[int, ...], half: int, step: float
 ) -> tuple[I64, I64, BoolGrid]:
-    """Cells (K, S) of the samples in a square around each keypoint, turned with it, as rows and columns, and
-    whether they lie inside an image of a shape; those outside are moved to (0, 0).
+    """Return the cells (K, S) of the samples in a square around each keypoint, turned with it, as rows and
+    columns, and whether they lie inside an image of a shape; those outside are moved to (0, 0).
 
     half : samples on either side of the keypoint. step : from one to the next, cells.
     """
@@ -256,7 +253,7 @@ def _samples(
 
 
 def _mean_distances(samples: tuple[I64, I64, BoolGrid], distance: F32) -> F64:
-    """Mean (K,) of D over the samples of each keypoint that lie inside the map."""
+    """Return the mean (K,) of D over the samples of each keypoint that lie inside the map."""
     rows, columns, inside = samples
     sums = (distance.astype(np.float64)[rows, columns] * inside).sum(axis=1)
     return np.asarray(sums / np.maximum(inside.sum(axis=1), 1))
@@ -265,7 +262,7 @@ def _mean_distances(samples: tuple[I64, I64, BoolGrid], distance: F32) -> F64:
 def _orientation_shares(
     samples: tuple[I64, I64, BoolGrid], directions: F64, strength: F32, turns: F64, half: int
 ) -> F64:
-    """Orientation histograms (K, 128) of length 1 on 4 x 4 fields that are turned with the keypoint.
+    """Return orientation histograms (K, 128) of length 1 on 4 x 4 fields that are turned with the keypoint.
 
     A sample counts in the nearest fields and directions by linear interpolation. All 0 where D does not
     change.
@@ -284,7 +281,8 @@ def _orientation_shares(
 
 
 def _nearest(costs: F32, starts: I64) -> I64:
-    """For each submap the cheapest for each wanted keypoint (row), (N, K); -1 if the submap has none."""
+    """Return for each submap the cheapest for each wanted keypoint (row), (N, K); -1 if the submap has
+    none."""
     out = np.full((len(starts) - 1, len(costs)), -1, np.int64)
     for s, (start, stop) in enumerate(itertools.pairwise(starts.tolist())):
         if stop > start:
@@ -293,7 +291,8 @@ def _nearest(costs: F32, starts: I64) -> I64:
 
 
 def _consensus(a: F32, b: F32, nearest: I64, inlier_m: float, iterations: int) -> I64:
-    """RANSAC: for each submap the most matches a[m] ~ b[nearest[s, m]] that one rigid motion explains: (N,).
+    """Find by RANSAC, for each submap, the most matches a[m] ~ b[nearest[s, m]] that one rigid motion
+    explains: (N,).
 
     a (M, 2), b (D, 2), nearest (N, M) : -1 where a submap has no keypoints. The motion follows from two
     matches; the same pairs are drawn on every call.
@@ -327,8 +326,8 @@ WORDS = 1024
 
 
 def submap_image(submap: Submap) -> NDArray[np.uint8]:
-    """The submap as an image (H, W) like the published maps: walls black, free cells white, unknown cells
-    grey.
+    """Return the submap as an image (H, W) like the published maps: walls black, free cells white, unknown
+    cells grey.
 
     The image is blurred by one cell. Without the blur both features respond to the steps in slanted lines
     of one cell, and recognise a third less.
@@ -340,7 +339,7 @@ def submap_image(submap: Submap) -> NDArray[np.uint8]:
 
 
 def sift(image: NDArray[np.uint8]) -> F32:
-    """Up to 300 SIFT descriptors (K, 128) of OpenCV, those of the strongest contrast."""
+    """Return up to 300 SIFT descriptors (K, 128) of OpenCV, those of the strongest contrast."""
     detector: Any = cv2.SIFT.create(nfeatures=MAX_FEATURES)
     _, descriptors = detector.detectAndCompute(image, None)
     # OpenCV returns more than asked for if several have the contrast of the last.
@@ -352,7 +351,7 @@ def sift(image: NDArray[np.uint8]) -> F32:
 
 
 def surf(image: NDArray[np.uint8]) -> F32:
-    """Up to 300 SURF descriptors (K, 64), those of the strongest response."""
+    """Return up to 300 SURF descriptors (K, 64), those of the strongest response."""
     return surf_descriptors(image, MAX_FEATURES)
 
 
@@ -390,7 +389,7 @@ class Vocabulary:
         return self.counts
 
     def read(self, submap: Submap) -> F64:
-        """Counts of each word in a submap, (words,)."""
+        """Return the counts of each word in a submap, (words,)."""
         if self._read is not submap:
             self._count = self._word_counts(self.feature(submap_image(submap)))
             self._read = submap
@@ -434,7 +433,8 @@ class _Counts:
 
 
 def _unit(rows: F64) -> F64:
-    """Rows scaled to length 1; a row of zeros stays zero, and its similarity to all others is 0."""
+    """Return the rows scaled to length 1; a row of zeros stays zero, and its similarity to all others is
+    0."""
     lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
     return np.asarray(rows / np.where(lengths > 0, lengths, 1.0))
 
@@ -444,12 +444,13 @@ _SECTORS = 36
 
 
 def surf_descriptors(image: NDArray[np.uint8], max_points: int) -> F32:
-    """Up to `max_points` SURF descriptors (K, 64) of length 1, of the points with the strongest response."""
+    """Return up to `max_points` SURF descriptors (K, 64) of length 1, of the points with the strongest
+    response."""
     return describe_points(image, interest_points(image, max_points))
 
 
 def interest_points(image: NDArray[np.uint8], max_points: int) -> F64:
-    """Points (K, 3) as y, x, scale in pixels; the strongest of mahotas's Fast-Hessian detector."""
+    """Return the points (K, 3) as y, x, scale in pixels; the strongest of mahotas's Fast-Hessian detector."""
     from mahotas.features import surf
 
     if min(image.shape) < 16:  # smaller than the smallest filter
@@ -461,7 +462,7 @@ def interest_points(image: NDArray[np.uint8], max_points: int) -> F64:
 
 
 def describe_points(image: NDArray[np.uint8], points: F64) -> F32:
-    """SURF descriptors (K, 64) of points (K, 3) as y, x, scale.
+    """Return SURF descriptors (K, 64) of points (K, 3) as y, x, scale.
 
     For each of 4 x 4 fields of a square of 20 scales, turned with the point: the sums of dx, dy, |dx|, |dy|
     of 5 x 5 wavelets. A descriptor has length 1, or 0 where the image does not change.
@@ -484,7 +485,8 @@ def describe_points(image: NDArray[np.uint8], points: F64) -> F32:
 
 
 def orientations(integral: F64, points: F64) -> F64:
-    """Directions (K,), radians, in which the wavelets within 6 scales have the largest 60 degree sum."""
+    """Return the directions (K,), radians, in which the wavelets within 6 scales have the largest 60 degree
+    sum."""
     y, x, scale = points.T
     i, j = (axis.reshape(-1, 1) for axis in np.mgrid[-6:7, -6:7])
     near = (i**2 + j**2 < 36)[:, 0]
@@ -504,7 +506,8 @@ C64 = NDArray[np.complex64]
 
 @compiled()
 def ring_votes(keypoints: I64, offsets: I64, falloff: F64, strength: F32, turns: F64, bins: int) -> F64:
-    """Votes (K, bins) of the gradient around keypoints (K, 2) on its direction, shared by two bins.
+    """Return the votes (K, bins) of the gradient around keypoints (K, 2) on its direction, shared by two
+    bins.
 
     offsets (S, 2), falloff (S,) : the cells around a keypoint, and their weights. strength, turns (H, W).
     """
@@ -524,7 +527,7 @@ def ring_votes(keypoints: I64, offsets: I64, falloff: F64, strength: F32, turns:
 
 @compiled()
 def _remainder(value: float, size: float) -> float:
-    """value % size as numpy has it, for a size that is a power of two."""
+    """Return value % size as numpy has it, for a size that is a power of two."""
     while value >= size:
         value -= size
     while value <= -size:
@@ -543,7 +546,8 @@ def direction_shares(
     turns: F64,
     bins: int,
 ) -> F64:
-    """What the samples (K, S) of K keypoints add to each of the directions, a power of two: (bins, K, S).
+    """Return what the samples (K, S) of K keypoints add to each of the directions, a power of two: (bins, K,
+    S).
 
     own (K,) : directions of the keypoints, as shares of a turn, from which those of the samples are counted.
     """
@@ -564,7 +568,7 @@ def direction_shares(
 def most_agreeing(
     a: C64, b: C64, submap: I64, rotation: C64, shift: C64, inlier_m: float, counts: I64
 ) -> None:
-    """The most of the matches a[m] ~ b[s, m] of each submap s that one of its motions explains.
+    """Count the most of the matches a[m] ~ b[s, m] of each submap s that one of its motions explains.
 
     a (M,), b (N, M) : points as complex numbers. submap, rotation, shift (H,) : motions. counts (N,), in
     place. The product is rounded as numpy rounds it, whose processor adds to it before it rounds.
@@ -585,7 +589,8 @@ def most_agreeing(
 
 @compiled()
 def haar(integral: F64, y: F64, x: F64, half: I64) -> tuple[F64, F64]:
-    """Haar wavelets in x and y at places y, x (M, K), 2 * half (M or 1, K or 1) pixels wide: (M, K) each.
+    """Return Haar wavelets in x and y at places y, x (M, K), 2 * half (M or 1, K or 1) pixels wide: (M, K)
+    each.
 
     They are 0 where the wavelet would leave the image.
     """
@@ -609,7 +614,7 @@ def haar(integral: F64, y: F64, x: F64, half: I64) -> tuple[F64, F64]:
 
 @compiled()
 def sector_sums(angles: F64, dx: F64, dy: F64, sectors: int) -> F64:
-    """Sums (sectors, 2, K) of wavelets (M, K) whose angles lie in each sector of 60 degrees."""
+    """Return the sums (sectors, 2, K) of wavelets (M, K) whose angles lie in each sector of 60 degrees."""
     sums = np.zeros((sectors, 2, angles.shape[1]))
     step = math.pi / (sectors / 2)
     for m in range(angles.shape[0]):

@@ -78,14 +78,14 @@ class Source:
     load: Callable[[], OccupancyGrid]
 
     def places(self, folder: Path) -> Described:
-        """Its places, kept in a folder."""
+        """Return its places, kept in a folder."""
         return once(
             folder / f"places.{self.file}.pickle", lambda: Described.of(partition(self.load(), PLACES))
         )
 
 
 def sources_of(maps: Path) -> list[Source]:
-    """The maps beside each other in a folder, at all sizes, and the simulated floors."""
+    """Return the maps beside each other in a folder, at all sizes, and the simulated floors."""
     found = [
         Source(path.stem, int(factor != 1.0), f"{path.stem}.x{factor:g}", partial(_sized, path, factor))
         for path in sorted(maps.glob("*.yaml"))
@@ -96,7 +96,7 @@ def sources_of(maps: Path) -> list[Source]:
 
 
 def own_of(asked: Path) -> Source:
-    """The map that is asked, in the size that the paper has it."""
+    """Return the map that is asked, in the size that the paper has it."""
     return Source(asked.stem, KINDS.index("own building"), f"{asked.stem}.own", partial(read_map, asked))
 
 
@@ -116,8 +116,8 @@ class Counted:
     before: Mapping[str, I64]
 
     def recall(self, method: str, kinds: Sequence[int], rank: int, number: int) -> F64:
-        """(Q,) probability that the right place is among the first `rank` of `number` places: itself, and
-        others of these kinds that are drawn at random; all of them, if there are fewer."""
+        """Return the probability (Q,) that the right place is among the first `rank` of `number` places:
+        itself, and others of these kinds that are drawn at random; all of them, if there are fewer."""
         pairs = np.stack([table[:, kinds].sum(axis=1) for table in (self.places, self.before[method])])
         (others, before), each = np.unique(pairs, axis=1, return_inverse=True)
         ahead = np.arange(rank)[:, None]
@@ -172,7 +172,7 @@ def _distances(queries: Described, others: Described, learned: F64) -> dict[str,
 def mean_recall(
     results: Sequence[Counted], method: str, kinds: Sequence[int], rank: int, number: int
 ) -> tuple[float, float]:
-    """The mean over maps, and half of its interval from 5 to 95 %, by bootstrap over the queries."""
+    """Return the mean over maps, and half of its interval from 5 to 95 %, by bootstrap over the queries."""
     rng = np.random.default_rng(0)
     recalls = [counted.recall(method, kinds, rank, number) for counted in results]
     drawn = [recall[rng.integers(len(recall), size=(300, len(recall)))].mean(axis=1) for recall in recalls]
@@ -184,8 +184,8 @@ DATABASES: Mapping[str, Sequence[int]] = {"other buildings": (0, 1, 2), "own bui
 
 
 def curves(results: Sequence[Counted]) -> Iterator[dict[str, Any]]:
-    """Every curve: noise level, database, method, rank; numbers of places, recall, half of its interval. The
-    last point is of all places, the mean number of the maps."""
+    """Yield every curve: noise level, database, method, rank; numbers of places, recall, half of its
+    interval. The last point is of all places, the mean number of the maps."""
     for level in LEVELS:
         here = [counted for counted in results if counted.level == level]
         for database, kinds in DATABASES.items():
@@ -204,7 +204,7 @@ def curves(results: Sequence[Counted]) -> Iterator[dict[str, Any]]:
 
 
 def print_curves(drawn: Sequence[Mapping[str, Any]], results: Sequence[Counted]) -> None:
-    """The curves at some numbers of places, and each kind of places alone, on stdout."""
+    """Print the curves at some numbers of places, and each kind of places alone, on stdout."""
     columns = [f"{n:,}" for n in SHOWN]
     shown = table("Recall, in thousandths", ("noise", "database", "method", "rank"), (*columns, "all"))
     for curve in drawn:
@@ -230,7 +230,7 @@ def _cell(recall: float, half_width: float) -> str:
 
 
 def draw_curves(drawn: Sequence[Mapping[str, Any]], path: Path) -> None:
-    """Recall over the number of places, a panel for each noise level."""
+    """Draw recall over the number of places, a panel for each noise level."""
     colors = dict(zip(METHODS, ("tab:blue", "tab:red"), strict=True))
     with picture(path, 9.5, 4.0) as figure:
         for axis, level in zip(figure.subplots(1, len(LEVELS), sharey=True), LEVELS, strict=True):

@@ -73,7 +73,7 @@ class PaperTask:
         return self.map_path.stem
 
     def file(self, folder: Path) -> Path:
-        """The file of the results."""
+        """Return the file of the results."""
         return folder / (
             f"{self.map_name}.{self.method}.noise{self.level}.r{self.radius_m:g}.offset{self.offset_m:g}"
             f".q{self.queries}.seed{self.seed}.pickle"
@@ -87,7 +87,7 @@ def paper_tasks(
     offsets_m: Sequence[float] = (1.0, 0.5),
     **setting: Any,
 ) -> Iterator[PaperTask]:
-    """Every task of Tables III and IV. setting : of all tasks."""
+    """Yield every task of Tables III and IV. setting : of all tasks."""
     for offset_m, method, path in itertools.product(offsets_m, methods, maps):
         task = PaperTask(map_path=path, method=method, level=0, radius_m=8.0, offset_m=offset_m, **setting)
         yield from (replace(task, level=level) for level in range(len(NOISE_LEVELS)))
@@ -96,7 +96,8 @@ def paper_tasks(
 
 
 def that_share_submaps(tasks: Iterable[PaperTask]) -> list[list[PaperTask]]:
-    """The tasks of each map and radius, for `cells_of`: by the queries that they share; the most first."""
+    """Return the tasks of each map and radius, for `cells_of`: by the queries that they share; the most
+    first."""
     groups: dict[tuple[Path, float], list[PaperTask]] = {}
     for task in sorted(tasks, key=lambda task: (task.offset_m, task.level)):
         groups.setdefault((task.map_path, task.radius_m), []).append(task)
@@ -104,7 +105,7 @@ def that_share_submaps(tasks: Iterable[PaperTask]) -> list[list[PaperTask]]:
 
 
 def read_map(path: Path) -> OccupancyGrid:
-    """A map in the size that the paper has it. Raises MapFileError.
+    """Read a map in the size that the paper has it. Raises MapFileError.
 
     The image of killian has 0.10 m a pixel, while the paper says 0.05: it is read half as large.
     """
@@ -113,7 +114,7 @@ def read_map(path: Path) -> OccupancyGrid:
 
 
 def rescaled(grid: OccupancyGrid, factor: float) -> OccupancyGrid:
-    """The grid with the same resolution, but `factor` times as large in metres.
+    """Return the grid with the same resolution, but `factor` times as large in metres.
 
     A cell is occupied if any of the cells that it replaces is; else free if any is; else unknown.
     """
@@ -143,8 +144,8 @@ class PaperCell:
 
     @property
     def published(self) -> Measures | None:
-        """What the paper has printed for it, or for its own method if it does not have this one; None of maps
-        and settings that it does not have."""
+        """Return what the paper has printed for it, or for its own method if it does not have this one; None
+        of maps and settings that it does not have."""
         task = self.task
         if task.map_name not in MAPS:
             return None
@@ -154,7 +155,7 @@ class PaperCell:
         return TABLE_4[int(task.radius_m)].get(task.map_name)
 
     def summary(self) -> dict[str, Any]:
-        """Everything except the single queries, for JSON."""
+        """Return everything except the single queries, for JSON."""
         task = {**asdict(self.task), "map_path": self.task.map_name}
         half = {f"{name}_half_width": value for name, value in self.half_widths._asdict().items()}
         published = None if self.published is None else self.published._asdict()
@@ -163,7 +164,7 @@ class PaperCell:
 
 
 def cells_of(tasks: Sequence[PaperTask], folder: Path) -> list[PaperCell]:
-    """The results of tasks of one map and radius, kept in a folder. Raises MapFileError, OutputError.
+    """Return the results of tasks of one map and radius, kept in a folder. Raises MapFileError, OutputError.
 
     Methods are fitted once for all levels, and queries drawn once for all methods of a level: tasks that
     share queries stand together.
@@ -194,7 +195,8 @@ def _run(tasks: Sequence[PaperTask], folder: Path) -> Iterator[PaperCell]:
 
 
 def within_others(asked: Path, radius_m: float, seed: int, folder: Path) -> F64:
-    """`differences` of the maps beside one, each kept in a file of a folder. Raises MapFileError."""
+    """Return the `differences` of the maps beside one, each kept in a file of a folder. Raises
+    MapFileError."""
     others = [path for path in known_maps(asked.parent) if path.stem != asked.stem]
     if not others:
         raise MapFileError(
@@ -214,9 +216,8 @@ def _differences(path: Path, radius_m: float, seed: int) -> F64:
 
 
 def known_maps(path: Path) -> list[Path]:
-    """The maps that a path names: itself, if it is a file; else those of the paper in the folder, in the
-    paper's order; else every `*.yaml` in it, by name. Raises MapFileError if there is none.
-    """
+    """Return the maps that a path names: itself, if it is a file; else those of the paper in the folder, in
+    the paper's order; else every `*.yaml` in it, by name. Raises MapFileError if there is none."""
     if path.is_file():
         return [path]
     published = [path / f"{name}.yaml" for name in MAPS if (path / f"{name}.yaml").is_file()]
@@ -234,9 +235,8 @@ _MEASURES = ("auc", "rp9", "f1", "r_at_1")
 
 
 def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
-    """Tables I, III and IV on stdout, in the order of a reader's questions: does the method hold, how do its
-    rivals do, what beats it, and what does each of its parts add.
-    """
+    """Print Tables I, III and IV on stdout, in the order of a reader's questions: does the method hold, how
+    do its rivals do, what beats it, and what does each of its parts add."""
     maps = list(dict.fromkeys(r.task.map_name for r in results))
     counts = {r.task.map_name: r.submaps for r in results if r.task.radius_m == 8.0}
     first = table("Table I, number of submaps", ["map"], ["paper", "ours"])
@@ -273,7 +273,7 @@ def _print_measures(
     maps: Sequence[str],
     methods: Sequence[str],
 ) -> None:
-    """A table of some methods: a row for each measure and setting (its name, noise level and radius), a
+    """Print a table of some methods: a row for each measure and setting (its name, noise level and radius), a
     column for each map and one for their mean."""
     shown = table(title, (heading, "measure", "method"), (*maps, "mean"))
     for (name, level, radius_m), measure, method in itertools.product(settings, _MEASURES, methods):
@@ -288,7 +288,8 @@ def _print_measures(
 
 
 def _cell(cells: Sequence[PaperCell], measure: str) -> str:
-    """The mean over maps: paper, ours, difference and interval; only ours if the paper lacks one of them."""
+    """Return the mean over maps: paper, ours, difference and interval; only ours if the paper lacks one of
+    them."""
     ours = 1000 * float(np.mean([getattr(cell.measures, measure) for cell in cells]))
     halves = [getattr(cell.half_widths, measure) for cell in cells]
     # The queries of the maps are independent of each other.
@@ -363,14 +364,14 @@ def run(
 
 
 def kept_in(out: Path, maps: Sequence[Path]) -> Path:
-    """The folder of the results of these sources, these maps, and those beside them to learn from."""
+    """Return the folder of the results of these sources, these maps, and those beside them to learn from."""
     beside = {path for folder in {path.parent for path in maps} for path in known_maps(folder)}
     images = {file for path in {*maps, *beside} for file in path.parent.glob(f"{path.stem}.*")}
     return out / "cells" / digest_of_sources((FRONT, BACK, LABORATORY, *sorted(images)))
 
 
 def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
-    """The methods that are compared. Raises ConfigError if one is not known."""
+    """Return the methods that are compared. Raises ConfigError if one is not known."""
     chosen, known = tuple(methods or METHOD_NAMES), METHOD_NAMES + EXTRA_METHOD_NAMES
     for name in chosen:
         if name not in known:
@@ -396,7 +397,7 @@ class Measures(NamedTuple):
 
 
 def _rows(text: str) -> dict[str, dict[str, Measures]]:
-    """A table from its text: each line has a name and, for each map, AUC, RP9 and F1 in thousandths."""
+    """Parse a table: each line has a name and, for each map, AUC, RP9 and F1 in thousandths."""
     table = {}
     for line in text.strip().splitlines():
         name, *numbers = line.split()

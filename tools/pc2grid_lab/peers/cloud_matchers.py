@@ -48,13 +48,13 @@ def serve(locator: Callable[[str, str], Callable[[str], Found]]) -> None:
 
 
 def _cpu_s() -> float:
-    """Processor time of this process, and of those that it has started and that have ended."""
+    """Return the processor time of this process, and of those that it has started and that have ended."""
     used = map(getrusage, (RUSAGE_SELF, RUSAGE_CHILDREN))
     return sum(one.ru_utime + one.ru_stime for one in used)
 
 
 def _peak_mb() -> float:
-    """Largest resident memory so far of this process or of one that it has started."""
+    """Return the largest resident memory so far of this process or of one that it has started."""
     lines = Path("/proc/self/status").read_text().splitlines()
     own_kb = next(int(line.split()[1]) for line in lines if line.startswith("VmHWM"))
     return max(own_kb, getrusage(RUSAGE_CHILDREN).ru_maxrss) / 1000.0
@@ -74,7 +74,8 @@ DENSITY_M = 0.5 * VOXEL_M
 
 
 def map_closures(path: Matrix, clouds: list[Cloud]) -> Locate:
-    """Submaps of 15 m of the map's path; the query is matched with all of them at once. Score: inliers."""
+    """Prepare MapClosures: submaps of 15 m of the map's path; a query is matched with all of them at once.
+    Score: inliers."""
     from map_closures.config import MapClosuresConfig
     from map_closures.map_closures import MapClosures
 
@@ -104,7 +105,8 @@ def map_closures(path: Matrix, clouds: list[Cloud]) -> Locate:
 
 
 def kiss_matcher(_: Matrix, clouds: list[Cloud]) -> Locate:
-    """The cloud of the query is matched with that of the whole building. Score: inliers."""
+    """Prepare KISS-Matcher: the cloud of a query is matched with that of the whole building. Score:
+    inliers."""
     import kiss_matcher as library
 
     matcher = library.KISSMatcher(library.KISSMatcherConfig(VOXEL_M))
@@ -121,7 +123,8 @@ def kiss_matcher(_: Matrix, clouds: list[Cloud]) -> Locate:
 
 
 def fpfh_ransac(_: Matrix, clouds: list[Cloud]) -> Locate:
-    """Open3D: FPFH features, RANSAC on their matches, ICP point to plane. Score: share of points that fit."""
+    """Prepare Open3D: FPFH features, RANSAC on their matches, ICP point to plane. Score: share of points
+    that fit."""
     import open3d
 
     steps: Any = open3d.pipelines.registration
@@ -165,13 +168,13 @@ def fpfh_ransac(_: Matrix, clouds: list[Cloud]) -> Locate:
 
 
 def thinned(points_m: Cloud, edge_m: float) -> Cloud:
-    """One point for each voxel."""
+    """Return one point for each voxel."""
     _, first = np.unique(np.floor(points_m / edge_m).astype(np.int64), axis=0, return_index=True)
     return points_m[np.sort(first)]
 
 
 def locator(name: str, map_stem: str) -> Callable[[str], Found]:
-    """A program that has the clouds of the map."""
+    """Return a program that has the clouds of the map."""
     with np.load(f"{map_stem}.npz") as file:
         path, points_m, count = file["T_map_base"], file["points_m"], file["count"]
     matcher = {"map-closures": map_closures, "kiss-matcher": kiss_matcher, "fpfh-ransac": fpfh_ransac}[name]

@@ -107,7 +107,7 @@ LF_alternateAverageMethod=0
 
 
 def particle_filter(map_stem: str) -> Callable[[str], Found]:
-    """The mean of the particles at the last scan, in one map.
+    """Prepare MRPT: the pose is the mean of the particles at the last scan, in one map.
 
     The score is minus the root of the trace of their covariance, metres and radians: particles in several
     places are far from each other. Raises Pc2GridError if one of the programs fails.
@@ -156,7 +156,7 @@ def _run(*command: str) -> str:
 
 
 def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base_middle: SE2) -> str:
-    """The scans after each step of motion as a CARMEN log: a ROBOTLASER1 line each, with the odometry.
+    """Return the scans after each step of motion as a CARMEN log: a ROBOTLASER1 line each, with the odometry.
 
     ranges_m (N, B) of all scans; `T_base_middle` looks at the middle of `fov_rad`.
     """
@@ -181,7 +181,7 @@ def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base
 
 
 def _after_motion(T_odom_base: F64) -> list[int]:
-    """The first scan, those after each step of motion, and the last."""
+    """Return the first scan, those after each step of motion, and the last."""
     poses, p = [SE2(*row) for row in T_odom_base.tolist()], PARTICLE_FILTER
     kept = [0]
     for k, pose in enumerate(poses):

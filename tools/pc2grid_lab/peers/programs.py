@@ -106,20 +106,20 @@ class Site:
 
     @property
     def planar(self) -> bool:
-        """Whether its sensor is a 2D laser."""
+        """Return whether its sensor is a 2D laser."""
         return SENSOR_MODELS[self.sensor].planar
 
     @property
     def map_stem(self) -> Path:
-        """`map.yaml`, `map.png` and, of a lidar, `map.npz` without their suffixes."""
+        """Return `map.yaml`, `map.png` and, of a lidar, `map.npz` without their suffixes."""
         return self.folder / "map"
 
     def stem(self, number: int) -> Path:
-        """The files of a query without their suffixes."""
+        """Return the files of a query without their suffixes."""
         return self.folder / "queries" / f"{number:02d}"
 
     def queries(self) -> dict[int, SiteQuery]:
-        """All queries by their numbers."""
+        """Return all queries by their numbers."""
         files = sorted((self.folder / "queries").glob("*.json"))
         return {int(file.stem): SiteQuery(**json.loads(file.read_text())) for file in files}
 
@@ -129,7 +129,7 @@ PosedScan = tuple[Scan, F64 | None]
 
 
 def truth_file(log: Path) -> Path:
-    """The true poses beside a recording: `NAME.tum` or `NAME_corrected.tum`.
+    """Return the file of the true poses beside a recording: `NAME.tum` or `NAME_corrected.tum`.
 
     Raises LogNotFound if there is neither.
     """
@@ -151,7 +151,7 @@ def recorded_site(
     mapped_s: float | None = None,
     of_base: bool = False,
 ) -> Site:
-    """The site of a recording with true poses beside it. What exists in `folder` is not made again.
+    """Prepare the site of a recording with true poses beside it. What exists in `folder` is not made again.
 
     queries : how many, evenly spread over what is not mapped; fewer where it has fewer scans.
     mapped_s : seconds from the start that become the map; None: `SiteParameters.mapped` of all.
@@ -187,7 +187,7 @@ def recorded_site(
 def simulated_site(
     building_file: Path, folder: Path, config: Config, *, queries: int, travel_m: float
 ) -> Site:
-    """The site of a lidar that is simulated in a real 3D scan of a building (PLY, PCD or a mesh)."""
+    """Prepare the site of a lidar that is simulated in a real 3D scan of a building (PLY, PCD or a mesh)."""
     building = load_building(building_file)
     site = Site(name=building_file.stem, sensor="lidar", folder=folder)
 
@@ -207,7 +207,7 @@ def simulated_site(
 
 
 def _distinct(log: Log, starts_s: Iterable[float]) -> list[float]:
-    """The starts, without those that begin with the same scan as an earlier one."""
+    """Return the starts, without those that begin with the same scan as an earlier one."""
     by_scan = {next(iter(log.scans(start_s))).stamp_ns: start_s for start_s in reversed([*starts_s])}
     return sorted(by_scan.values())
 
@@ -236,7 +236,7 @@ def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
 
 
 def _keyframes(site: Site, scans: Iterable[PosedScan]) -> Iterator[tuple[Scan, F64]]:
-    """The scans with a true pose between which the robot has moved or, with a laser, turned."""
+    """Yield the scans with a true pose between which the robot has moved or, with a laser, turned."""
     step_m, last = SITE.keyframe_m if site.planar else SITE.lidar_keyframe_m, None
     for scan, T_world_base in scans:
         if T_world_base is None:
@@ -310,7 +310,7 @@ def _write_arrays(path: Path, **arrays: Any) -> None:
 
 
 def _thinned(points_m: F64) -> F32:
-    """One point for each voxel."""
+    """Return one point for each voxel."""
     voxels = np.floor(points_m / SITE.cloud_voxel_m).astype(np.int32)
     _, first = np.unique(voxels, axis=0, return_index=True)
     return points_m[np.sort(first)].astype(np.float32)
@@ -338,7 +338,7 @@ class PeerKind:
 
     @property
     def python(self) -> Path:
-        """The interpreter of its environment."""
+        """Return the interpreter of its environment."""
         return ENVIRONMENT / "bin" / "python" if self.apart else Path(sys.executable)
 
 
@@ -361,7 +361,7 @@ class PeerFailed(Pc2GridError):
 
 
 def missing(kind: PeerKind) -> str | None:
-    """The command that installs a program; None if it can be run."""
+    """Return the command that installs a program; None if it can be run."""
     if kind.name == "particle-filter" and not all(map(shutil.which, PROGRAMS)):
         return "apt-get install mrpt-apps"
     if kind.apart:
@@ -545,7 +545,8 @@ def _tasks(sites: Sequence[Site], not_installed: Mapping[str, str]) -> list[tupl
 def _site(
     recording: Path, work: Path, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
 ) -> Site:
-    """The building of a recording, or of a 3D scan; what was prepared from the same before is used again."""
+    """Return the building of a recording, or of a 3D scan; what was prepared from the same before is used
+    again."""
     if not recording.exists():
         raise LogNotFound(f"{recording}: no such file")
     config, is_building = Config(), is_building_file(recording)
@@ -560,7 +561,7 @@ def _site(
 
 
 def _seconds(mapped: Sequence[str], recordings: Sequence[Path]) -> dict[str, float]:
-    """The values of `--mapped`, by name. Raises ConfigError."""
+    """Return the values of `--mapped`, by name. Raises ConfigError."""
     names, seconds = [recording.stem for recording in recordings], {}
     if len(set(names)) != len(names):
         raise ConfigError(f"two recordings share a name: {', '.join(names)}", hint="rename one of the files")

@@ -1,16 +1,12 @@
 """Which real recordings are mapped, and which are located in which maps.
 
 The files are those of the data folder that the README there describes. A row here is all that is known of a
-recording: another recording is another row, and no other file changes.
+recording: another recording is another row, and no other file changes. Some are simulated drives through the
+real 3D scan of a building, with their true poses: nobody has recorded one building with a lidar, a depth
+camera and a laser, so the first two are driven through what a laser has recorded in another year.
 
-Recordings of a folder that the catalogue does not name: one's own, with true poses beside them.
-
-Later parts of each are located in the map of its beginning, and parts of each in the maps of the others.
-
-Recordings that are made: simulated drives through the real 3D scan of a building, with their true poses.
-
-Nobody has recorded one building with a lidar, a depth camera and a laser. A scan of its walls and furniture
-lets the first two be driven through it; a laser has recorded it in another year.
+In a folder that the catalogue does not name, such as one's own, later parts of each recording are located in
+the map of its beginning, and parts of each in the maps of the others; true poses lie beside them.
 """
 
 from __future__ import annotations
@@ -88,7 +84,7 @@ class Recording:
 
     @property
     def sensor_shown(self) -> str:
-        """The sensor as the page names it."""
+        """Return the sensor as the page names it."""
         return self.sensor if self.drive is None else f"driven {self.sensor}"
 
 
@@ -130,7 +126,7 @@ class Pair:
 
     @property
     def map_name(self) -> str:
-        """The map, with the part of the recording that it is made from."""
+        """Return the map, with the part of the recording that it is made from."""
         return self.map if self.until_s is None else f"{self.map} 0..{self.until_s:g} s"
 
 
@@ -144,7 +140,7 @@ def _map(name: str, file: str, building: str, *, quick: bool = False) -> Recordi
 
 
 def _corrected(name: str, building: str, *, relations: bool = True, quick: bool = False) -> Recording:
-    """A log of the SLAM benchmark, with gmapping's poses of its laser."""
+    """Return a log of the SLAM benchmark, with gmapping's poses of its laser."""
     poses = f"laser/{name}_corrected.tum"
     return _laser(
         name, building, truth=f"laser/{name}.relations" if relations else poses, poses=poses, quick=quick
@@ -224,7 +220,7 @@ _SCAN = "lidar/fr079_floor.ply"
 
 
 def _driven(name: str, sensor: SensorKind, length_m: float, seed: int, *, mapped: bool = True) -> Recording:
-    """A drive through the 3D scan of fr079's floor."""
+    """Return a drive through the 3D scan of fr079's floor."""
     return Recording(
         name=name,
         file=_SCAN,
@@ -252,7 +248,7 @@ def _hall(every: int, name: str, *, quick: bool = False) -> Recording:
 
 
 def _with_control(recording: Recording) -> tuple[Recording, Recording]:
-    """A recording whose scans are far apart, and the same without KISS-ICP, which must do worse."""
+    """Return a recording whose scans are far apart, and the same without KISS-ICP, which must do worse."""
     without = ("--set", "registration.icp=none")
     name = f"{recording.name}, without KISS-ICP"
     return recording, replace(recording, name=name, options=recording.options + without, quick=False)
@@ -340,25 +336,26 @@ def _pair(kind: Kind, query: str, map_: str, window_s: float, windows: int, *, q
 
 
 def _across(query: str, map_: str) -> Pair:
-    """Another sensor on fr079's floor. The log is asked every 50 s, 7 m in the median."""
+    """Return a pair with another sensor on fr079's floor. The log is asked every 50 s, 7 m in the median."""
     if query == "fr079":
         return replace(_pair("other sensor", query, map_, 40.0, 21), within_s=(0.0, 1040.0))
     return _pair("other sensor", query, map_, 14.0, 10)
 
 
 def _in_corridor(query: str, *, quick: bool = False) -> Pair:
-    """Every 8 s in the map of the same walk, made with odometry."""
+    """Return a pair of a walk in its own map, made with odometry, asked every 8 s."""
     within_s = (4.0, 68.0)
     return replace(_pair("same recording", query, "corridor", 8.0, 8, quick=quick), within_s=within_s)
 
 
 def _under_nav(query: str, window_s: float) -> Pair:
-    """A laser whose height is not known, or is that of a robot, in the map of another building's at 2.0 m."""
+    """Return a pair of a laser whose height is not known, or is that of a robot, with the map of another
+    building's at 2.0 m."""
     return _pair("elsewhere", query, "jarvis nav", window_s, 4)
 
 
 def _in_wean_yaml(query: str, by_hand: PlacedByHand, *, quick: bool = False) -> Pair:
-    """In a drawn map in which no three answers agree."""
+    """Return a pair with a drawn map in which no three answers agree."""
     return replace(_pair("published map", query, "wean.yaml", 20.0, 8, quick=quick), by_hand=by_hand)
 
 
@@ -445,7 +442,7 @@ PAIRS: tuple[Pair, ...] = (
 
 
 def evenly_spaced(first_s: float, last_s: float, count: int, duration_s: float) -> tuple[TimeSpan, ...]:
-    """`count` parts of `duration_s`, evenly distributed over the time from `first_s` to `last_s`."""
+    """Return `count` parts of `duration_s`, evenly distributed over the time from `first_s` to `last_s`."""
     starts_s = np.linspace(first_s, max(last_s - duration_s, first_s), count)
     return tuple(TimeSpan(float(start_s), duration_s) for start_s in starts_s)
 
@@ -469,7 +466,8 @@ class Catalogue:
 
     @staticmethod
     def in_folder(data: Path) -> tuple[tuple[Recording, ...], tuple[Pair, ...]]:
-        """The recordings and pairs of this file, if the folder has one of the recordings; else nothing."""
+        """Return the recordings and pairs of this file, if the folder has one of the recordings; else
+        nothing."""
         if any((data / recording.file).exists() for recording in RECORDINGS):
             return RECORDINGS, PAIRS
         return (), ()
@@ -482,7 +480,7 @@ class Catalogue:
         only: str | None = None,
         quick: bool = False,
     ) -> Catalogue:
-        """What the quick form holds, or all; of it what `only` names.
+        """Return what the quick form holds, or all; of it what `only` names.
 
         recordings, pairs : of which; None: those of this file. only : a pattern of the shell for names of
             recordings, buildings or kinds of pairs.
@@ -511,7 +509,7 @@ class Catalogue:
         )
 
     def windows(self, pair: Pair, length_s: float) -> list[tuple[int, TimeSpan]]:
-        """The windows of a pair with their numbers, in a recording of `length_s`.
+        """Return the windows of a pair with their numbers, in a recording of `length_s`.
 
         They begin at whole milliseconds, as commands are told: else the last scan might be another one.
         """
@@ -560,7 +558,8 @@ def own_recordings(data: Path, *, without: Path, of_base: bool) -> tuple[list[Re
 
 
 def state_of(data: Path, recordings: Sequence[Recording]) -> str:
-    """Digits that change when a file of one of these recordings is written; empty without recordings."""
+    """Return digits that change when a file of one of these recordings is written; empty without
+    recordings."""
     found = hashlib.sha256()
     for recording in recordings:
         path = data / recording.file
@@ -571,7 +570,7 @@ def state_of(data: Path, recordings: Sequence[Recording]) -> str:
 
 
 def _recordings(folder: Path, without: Path) -> Iterator[Path]:
-    """The recordings in a folder and in those below it. One of rosbag2, which is a folder, is one."""
+    """Yield the recordings in a folder and in those below it. One of rosbag2, which is a folder, is one."""
     for path in sorted(folder.iterdir()):
         if path.is_dir() and path.resolve() != without:
             if (path / "metadata.yaml").exists():
@@ -634,7 +633,7 @@ def write_drive(scan: Path, target: Path, drive: Drive) -> None:
 
 
 def drive_config(length_m: float, seed: int, start_m: tuple[float, float] | None = None) -> SimulationConfig:
-    """Of one drive."""
+    """Return the configuration of one drive."""
     return SimulationConfig.model_validate(
         {
             "length_m": length_m,
@@ -649,7 +648,7 @@ def drive_config(length_m: float, seed: int, start_m: tuple[float, float] | None
 
 @cache
 def digest_of_drive(scan: Path, drive: Drive) -> str:
-    """Twelve hexadecimal digits that change with the scan, the drive and the simulation."""
+    """Return twelve hexadecimal digits that change with the scan, the drive and the simulation."""
     sources = digest_of_sources((Path(simulate.__file__).parent, Path(__file__)))
     shown = hashlib.sha256(f"{sources} {drive}".encode() + scan.read_bytes())
     return shown.hexdigest()[:12]

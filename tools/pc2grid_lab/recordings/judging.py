@@ -74,7 +74,7 @@ _KNOWN_M = 0.2
 
 
 def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
-    """The trajectories of the sessions of a map, empty if there is none."""
+    """Return the trajectories of the sessions of a map, empty if there is none."""
     if not folder.map(name).exists():
         return {}
     with open_database(folder.map(name)) as database:
@@ -82,7 +82,7 @@ def sessions(folder: Folder, name: str) -> dict[str, Trajectory]:
 
 
 def mount(folder: Folder, recording: Recording) -> F64:
-    """T_base_sensor (4, 4) of a recording's first scan."""
+    """Return t_base_sensor (4, 4) of a recording's first scan."""
     with open_log(folder.source(recording), config_of(recording).read) as log:
         return next(iter(log.scans())).T_base_sensor
 
@@ -100,7 +100,7 @@ class RecordedDrive:
     late_ns: int = 0
 
     def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
-        """The part and T_part_base of the scan with that stamp; None if no part has it."""
+        """Return the part and T_part_base of the scan with that stamp; None if no part has it."""
         for number, part in enumerate(self.parts):
             (k,) = nearest(part.stamps_ns, np.array([stamp_ns]))
             if k >= 0:
@@ -108,20 +108,21 @@ class RecordedDrive:
         return None
 
     def where(self, stamp_ns: int) -> tuple[int, SE2] | None:
-        """The same; of a recording with true poses the part is -1, and the pose the true one."""
+        """Return the same; of a recording with true poses the part is -1, and the pose the true one."""
         if self.truth is None:
             return self.own_pose(stamp_ns)
         true = self.true_pose(stamp_ns)
         return None if true is None else (-1, true)
 
     def true_pose(self, stamp_ns: int) -> SE2 | None:
-        """T_world_base by the true poses; where they are far apart, carried on by the own trajectory."""
+        """Return t_world_base by the true poses; where they are far apart, carried on by the own
+        trajectory."""
         assert self.truth is not None
         T = pose_at(self.truth, stamp_ns - self.late_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
         return self._carried(stamp_ns - self.late_ns) if T is None else SE2.from_matrix(T)
 
     def _carried(self, stamp_ns: int) -> SE2 | None:
-        """The own trajectory around a stamp, laid on the true poses there."""
+        """Return the own trajectory around a stamp, laid on the true poses there."""
         assert self.truth is not None
         own = self.own_pose(stamp_ns + self.late_ns)
         near = np.flatnonzero(np.abs(self.truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
@@ -140,7 +141,7 @@ class RecordedDrive:
 
 @cache
 def drive_of(recording: Recording, folder: Folder) -> RecordedDrive:
-    """The drive of a recording whose whole map is in the folder."""
+    """Return the drive of a recording whose whole map is in the folder."""
     parts = tuple(sessions(folder, recording.name).values())
     late_ns = round(recording.late_s * 1e9)
     poses = folder.true(recording, recording.poses)
@@ -155,13 +156,13 @@ def drive_of(recording: Recording, folder: Folder) -> RecordedDrive:
 
 @cache
 def grids(folder: Folder, name: str) -> dict[str, OccupancyGrid]:
-    """The sessions of a map by name."""
+    """Return the sessions of a map by name."""
     with open_database(folder.map(name)) as database:
         return {info.name: database.grid(info.name) for info in database.sessions()}
 
 
 def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -> Trajectory:
-    """True poses of the base, turned so that z of the world is up.
+    """Turn true poses of the base so that z of the world is up.
 
     The world of a camera's poses may lie as its first image does. Which way is up in it is told by the own
     trajectories, which are levelled; without scans that have a true pose it stays as it is.
@@ -179,13 +180,13 @@ def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -
 
 
 def config_of(recording: Recording) -> Config:
-    """The settings that the commands read a recording with."""
+    """Return the settings that the commands read a recording with."""
     given = dict(zip(recording.options[::2], recording.options[1::2], strict=True))
     return Reading(topic=given.get("--topic"), odometry=given.get("--odometry")).settings()
 
 
 def hits_at(folder: Folder, recording: Recording, stamp_ns: int) -> F64:
-    """(N, 2) walls that the scan with that stamp shows, in the axes of the base."""
+    """Return the walls (N, 2) that the scan with that stamp shows, in the axes of the base."""
     config = config_of(recording)
     with open_log(folder.source(recording), config.read) as log:
         start_s = max((stamp_ns - log.info.start_ns) * 1e-9 - _BEFORE_S, 0.0)
@@ -200,7 +201,8 @@ def hits_at(folder: Folder, recording: Recording, stamp_ns: int) -> F64:
 
 
 def known_share(grid: OccupancyGrid, points_m: F64) -> float:
-    """Share 0..1 of points (N, 2) in the map frame that have a known cell within `_KNOWN_M`; 0 without."""
+    """Return the share 0..1 of points (N, 2) in the map frame that have a known cell within `_KNOWN_M`; 0
+    without."""
     if not len(points_m):
         return 0.0
     reach = round(_KNOWN_M / grid.resolution_m)
@@ -227,7 +229,7 @@ EXACT_M, WRONG_M = 0.1, 0.25
 
 
 def map_row(recording: Recording, folder: Folder) -> MapRow:
-    """The row of a recording as a map; what cannot be judged is a row that says why."""
+    """Return the row of a recording as a map; what cannot be judged is a row that says why."""
     row: dict[str, Any] = {
         "name": recording.name,
         "building": recording.building,
@@ -247,7 +249,7 @@ def map_row(recording: Recording, folder: Folder) -> MapRow:
 
 
 def said(error: Exception) -> str:
-    """What became of a row that cannot be judged."""
+    """Return what became of a row that cannot be judged."""
     return f"{type(error).__name__}: {error}"
 
 
@@ -275,7 +277,8 @@ def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, 
 
 
 def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
-    """The error of a trajectory against its truth; of a recording in parts, that of each part by itself."""
+    """Return the error of a trajectory against its truth; of a recording in parts, that of each part by
+    itself."""
     parts, truth = list(sessions(folder, recording.name).values()), folder.true(recording, recording.truth)
     if recording.same_place:
         return {"truth": "loops", **_relation_error(parts, _loops(recording, folder), SE2())}
@@ -288,7 +291,7 @@ def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
 
 
 def _loops(recording: Recording, folder: Folder) -> Relations:
-    """From each scan of `Recording.same_place` to the next one the sensor has not moved."""
+    """Return relations: from each scan of `Recording.same_place` to the next one the sensor has not moved."""
     with open_log(folder.source(recording), config_of(recording).read) as log:
         stamps = {number: scan.stamp_ns for number, scan in enumerate(log.scans())}
     there = np.array([stamps[number] for number in recording.same_place])
@@ -298,7 +301,7 @@ def _loops(recording: Recording, folder: Folder) -> Relations:
 def _relation_error(
     parts: Sequence[Trajectory], relations: Relations, T_base_sensor: SE2
 ) -> dict[str, float]:
-    """Mean errors over the relations that lie in one part."""
+    """Return mean errors over the relations that lie in one part."""
     offset_m = (T_base_sensor.x, T_base_sensor.y)
     found = [relation_error(part, relations, base_to_reference_m=offset_m) for part in parts]
     found = [error for error in found if error.used]
@@ -313,7 +316,7 @@ def _relation_error(
 
 
 def _pose_error(parts: Sequence[Trajectory], truth: Path) -> dict[str, float]:
-    """RMS distance from the true poses, each part aligned by itself."""
+    """Return the RMS distance from the true poses, each part aligned by itself."""
     true = read_tum(truth)
     found = [error for part in parts if (error := trajectory_error(part, true)) is not None]
     if not found:
@@ -326,7 +329,8 @@ def _pose_error(parts: Sequence[Trajectory], truth: Path) -> dict[str, float]:
 
 
 def warned(texts: Iterable[str], *, error_m: float | None) -> tuple[Warned, ...]:
-    """The warnings of `convert`, each with what it is about and whether it is right, where that is known.
+    """Return the warnings of `convert`, each with what it is about and whether it is right, where that is
+    known.
 
     error_m : of the trajectory, None if it is not known.
     """
@@ -338,7 +342,7 @@ def warned(texts: Iterable[str], *, error_m: float | None) -> tuple[Warned, ...]
 
 
 def _about(text: str) -> str:
-    """What a warning is about; of one that is not known here, its first words."""
+    """Return what a warning is about; of one that is not known here, its first words."""
     for about, pattern in _ABOUT.items():
         if re.search(pattern, text):
             return about
@@ -373,7 +377,7 @@ def judged_table(
     commit: str,
     advance: Callable[[float], None],
 ) -> Table:
-    """All rows of a run. advance : called with the share that is done."""
+    """Judge all rows of a run. advance : called with the share that is done."""
     judge, rows = Judge(catalogue, folder), []
     maps = tuple(map_row(recording, folder) for recording in catalogue.mapped)
     for done, pair in enumerate(catalogue.pairs, start=1):
@@ -407,12 +411,12 @@ class LocatedWindow:
 
     @property
     def answer(self) -> dict[str, Any] | None:
-        """The document of `relocalize`."""
+        """Return the document of `relocalize`."""
         return None if self.done is None or self.done.failed else self.done.document
 
     @property
     def places(self) -> list[tuple[str, SE2, int]]:
-        """Session, pose and number of the place of each hypothesis, best first."""
+        """Return session, pose and number of the place of each hypothesis, best first."""
         if self.answer is None:
             return []
         return [(h["session"], SE2(h["x"], h["y"], h["yaw"]), h["place"]) for h in self.answer["hypotheses"]]
@@ -427,7 +431,7 @@ class Judge:
         self._followed: dict[tuple[str, str], Frame | None] = {}
 
     def row(self, pair: Pair) -> PairRow:
-        """The row of a pair; what cannot be judged is a row that says why."""
+        """Return the row of a pair; what cannot be judged is a row that says why."""
         query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
         row: dict[str, Any] = {
             "query": pair.query,
@@ -442,8 +446,8 @@ class Judge:
             return PairRow(**row, problem=said(error))
 
     def truths(self, pair: Pair) -> Iterator[tuple[TimeSpan, dict[str, SE2], bool]]:
-        """The windows of a pair whose place is known: the window, the base at its end in each session of the
-        map that shows it, and whether the map knows what is seen there.
+        """Yield the windows of a pair whose place is known: the window, the base at its end in each session
+        of the map that shows it, and whether the map knows what is seen there.
 
         Of a pair with another building, every window, and no place.
         """
@@ -481,7 +485,7 @@ class Judge:
     def _row_of(
         self, pair: Pair, one: LocatedWindow, frames: Frames, known: Mapping[str, OccupancyGrid]
     ) -> QueryRow:
-        """The row of a window; where it is missed, with what `--check` says of its true pose."""
+        """Return the row of a window; where it is missed, with what `--check` says of its true pose."""
         row = _judged(one, frames, known)
         if not row.missed:
             return row
@@ -491,7 +495,8 @@ class Judge:
     def _fine(
         self, pair: Pair, query: Recording, one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]]
     ) -> float | None:
-        """Probability of the true pose of a window by `check_pose`; None if that does not call it fine."""
+        """Return the probability of the true pose of a window by `check_pose`; None if that does not call it
+        fine."""
         config, folder, found = config_of(query), self._folder, []
         for session, (T_map_base, _) in expected.items():
             with (
@@ -574,7 +579,7 @@ class Judge:
         return f"no map: {done.error}" if done.failed else ""
 
     def _located_windows(self, pair: Pair) -> list[LocatedWindow]:
-        """The windows of a pair with their answers."""
+        """Return the windows of a pair with their answers."""
         if pair not in self._windows:
             query = self._catalogue.recordings[pair.query]
             windows = self._catalogue.windows(pair, self._folder.length_s(query))
@@ -592,9 +597,8 @@ class Judge:
     def _frames(
         self, pair: Pair, query: Recording, map_: Recording
     ) -> tuple[Truth | None, list[LocatedWindow], Frames]:
-        """The windows, and how the parts of the drive lie in the sessions of the map: by true poses, by the
-        trajectory of the whole recording, by hand, by the clouds of both, or else by the answers.
-        """
+        """Return the windows, and how the parts of the drive lie in the sessions of the map: by true poses,
+        by the trajectory of the whole recording, by hand, by the clouds of both, or else by the answers."""
         windows = self._located_windows(pair)
         if query.poses is not None and query.poses == map_.poses:
             return "poses", windows, self._by_scans(pair, map_)
@@ -616,7 +620,8 @@ class Judge:
         return ("agreement" if frames else None), windows, frames
 
     def _said_back(self, pair: Pair) -> Iterator[tuple[tuple[int, str], Clue]]:
-        """What the drive of the map says, asked in the map of this query: it is of the same two trajectories.
+        """Yield the answers of the reverse pair: the map's recording located in the query's map. They relate
+        the same two trajectories.
 
         Nothing where true poses place one of them, or where it was not asked.
         """
@@ -636,8 +641,8 @@ class Judge:
             yield (parts.index(session), names[number]), turned
 
     def _by_clouds(self, query: Recording, map_: Recording) -> Frame | None:
-        """The frame of a recording in the map of another one, by the clouds of both; None if they have none,
-        or do not tell."""
+        """Return the frame of a recording in the map of another one, by the clouds of both; None if they have
+        none, or are not clear."""
         parts = [drive_of(one, self._folder).parts for one in (query, map_)]
         if any(r.sensor not in ("lidar", "depth") for r in (query, map_)) or not all(parts):
             return None
@@ -652,8 +657,8 @@ class Judge:
         return Frame(tuple(Clue(pose, T_map_query @ pose) for pose in ways))
 
     def _shared(self, pair: Pair) -> tuple[list[LocatedWindow], Frames] | None:
-        """The same of several drives in one map, whose answers judge each other: those that are known to lie
-        in the trajectory of one of them, or of another recording of the building.
+        """Return the windows and frames of several drives in one map, whose answers judge each other: those
+        that are known to lie in the trajectory of one of them, or of another recording of the building.
 
         None if there are not several.
         """
@@ -668,7 +673,8 @@ class Judge:
         return None
 
     def _in_root(self, pair: Pair, root: str) -> list[LocatedWindow] | None:
-        """The windows of a pair, in the trajectory of the recording `root`; None if not located there."""
+        """Return the windows of a pair, in the trajectory of the recording `root`; None if not located
+        there."""
         if pair.query == root:
             return self._located_windows(pair)
         wanted = (pair.query, root, None)
@@ -684,8 +690,8 @@ class Judge:
         ]
 
     def _by_scans(self, pair: Pair, map_: Recording) -> Frames:
-        """How the sessions of the map lie in the world, or in the whole drive that they are a part of: by
-        their own scans, one on each `_STEP_M`."""
+        """Return how the sessions of the map lie in the world, or in the whole drive that they are a part of:
+        by their own scans, one on each `_STEP_M`."""
         drive = drive_of(map_, self._folder)
         clues: dict[tuple[int, str], list[Clue]] = {}
         for session, trajectory in sessions(self._folder, pair.map_name).items():
@@ -697,7 +703,7 @@ class Judge:
         return {key: Frame(tuple(found)) for key, found in clues.items() if len(found) >= 2}
 
     def _by_hand(self, query: Recording, known: PlacedByHand) -> Frames:
-        """The frame of the recording's first part in the map, by one pose."""
+        """Return the frame of the recording's first part in the map, by one pose."""
         drive = drive_of(query, self._folder).parts[0]
         at_ns = drive.stamps_ns[0] + round(known.at_s * 1e9)
         (k,) = nearest(drive.stamps_ns, np.array([at_ns]), math.inf)
@@ -707,13 +713,13 @@ class Judge:
 
 
 def _steps(trajectory: Trajectory) -> list[int]:
-    """Numbers of its scans, one on each `_STEP_M`."""
+    """Return the numbers of its scans, one on each `_STEP_M`."""
     first: list[int] = np.unique((trajectory.path_m() / _STEP_M).astype(int), return_index=True)[1].tolist()
     return first
 
 
 def _said(windows: Iterable[LocatedWindow]) -> Iterator[tuple[tuple[int, str], Clue]]:
-    """The part of the drive, the session of the map, and the best place of every answer."""
+    """Yield the part of the drive, the session of the map, and the best place of every answer."""
     for one in windows:
         if one.where is not None and one.places and one.answer is not None:
             session, T_map_base, _ = one.places[0]
@@ -722,7 +728,7 @@ def _said(windows: Iterable[LocatedWindow]) -> Iterator[tuple[tuple[int, str], C
 
 
 def _agreed(said: Iterable[tuple[tuple[int, str], Clue]]) -> Frames:
-    """How the parts of drives lie in the sessions of a map, by what answers have said."""
+    """Return how the parts of drives lie in the sessions of a map, by what answers agree on."""
     groups: dict[tuple[int, str], list[Clue]] = {}
     for key, clue in said:
         groups.setdefault(key, []).append(clue)
@@ -731,7 +737,7 @@ def _agreed(said: Iterable[tuple[tuple[int, str], Clue]]) -> Frames:
 
 
 def _answered(one: LocatedWindow) -> dict[str, Any]:
-    """What a row says of an answer before it is judged."""
+    """Return what a row holds of an answer before it is judged."""
     row: dict[str, Any] = {"window": one.window, "start_s": one.span.start_s}
     if one.done is None:
         return {**row, "problem": NOT_RUN}
@@ -749,7 +755,7 @@ def _answered(one: LocatedWindow) -> dict[str, Any]:
 
 
 def _judged(one: LocatedWindow, frames: Frames, grids: Mapping[str, OccupancyGrid]) -> QueryRow:
-    """An answer judged by where the query is in the sessions of the map."""
+    """Judge an answer by where the query is in the sessions of the map."""
     row = _answered(one)
     if one.answer is None or one.where is None:
         return QueryRow(**row)
@@ -760,7 +766,8 @@ def _judged(one: LocatedWindow, frames: Frames, grids: Mapping[str, OccupancyGri
 
 
 def _expected(one: LocatedWindow, frames: Frames) -> dict[str, tuple[SE2, float]]:
-    """Where the base is at the end of a window, by session of the map, and how far a right answer may be."""
+    """Return where the base is at the end of a window, by session of the map, and how far a right answer may
+    be."""
     if one.where is None:
         return {}
     part, T_drive_base = one.where
@@ -783,7 +790,8 @@ def _covered(
 def _best(
     places: Sequence[tuple[str, SE2, int]], expected: Mapping[str, tuple[SE2, float]]
 ) -> dict[str, Any]:
-    """`right` and `error_m` of the first hypothesis, and `rank` of the first right one, by its place."""
+    """Return `right` and `error_m` of the first hypothesis, and `rank` of the first right one, by its
+    place."""
     if not places:
         return {"right": False}
     judged = [
@@ -817,12 +825,12 @@ class Look:
 
     @property
     def tells(self) -> bool:
-        """Whether it tells a place."""
+        """Return whether it names a place."""
         return self.state in ("located", "recovered")
 
 
 def _was_right(looks: Sequence[Look]) -> bool:
-    """Whether the robot was located, and the last place that was told is not known to be wrong."""
+    """Return whether the robot was located, and the last place that it was sent is not known to be wrong."""
     told = [look for look in looks if look.tells]
     return bool(told) and looks[-1].state != "lost" and told[-1].right is not False
 
@@ -832,7 +840,7 @@ def _pose(said: dict[str, Any]) -> SE2:
 
 
 def followed_row(row: FollowedRow, looks: Sequence[Look]) -> FollowedRow:
-    """What a row says of its looks."""
+    """Return what a row holds of its looks."""
     before = [look for look in looks if look.since_s is None]
     after = looks[len(before) :]
     knew = bool(before) and before[-1].state in ("located", "recovered", "off_map", "doubtful")
@@ -853,7 +861,7 @@ def followed_row(row: FollowedRow, looks: Sequence[Look]) -> FollowedRow:
 
 
 def _with_times(row: FollowedRow, after: Sequence[Look]) -> FollowedRow:
-    """The row with when the robot noticed that it had been carried away, and was located again."""
+    """Add to a row when the robot noticed that it had been carried away, and was located again."""
     row = replace(row, noticed_s=after[0].since_s, noticed_m=after[0].since_m)
     again = next((look for look in after if look.tells and look.right is not False), None)
     return row if again is None else replace(row, again_s=again.since_s, again_m=again.since_m)

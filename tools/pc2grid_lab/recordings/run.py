@@ -58,7 +58,7 @@ class Folder:
     work: Path
 
     def source(self, recording: Recording) -> Path:
-        """The file that the commands read; if it is thinned or driven, `_make` makes it.
+        """Return the file that the commands read; if it is thinned or driven, `_make` makes it.
 
         Drives are kept beside the work of all versions: they are made again when they would differ.
         """
@@ -77,52 +77,53 @@ class Folder:
         return self.data / file if recording.drive is None else self.source(recording).with_suffix(".tum")
 
     def map(self, name: str) -> Path:
-        """The database of a map, beside the result of `convert`."""
+        """Return the database of a map, beside the result of `convert`."""
         return self.work / "maps" / f"{plain(name)}.submaps"
 
     def result(self, name: str) -> Path:
-        """The result of `convert` for a map."""
+        """Return the result of `convert` for a map."""
         return self.map(name).with_suffix(".json")
 
     def bare(self, name: str) -> Path:
-        """The result of bare KISS-ICP."""
+        """Return the result of bare KISS-ICP."""
         return self.work / "bare" / f"{plain(name)}.json"
 
     def has_bare(self, recording: Recording) -> bool:
-        """Whether bare KISS-ICP is asked: it knows lidars, and real ones are there to be compared."""
+        """Return whether bare KISS-ICP runs on it: it knows lidars, and real ones are there to be
+        compared."""
         return recording.sensor == "lidar" and recording.drive is None and not self.missing(recording)
 
     def answer(self, pair: Pair, window: TimeSpan) -> Path:
-        """The result of `relocalize` for a window."""
+        """Return the result of `relocalize` for a window."""
         named = f"{plain(pair.query)}.in.{plain(pair.map_name)}"
         return self.work / "answers" / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
 
     def followed(self, one: Followed) -> Path:
-        """The result of `watch` for a row."""
+        """Return the result of `watch` for a row."""
         return self.work / "followed" / f"{plain(one.name)}.in.{plain(one.map)}.json"
 
     def missing(self, recording: Recording) -> bool:
-        """Whether the data folder lacks the recording, so that it is a gap of the page."""
+        """Return whether the data folder lacks the recording, so that it is a gap of the page."""
         return not (self.data / recording.file).exists()
 
     def gaps(self, catalogue: Catalogue, pair: Pair) -> list[str]:
-        """The files of a pair that the data folder lacks."""
+        """Return the files of a pair that the data folder lacks."""
         recordings = (catalogue.recordings[name] for name in (pair.query, pair.map))
         return [recording.file for recording in recordings if self.missing(recording)]
 
     def cpu_s(self) -> float:
-        """Processor time of all commands whose result is here."""
+        """Return the processor time of all commands whose result is here."""
         results = (kept(file) for kind in _RESULTS for file in (self.work / kind).glob("*.json"))
         return sum(done.cpu_s for done in results if done is not None)
 
     def length_s(self, recording: Recording) -> float:
-        """How long a recording lasts. Raises the errors of `open_log`."""
+        """Return how long a recording lasts. Raises the errors of `open_log`."""
         with open_log(self.source(recording)) as opened:
             return (opened.info.end_ns - opened.info.start_ns) * 1e-9
 
 
 def plain(name: str) -> str:
-    """A name as a part of the name of a file."""
+    """Return a name as a part of the name of a file."""
     return "".join(c if c.isalnum() or c in "-.+" else "_" for c in name)
 
 
@@ -144,12 +145,12 @@ class Followed:
 
     @property
     def name(self) -> str:
-        """Of the row."""
+        """Return of the row."""
         return self.before if self.after is None else f"{self.before}, {self.after}"
 
 
 def _in(map_: str, *others: str) -> Iterator[Followed]:
-    """Each of the others as it is, and carried away to each of them."""
+    """Yield each of the others as it is, and carried away to each of them."""
     yield from (Followed(before=name, map=map_) for name in others)
     pairs = permutations(others, 2) if len(others) > 1 else [(others[0], others[0])]
     yield from (Followed(before=before, map=map_, after=after) for before, after in pairs)
@@ -178,7 +179,7 @@ FOLLOWED: tuple[Followed, ...] = (
 
 
 def followed_in(catalogue: Catalogue, folder: Folder, only: str | None) -> tuple[Followed, ...]:
-    """The rows of a run whose recordings are there. only : a pattern, see `Catalogue.of`."""
+    """Return the rows of a run whose recordings are there. only : a pattern, see `Catalogue.of`."""
 
     def there(name: str | None) -> bool:
         return name is None or (
@@ -198,7 +199,7 @@ def followed_in(catalogue: Catalogue, folder: Folder, only: str | None) -> tuple
 
 
 def _watched(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
-    """`watch` of a row, of its every scan."""
+    """Return the task that watches every scan of a row."""
 
     def do() -> Finished:
         put_down_ns = shift_ns = None
@@ -249,7 +250,7 @@ def run_all(
 def _maps(
     catalogue: Catalogue, folder: Folder, pairs: Sequence[Pair]
 ) -> dict[str, tuple[Recording, float | None]]:
-    """The maps that are made, by name: of what recording, and of how much of it."""
+    """Return the maps that are made, by name: of what recording, and of how much of it."""
     maps: dict[str, tuple[Recording, float | None]] = {
         r.name: (r, None) for r in catalogue.mapped if not folder.missing(r)
     }
@@ -274,7 +275,7 @@ def _make(folder: Folder, recording: Recording) -> None:
 
 
 def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[Task]:
-    """A task a window; none where there is no map, or where the recording cannot be opened."""
+    """Return a task a window; none where there is no map, or where the recording cannot be opened."""
     query = catalogue.recordings[pair.query]
     if not folder.map(pair.map_name).exists():
         return []
@@ -340,7 +341,7 @@ class Stored(NamedTuple):
 
 
 def stored_messages(path: Path) -> Iterator[Stored]:
-    """All messages of an MCAP. Raises OSError, and the errors of the `mcap` library."""
+    """Yield all messages of an MCAP. Raises OSError, and the errors of the `mcap` library."""
     with path.open("rb") as stream:
         for schema, channel, message in make_reader(stream).iter_messages():
             assert schema is not None
@@ -414,7 +415,7 @@ def write_joined(before: Part, after: Part, target: Path) -> tuple[int, int]:
 
 
 def _messages(part: Part) -> list[Stored]:
-    """Scans and odometry of a part, from its first scan to its last one."""
+    """Return scans and odometry of a part, from its first scan to its last one."""
     found = [m for m in stored_messages(part.path) if m.schema.name.endswith(("/LaserScan", "/Odometry"))]
     scans_ns = [m.log_time_ns for m in found if not _is_odometry(m)]
     begin_ns = scans_ns[0] + round(part.begin_s * 1e9)
@@ -424,7 +425,7 @@ def _messages(part: Part) -> list[Stored]:
 
 
 def _moved(message: Stored, shift_ns: int, T: SE2 | None) -> Stored:
-    """A message at another time; an odometry at the pose that `T` moves it to."""
+    """Return a message at another time; an odometry at the pose that `T` moves it to."""
     content = _decoded(message)
     stamp = content.header.stamp
     stamp.sec, stamp.nanosec = divmod(stamp.sec * 10**9 + stamp.nanosec + shift_ns, 10**9)
@@ -458,7 +459,8 @@ _WALK_MPS, _WALK_MOST_M = 1.0, 0.5
 
 
 def indoors(first: Scan, second: Scan) -> tuple[float, float]:
-    """The voxel and the range, metres, with which KISS-ICP maps the surroundings of the first two scans.
+    """Return the voxel and the range, metres, with which KISS-ICP maps the surroundings of the first two
+    scans.
 
     Its own, 1 m and 100 m, are for streets: with these it is ten times faster, and makes no map of a room.
     """

@@ -97,12 +97,12 @@ class QueryRow:
 
     @property
     def located(self) -> bool:
-        """Whether one place was answered."""
+        """Return whether one place was answered."""
         return self.status == "located"
 
     @property
     def missed(self) -> bool:
-        """Whether it is covered, and the answer is not its place."""
+        """Return whether it is covered, and the answer is not its place."""
         return self.covered is True and not (self.located and self.right)
 
 
@@ -127,7 +127,7 @@ class Counts:
 
     @staticmethod
     def of(queries: Sequence[QueryRow]) -> Counts:
-        """Counts of queries."""
+        """Return the counts of queries."""
         located = [q for q in queries if q.located]
         return Counts(
             queries=len(queries),
@@ -143,7 +143,7 @@ class Counts:
 
     @property
     def refused(self) -> int:
-        """Not located."""
+        """Return the number of queries that are not located."""
         return self.queries - self.located - self.failed
 
 
@@ -167,23 +167,23 @@ class PairRow:
 
     @property
     def name(self) -> str:
-        """Of the row."""
+        """Return the name of the row."""
         return f"{self.query} in {self.map}"
 
     @property
     def counts(self) -> Counts:
-        """Of its queries."""
+        """Return the counts of its queries."""
         return Counts.of(self.queries)
 
     @property
     def median_error_m(self) -> float | None:
-        """Of the answers that are located and right."""
+        """Return the median error of the answers that are located and right."""
         errors = [q.error_m for q in self.queries if q.located and q.right and q.error_m is not None]
         return median(errors) if errors else None
 
     @property
     def ranks(self) -> list[int | None]:
-        """Of the right place, of the covered queries that are not located."""
+        """Return the ranks of the right place, of the covered queries that are not located."""
         return [q.rank for q in self.queries if not q.located and not q.problem and q.covered]
 
 
@@ -219,7 +219,7 @@ class FollowedRow:
 
     @property
     def name(self) -> str:
-        """Of the row."""
+        """Return the name of the row."""
         return f"{self.before}{'' if self.after is None else f', {self.after}'} followed in {self.map}"
 
 
@@ -236,7 +236,7 @@ class Table:
     followed: tuple[FollowedRow, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        """In plain types; numbers are rounded to what the page could show."""
+        """Return the table in plain types; numbers are rounded to what the page could show."""
         text = json.dumps({"schema_version": 1, **asdict(self)})
         document: dict[str, Any] = json.loads(
             text, parse_float=lambda digits: round(float(digits), 4), parse_constant=lambda _: None
@@ -244,7 +244,7 @@ class Table:
         return document
 
     def to_text(self) -> str:
-        """The same as a JSON text with a line for each row, so that versions can be compared."""
+        """Return the table as a JSON text with a line for each row, so that versions can be compared."""
         document = self.to_json()
         rows = {name: document.pop(name) for name in ("maps", "pairs", "followed")}
         head = json.dumps(document)[1:-1]
@@ -256,7 +256,7 @@ class Table:
 
     @staticmethod
     def from_json(document: dict[str, Any]) -> Table:
-        """What `to_json` made. Raises ValueError for any other document."""
+        """Return the table that `to_json` made. Raises ValueError for any other document."""
         return TypeAdapter(Table).validate_python(document)
 
 
@@ -266,7 +266,7 @@ _READING = ("no tf", "gaps", "empty scans")
 
 
 def page(table: Table, changed: Sequence[RowChange] = ()) -> str:
-    """The page in Markdown. changed : against the run before."""
+    """Return the page in Markdown. changed : against the run before."""
     return "\n".join(
         [
             "# Real recordings",
@@ -452,7 +452,8 @@ def _pair_cells(row: PairRow) -> list[str]:
 
 
 def _in_space(row: PairRow) -> str:
-    """How many answers the points of the map confirm, leave open and contradict; empty without points."""
+    """Return how many answers the points of the map confirm, leave open and contradict; empty without
+    points."""
     said = [query.in_space for query in row.queries if query.in_space is not None]
     return "/".join(str(said.count(status)) for status in ("agrees", "unsure", "contradicts")) if said else ""
 
@@ -463,8 +464,8 @@ _DRIVEN = ("driven lidar", "driven depth")
 
 
 def sensor_matrix(table: Table) -> list[str]:
-    """Queries by each kind of sensor in maps by each, over all pairs of one building; then those of which one
-    was driven.
+    """Count queries by each kind of sensor in maps by each, over all pairs of one building; then those of
+    which one was driven.
 
     A dash: no two recordings of one building have these sensors, so that nothing was measured.
     """
@@ -488,7 +489,8 @@ def sensor_matrix(table: Table) -> list[str]:
 def _matrix(
     groups: Mapping[tuple[str, str], Sequence[PairRow]], queries: Sequence[str], maps: Sequence[str]
 ) -> list[str]:
-    """A table of the pairs of sensors: a row for each of the queries, a column for each of the maps."""
+    """Return a table of the pairs of sensors: a row for each of the queries, a column for each of the
+    maps."""
     heads = (("query by", *(f"in a map by {name}" for name in maps), "in a map.yaml or a 3D scan"), (), ())
     cells = [
         [query, *(_sensor_cell(groups.get((query, name), [])) for name in (*maps, "map"))]
@@ -510,7 +512,7 @@ def _sensor_cell(rows: Sequence[PairRow]) -> str:
 
 
 def _by_building(table: Table) -> list[str]:
-    """A row a building, over the pairs within it; and those from elsewhere."""
+    """Return a row a building, over the pairs within it; and those from elsewhere."""
     inside = [row for row in table.pairs if row.kind != "elsewhere" and not row.problem]
     outside = [row for row in table.pairs if row.kind == "elsewhere" and not row.problem]
     heads = (
@@ -567,7 +569,8 @@ _BANDS = (0.0, 0.5, 0.75, 0.9, 0.99)
 
 
 def _by_confidence(table: Table) -> list[str]:
-    """A row a band of confidence: how many of the likeliest places are wrong, and on how many drives."""
+    """Return a row a band of confidence: how many of the likeliest places are wrong, and on how many
+    drives."""
     judged = [(row.query, query) for row in table.pairs for query in row.queries if query.right is not None]
     cells = []
     for low, high in zip(_BANDS, (*_BANDS[1:], math.inf), strict=True):
@@ -592,7 +595,7 @@ _FOLLOWED = (
 
 
 def _followed(table: Table) -> list[str]:
-    """Recordings that were followed, carried away and not."""
+    """Return the recordings that were followed, carried away and not."""
     rows = table.followed
     if not rows:
         return []
@@ -628,7 +631,7 @@ def _count(name: str, rows: Sequence[FollowedRow]) -> int:
 
 
 def _middle(name: str, rows: Sequence[FollowedRow]) -> str:
-    """The median, where what never happened is longest."""
+    """Return the median, where what never happened is longest."""
     values = (getattr(row, name) for row in rows)
     ordered = sorted(math.inf if value is None else value for value in values)
     middle = ordered[len(ordered) // 2] if ordered else math.inf
@@ -654,7 +657,8 @@ def _followed_cells(row: FollowedRow) -> list[str]:
 
 
 def _failures(table: Table) -> list[str]:
-    """Every wrong answer, and every one that is not judged, with what is needed to ask for it again."""
+    """Return every wrong answer, and every one that is not judged, with what is needed to ask for it
+    again."""
     wrong, unjudged = (
         [
             f"- {row.name}, {row.kind}: the window from {query.start_s:.1f} s, "
@@ -717,7 +721,7 @@ def _changed(changed: Sequence[RowChange]) -> list[str]:
 
 
 def change_lines(changed: Sequence[RowChange]) -> list[str]:
-    """A line for each change; what became worse by more than chance is marked."""
+    """Return a line for each change; what became worse by more than chance is marked."""
     return [f"- {'**worse** ' if change.worse else ''}{change.row}: {change.text}" for change in changed]
 
 
@@ -751,7 +755,8 @@ class RowChange:
 
 
 def changes(before: Table, after: Table) -> list[RowChange]:
-    """What changed in the rows that both runs have; times relative to the change that half of them exceed."""
+    """Return what changed in the rows that both runs have; times relative to the change that half of them
+    exceed."""
     maps = [(old, new) for new in after.maps for old in before.maps if old.name == new.name]
     pairs = [(old, new) for new in after.pairs for old in before.pairs if _key(old) == _key(new)]
     pace = _pace(maps)
@@ -772,7 +777,7 @@ def _key(row: PairRow) -> tuple[str, str, str]:
 
 
 def _pace(maps: Sequence[tuple[MapRow, MapRow]]) -> float:
-    """Processor time of this run over that of the other one, in the median: machines differ."""
+    """Return the processor time of this run over that of the other one, in the median: machines differ."""
     ratios = [new.cpu_s / old.cpu_s for old, new in maps if old.cpu_s and new.cpu_s]
     return median(ratios) if ratios else 1.0
 
@@ -795,7 +800,8 @@ def _map_changes(old: MapRow, new: MapRow, pace: float) -> Iterator[RowChange]:
 
 
 def _figures(old: MapRow, new: MapRow, pace: float) -> Iterator[tuple[str, float, float, bool]]:
-    """What is said of each figure of a map, the two values (more is worse), and whether it is told."""
+    """Yield the words for each figure of a map, the two values (more is worse), and whether it is
+    printed."""
     if old.error_m is not None and new.error_m is not None:
         text = f"error {old.error_m:.3f} -> {new.error_m:.3f} m"
         yield text, old.error_m, new.error_m, _moved(old.error_m, new.error_m, CHANGE.error_m)
@@ -810,20 +816,20 @@ def _figures(old: MapRow, new: MapRow, pace: float) -> Iterator[tuple[str, float
 
 
 def _moved(old: float, new: float, least: float) -> bool:
-    """Whether a value differs by `least` and by more than `ChangeParameters.share`."""
+    """Return whether a value differs by `least` and by more than `ChangeParameters.share`."""
     ratio, most = new / max(old, 1e-6), 1 + CHANGE.share
     return abs(new - old) >= least and not 1 / most < ratio < most
 
 
 def _problem(row: str, old: str, new: str, without: str) -> RowChange:
-    """Two problems that differ. without : the word for none."""
+    """Return two problems that differ. without : the word for none."""
     return RowChange(row=row, text=f"{old or without} -> {new or without}", worse=bool(new) and not old)
 
 
 def _same_windows(
     rows: Sequence[tuple[PairRow, PairRow]], *, same_form: bool
 ) -> list[tuple[QueryRow, QueryRow]]:
-    """The answers of both runs to the same windows.
+    """Return the answers of both runs to the same windows.
 
     same_form : whether both runs are quick, or none. If not, fewer answers judge each other in one of them,
         and what is judged in one only is left out.
@@ -857,7 +863,7 @@ def _pair_changes(
 
 
 def _worse(name: str, windows: Sequence[tuple[QueryRow, QueryRow]]) -> Iterator[RowChange]:
-    """Whether fewer are located and right, by a sign test over the windows that changed."""
+    """Yield how many are located and right now and were not, or no longer; worse by a sign test."""
     counts = Counter((_outcome(a) == "right", _outcome(b) == "right") for a, b in windows)
     lost, won = counts[True, False], counts[False, True]
     if lost == won:
