@@ -48,13 +48,13 @@ Box = tuple[float, float, float, float]
 
 
 def scans_of(recording: Path) -> list[pc2grid.RegisteredScan]:
-    """The scans of a recording with their poses."""
+    """Return the scans of a recording with their poses."""
     with pc2grid.open_log(recording) as log:
         return [scan for scan, _ in pc2grid.follow(log.scans(), pc2grid.Config())]
 
 
 def cloud_of(scans: list[pc2grid.RegisteredScan]) -> np.ndarray:
-    """The points (N, 3) of many of the scans in the session frame."""
+    """Return the points (N, 3) of many of the scans in the session frame."""
     some = scans[:: max(1, len(scans) // SCANS_DRAWN)]
     return np.concatenate(
         [s.scan.points_m @ s.T_session_base[:3, :3].T + s.T_session_base[:3, 3] for s in some]
@@ -96,7 +96,7 @@ def draw_cloud(axis: Any, points_m: np.ndarray, *, size: float) -> None:
 
 
 def box_around(points_m: np.ndarray, aspect: float) -> Box:
-    """The smallest box of an aspect (height over width) around points (N, 2), with a margin."""
+    """Return the smallest box of an aspect (height over width) around points (N, 2), with a margin."""
     low, high = points_m.min(axis=0) - MARGIN_M, points_m.max(axis=0) + MARGIN_M
     half = 0.5 * np.max((high - low) / (1.0, aspect)) * np.array((1.0, aspect))
     (x0, y0), (x1, y1) = (low + high) / 2 - half, (low + high) / 2 + half
@@ -104,7 +104,7 @@ def box_around(points_m: np.ndarray, aspect: float) -> Box:
 
 
 def draw_grid(axis: Any, grid: OccupancyGrid, box: Box) -> None:
-    """A grid in metres of its map frame, cut to a box."""
+    """Draw a grid in metres of its map frame, cut to a box."""
     image = np.full((*grid.cells.shape, 3), UNSEEN)
     image[grid.free], image[grid.occupied] = FREE, WALL
     x, y = grid.origin_m
@@ -116,7 +116,7 @@ def draw_grid(axis: Any, grid: OccupancyGrid, box: Box) -> None:
 
 
 def draw_graph(axis: Any, session: SessionMap) -> None:
-    """The junction graph: junctions, ends, and the ways between them."""
+    """Draw the junction graph: junctions, ends, and the ways between them."""
     graph = session.graph
     ways = [data["path_m"] for _, _, data in graph.edges(data=True)]
     axis.add_collection(LineCollection(ways, colors=BLUE, linewidths=1.8))
@@ -126,7 +126,7 @@ def draw_graph(axis: Any, session: SessionMap) -> None:
 
 
 def draw_parts(axes: Any, submap: Submap, config: signature.Config) -> None:
-    """What each of the three signatures is computed from: in three panels."""
+    """Draw what each of the three signatures is computed from: in three panels."""
     x, y = submap.center_m
     radius_m, grid = submap.radius_m, submap.grid
     for axis in axes:
@@ -170,7 +170,7 @@ def draw_signatures(
 
 
 def draw_answer(axis: Any, session: SessionMap, answer: pc2grid.Answer, path: np.ndarray) -> None:
-    """The walls and the path (N, 2) of the query where it was located."""
+    """Draw the walls and the path (N, 2) of the query where it was located."""
     assert answer.T_map_odom is not None
     walls = answer.T_map_odom.apply(answer.local_map.to_point(np.argwhere(answer.local_map.occupied)))
     way = answer.T_map_odom.apply(path)
@@ -183,8 +183,8 @@ def draw_answer(axis: Any, session: SessionMap, answer: pc2grid.Answer, path: np
 def same_place(
     session: SessionMap, answer: pc2grid.Answer, config: signature.Config
 ) -> tuple[Submap, Submap]:
-    """A submap of the map, and one of what the query has seen, whose centres are at one place: of all such
-    pairs the one of which the query has seen most."""
+    """Return a submap of the map, and one of what the query has seen, whose centres are at one place: of all
+    such pairs the one of which the query has seen most."""
     assert answer.T_map_odom is not None
     seen = pc2grid.submaps_of(answer.local_map, config.partition)
     here = answer.T_map_odom.apply(np.array([submap.center_m for submap in seen]))
@@ -201,7 +201,7 @@ def draw(
     scans: list[pc2grid.RegisteredScan],
     query: list[pc2grid.RegisteredScan],
 ) -> Figure:
-    """The whole picture.
+    """Draw the whole picture.
 
     scans : of the session. query : those that the answer is about.
     """

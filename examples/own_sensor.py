@@ -23,7 +23,7 @@ T_BASE_SENSOR = pc2grid.SE2(0.2, 0.0, 0.0).lift()
 
 
 def read_scans(path: Path) -> Iterator[pc2grid.Scan]:
-    """The scans one by one: finite points in the base frame (x forward, y left, z up), in metres."""
+    """Yield the scans one by one: finite points in the base frame (x forward, y left, z up), in metres."""
     with path.open() as lines:
         for line in lines:
             seconds, *words = line.split()

@@ -145,7 +145,7 @@ def draw_symmetry(axes: Any, submap: Submap, config: SignatureConfig) -> None:
 
 
 def bars(axis: Any, histogram: np.ndarray, bin_m: float, color: str, title: str) -> None:
-    """A histogram over metres."""
+    """Draw a histogram over metres."""
     axis.bar(np.arange(len(histogram)) * bin_m, histogram, width=bin_m, align="edge", color=color, alpha=0.7)
     axis.set_title(title, fontsize=13, loc="left")
     axis.set_xlabel("metres")
@@ -156,7 +156,7 @@ def bars(axis: Any, histogram: np.ndarray, bin_m: float, color: str, title: str)
 
 
 def draw(grid: OccupancyGrid, submaps: tuple[Submap, ...], chosen: Submap, name: str) -> Figure:
-    """The whole picture."""
+    """Draw the whole picture."""
     config = SignatureConfig()
     figure = Figure(figsize=(20, 9.5), layout="constrained")
     left, right = figure.subfigures(1, 2, width_ratios=(1.0, 3.0))

@@ -242,7 +242,7 @@ def options(
         typer.Option("--version", callback=_print_version, is_eager=True, help="print the version and stop"),
     ] = False,
 ) -> None:
-    """Recordings to a submap database, and where in it a later recording was made."""
+    """Take the options that stand before the command."""
 
 
 for _name, _commands, _sentence in (

@@ -14,7 +14,7 @@ from lifecycle_msgs.msg import Transition
 
 
 def generate_launch_description() -> LaunchDescription:
-    """The node, configured and activated; its parameters are in config/pc2grid.yaml."""
+    """Return the node, configured and activated; its parameters are in config/pc2grid.yaml."""
     settings = Path(get_package_share_directory("pc2grid_ros")) / "config" / "pc2grid.yaml"
     node = LifecycleNode(
         package="pc2grid_ros",

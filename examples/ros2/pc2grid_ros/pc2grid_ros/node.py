@@ -53,7 +53,7 @@ def qos(*, reliable: bool, kept: bool, depth: int) -> QoSProfile:
 
 
 def message_class(name: str) -> Any:
-    """The Python class of a message type such as `sensor_msgs/LaserScan`."""
+    """Return the Python class of a message type such as `sensor_msgs/LaserScan`."""
     package, _, kind = name.replace("/msg/", "/").partition("/")
     return getattr(importlib.import_module(f"{package}.msg"), kind)
 
@@ -172,7 +172,7 @@ class Pc2gridNode(LifecycleNode):
         return TransitionCallbackReturn.SUCCESS
 
     def on_shutdown(self, state: Any) -> TransitionCallbackReturn:
-        """The same, from any state."""
+        """Stop the robot and close the database, from any state."""
         self._robot.close()
         return self.on_cleanup(state)
 
