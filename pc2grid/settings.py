@@ -121,6 +121,9 @@ class ProjectionConfig(Section):
     max_cells: int = Field(default=100_000_000, gt=0, description="a map larger than this is refused")
 
 
+Thinning = Literal["guo_hall", "zhang_suen"]
+
+
 class PartitionConfig(Section):
     """Occupancy grid -> submaps (paper III-A).
 
@@ -143,7 +146,7 @@ class PartitionConfig(Section):
         description="free space is eroded by this before thinning: keeps doors, drops gaps in furniture",
     )
     cluster_m: float = Field(1.0, gt=0, description="DBSCAN radius that merges junction pixels")
-    thinning: Literal["guo_hall", "zhang_suen"] = Field(
+    thinning: Thinning = Field(
         "zhang_suen", description="zhang_suen keeps fewer side branches than guo_hall, so fewer junctions"
     )
     spacing_m: float | None = Field(

@@ -8,9 +8,7 @@ from pydantic import Field
 from typing_extensions import Self
 
 import pc2grid.settings
-from pc2grid.settings import PartitionConfig, Section
-
-Thinning = Literal["guo_hall", "zhang_suen"]
+from pc2grid.settings import PartitionConfig, Section, Thinning
 
 ShortlistBy = Literal[
     "signatures",

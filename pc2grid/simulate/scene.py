@@ -252,7 +252,7 @@ _JUMP_SHARE, _JUMP_M = 0.1, 0.1
 
 
 @dataclass(frozen=True, slots=True)
-class Sensor:
+class SimulatedSensor:
     """A sensor as the rays that it casts in each scan.
 
     kind : of the sensor. frame : name of its frame.
@@ -287,7 +287,7 @@ class Sensor:
         return np.where(kept, reading, np.float32(np.nan))
 
 
-def make_sensor(kind: SensorKind, config: SimulationConfig) -> Sensor:
+def make_sensor(kind: SensorKind, config: SimulationConfig) -> SimulatedSensor:
     """Make the sensor of a kind as configured."""
     if kind == "lidar":
         return lidar(config.lidar)
@@ -296,7 +296,7 @@ def make_sensor(kind: SensorKind, config: SimulationConfig) -> Sensor:
     return depth(config.depth)
 
 
-def lidar(config: LidarConfig) -> Sensor:
+def lidar(config: LidarConfig) -> SimulatedSensor:
     """Make a lidar: columns of beams, fired one after another during one turn, stamped at the first
     column."""
     azimuth = np.arange(config.columns) * (2 * math.pi / config.columns) - math.pi
@@ -305,17 +305,21 @@ def lidar(config: LidarConfig) -> Sensor:
     a, e = (v.ravel() for v in np.meshgrid(azimuth, elevation, indexing="ij"))
     directions = np.column_stack((np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)))
     offsets = np.repeat(np.arange(config.columns) / (config.columns * config.rate_hz), config.beams)
-    return Sensor("lidar", "lidar_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
+    return SimulatedSensor(
+        "lidar", "lidar_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config
+    )
 
 
-def laser(config: LaserConfig) -> Sensor:
+def laser(config: LaserConfig) -> SimulatedSensor:
     """Make a laser: one horizontal row of rays from right to left, one after another, stamped at the
     first."""
     count = round(config.field_deg / config.step_deg) + 1
     angle = laser_angle_min(config) + np.arange(count) * math.radians(config.step_deg)
     directions = np.column_stack((np.cos(angle), np.sin(angle), np.zeros(count)))
     offsets = np.arange(count, dtype=np.float64) * laser_time_increment(config)
-    return Sensor("laser", "laser_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config)
+    return SimulatedSensor(
+        "laser", "laser_link", _mount(config.mount_m), config.rate_hz, directions, offsets, config
+    )
 
 
 def laser_angle_min(config: LaserConfig) -> float:
@@ -328,7 +332,7 @@ def laser_time_increment(config: LaserConfig) -> float:
     return config.step_deg / 360.0 / config.rate_hz
 
 
-def depth(config: DepthConfig) -> Sensor:
+def depth(config: DepthConfig) -> SimulatedSensor:
     """Make a pinhole camera with a global shutter."""
     K = depth_intrinsics(config)
     u, v = (p.ravel() for p in np.meshgrid(np.arange(config.width), np.arange(config.height)))
@@ -336,7 +340,7 @@ def depth(config: DepthConfig) -> Sensor:
     pose = _mount(config.mount_m)
     pose[:3, :3] = OPTICAL
     frame, at_once = "camera_depth_optical_frame", np.zeros(u.size)
-    return Sensor("depth", frame, pose, config.rate_hz, directions, at_once, config)
+    return SimulatedSensor("depth", frame, pose, config.rate_hz, directions, at_once, config)
 
 
 def depth_intrinsics(config: DepthConfig) -> F64:
@@ -388,7 +392,8 @@ class Prism:
 class Furniture:
     """One movable object; people who stand still count as such.
 
-    kind : a key of `KINDS`. pose : T_map_object. outline_m : (N, 2) convex hull on the floor, in its frame.
+    kind : a key of `FURNITURE`. pose : T_map_object. outline_m : (N, 2) convex hull on the floor, in its
+        frame.
     """
 
     kind: str
@@ -416,14 +421,14 @@ def place_clutter(
     """
     passages = Passages(grid.free, grid.resolution_m, robot_m)
     places = np.flatnonzero(grid.free)
-    names = list(KINDS)
-    shares = np.array([KINDS[name][1] for name in names])
+    names = list(FURNITURE)
+    shares = np.array([FURNITURE[name][1] for name in names])
     placed: list[Furniture] = []
     for _ in range(_TRIES_PER_OBJECT * count if len(places) else 0):
         if len(placed) == count:
             break
         name = names[rng.choice(len(names), p=shares / shares.sum())]
-        outline, parts = KINDS[name][0](rng)
+        outline, parts = FURNITURE[name][0](rng)
         cell = np.array([np.unravel_index(places[rng.integers(len(places))], grid.cells.shape)])
         x, y = (float(v) for v in grid.to_point(cell)[0])
         square = rng.random() < _SQUARE_SHARE
@@ -493,7 +498,7 @@ def _table(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     return outline, [Prism(outline, height - 0.03, height), *_legs(width, depth, 0.06, height)]
 
 
-KINDS: dict[str, tuple[Callable[[np.random.Generator], tuple[F64, list[Prism]]], float]] = {
+FURNITURE: dict[str, tuple[Callable[[np.random.Generator], tuple[F64, list[Prism]]], float]] = {
     "chair": (_chair, 0.35),
     "box": (_box, 0.25),
     "table": (_table, 0.15),

@@ -27,7 +27,7 @@ from pc2grid.simulate.scene import (
     Furniture,
     Mesh,
     Scene,
-    Sensor,
+    SimulatedSensor,
     covered,
     depth_intrinsics,
     extrude,
@@ -47,7 +47,7 @@ _CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
 
 
 @dataclass(frozen=True, slots=True)
-class Reading:
+class Measurements:
     """The measurements of one scan.
 
     index : number of the scan. time_s : of its stamp, since the session's start. values_m : (R,) float32, one
@@ -74,7 +74,7 @@ class Session:
     shell : geometry of a real building; None where the plan is extruded.
     """
 
-    sensor: Sensor
+    sensor: SimulatedSensor
     grid: OccupancyGrid
     clutter: tuple[Furniture, ...]
     drive: Drive
@@ -92,7 +92,7 @@ class Session:
         shell = extrude(self.grid, self.config.wall_height_m) if self.shell is None else self.shell
         return Mesh.join([shell, *(furniture.mesh() for furniture in self.clutter)])
 
-    def readings(self) -> Iterator[Reading]:
+    def readings(self) -> Iterator[Measurements]:
         """Cast all scans, several in a call; each ray starts at the robot's pose at the time of the ray."""
         sensor = self.sensor
         scene = Scene(self.mesh())
@@ -106,9 +106,9 @@ class Session:
             true_m = scene.cast(rays.reshape(-1, 6)).reshape(times_s.shape)
             for index, ranges in zip(indices, true_m, strict=True):
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
-                yield Reading(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
+                yield Measurements(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
 
-    def scan(self, reading: Reading) -> Scan:
+    def scan(self, reading: Measurements) -> Scan:
         """Return a reading as the scan that `pc2grid.io` decodes from the recording."""
         T = self.sensor.T_base_sensor
         kept = np.isfinite(reading.values_m)
@@ -305,7 +305,7 @@ def _write_odometry(log: LogWriter, session: Session, sent: int, until_s: float)
     return end
 
 
-def _write_reading(log: LogWriter, session: Session, reading: Reading) -> None:
+def _write_reading(log: LogWriter, session: Session, reading: Measurements) -> None:
     """Write one scan as the driver of its sensor publishes it."""
     sensor, values, stamp_ns = session.sensor, reading.values_m, reading.stamp_ns
     topic, config = TOPICS[sensor.kind], sensor.config

@@ -20,7 +20,7 @@ to 25 times as long; `thin` (Guo and Hall) needs 80 to 300 times as long.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import cv2
 import numpy as np
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pc2grid.geometry import F64, I64, BoolGrid
 from pc2grid.libraries import compiled
 from pc2grid.model import OccupancyGrid
-from pc2grid.settings import PartitionConfig
+from pc2grid.settings import PartitionConfig, Thinning
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -175,9 +175,6 @@ def _join(a: list[int], b: list[int]) -> list[int]:
 
 
 # --- skeletons ----------------------------------------------------------------------------------------
-
-Thinning = Literal["guo_hall", "zhang_suen"]
-
 
 # Neighbours clockwise from north: bit k of a code is neighbour k.
 _NEIGHBOURS = [tuple((code >> k) & 1 for k in range(8)) for code in range(256)]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from pc2grid.errors import OutputError
 from signature.database.database import SubmapDatabase
 from signature.database.postgres import PostgresRows, is_url, location
-from signature.database.protocol import Label, Place, Problem, Provenance, SessionInfo
+from signature.database.protocol import Label, Location, Problem, Provenance, SessionInfo
 from signature.database.rows import Rows
 from signature.database.sqlite import SqliteRows
 
@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 
-def open_database(path_or_url: Place, *, writable: bool = False) -> SubmapDatabase:
+def open_database(path_or_url: Location, *, writable: bool = False) -> SubmapDatabase:
     """Open an existing database; only with `writable` can it be changed, and only by `add`.
 
     Raises NotADatabase, DatabaseCorrupt, DatabaseVersion, DatabaseUnreachable for a server that does not
@@ -38,7 +38,7 @@ def open_database(path_or_url: Place, *, writable: bool = False) -> SubmapDataba
     return SubmapDatabase(engine_of(path_or_url).open(path_or_url), writable=writable)
 
 
-def create_database(path_or_url: Place, *, overwrite: bool = False) -> SubmapDatabase:
+def create_database(path_or_url: Location, *, overwrite: bool = False) -> SubmapDatabase:
     """Make an empty database and open it for writing; an existing one is replaced only with `overwrite`.
 
     Raises OutputError if the file is there already or cannot be written, DatabaseBusy if another
@@ -53,13 +53,13 @@ def create_database(path_or_url: Place, *, overwrite: bool = False) -> SubmapDat
     return open_database(path_or_url, writable=True)
 
 
-def refuse_existing(place: Place, overwrite: bool) -> None:
+def refuse_existing(place: Location, overwrite: bool) -> None:
     """Raise OutputError if there is something already, and `overwrite` is not set."""
     if not overwrite and engine_of(place).exists(place):
         where = location(str(place)) if is_url(place) else str(place)
         raise OutputError(f"{where}: exists already", hint="--force replaces it")
 
 
-def engine_of(place: Place) -> type[Rows]:
+def engine_of(place: Location) -> type[Rows]:
     """Return the engine of a path or URL."""
     return PostgresRows if is_url(place) else SqliteRows

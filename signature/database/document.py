@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from signature.paper import Signature
 
 
-KINDS = ("junction", "end")
+NODE_KINDS = ("junction", "end")
 """What a node may be; `GraphArrays.kind` counts from 0 in this order."""
 
 
@@ -60,7 +60,7 @@ KINDS = ("junction", "end")
 class GraphArrays:
     """A junction graph as plain arrays, to be stored.
 
-    center_m : (N, 2) float64. kind : (N,) uint8, index into `KINDS`. pixels : (N,) int32.
+    center_m : (N, 2) float64. kind : (N,) uint8, index into `NODE_KINDS`. pixels : (N,) int32.
     edges : (E, 2) int32, numbers of nodes, the lower one first. length_m : (E,) float64.
     path_start : (E + 1,) int64; `path_m[path_start[e]:path_start[e + 1]]` is the way of edge e.
     path_m : (K, 2) float32.
@@ -92,7 +92,7 @@ def graph_to_arrays(graph: nx.Graph) -> GraphArrays:
     paths = [np.asarray(way["path_m"], np.float32).reshape(-1, 2) for _, _, way in edges]
     return GraphArrays(
         center_m=np.array([node["center_m"] for node in nodes], np.float64).reshape(-1, 2),
-        kind=np.array([KINDS.index(node["kind"]) for node in nodes], np.uint8),
+        kind=np.array([NODE_KINDS.index(node["kind"]) for node in nodes], np.uint8),
         pixels=np.array([node["pixels"] for node in nodes], np.int32),
         edges=np.array([(a, b) for a, b, _ in edges], np.int32).reshape(-1, 2),
         length_m=np.array([way["length_m"] for _, _, way in edges], np.float64),
@@ -114,7 +114,7 @@ def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
     edges = arrays.edges.tolist()
     positive = np.isfinite(arrays.length_m) & (arrays.length_m > 0)
     valid = {
-        "kind": (arrays.kind < len(KINDS)).all(),
+        "kind": (arrays.kind < len(NODE_KINDS)).all(),
         "edges": all(0 <= a < b < nodes for a, b in edges) and len(set(map(tuple, edges))) == len(edges),
         "center_m": np.isfinite(arrays.center_m).all(),
         "length_m": positive.all(),
@@ -127,7 +127,7 @@ def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
     graph = nx.Graph()
     about = zip(arrays.kind.tolist(), arrays.center_m.tolist(), arrays.pixels.tolist(), strict=True)
     for node, (kind, (x, y), pixels) in enumerate(about):
-        graph.add_node(node, kind=KINDS[kind], center_m=(x, y), pixels=pixels)
+        graph.add_node(node, kind=NODE_KINDS[kind], center_m=(x, y), pixels=pixels)
     for k, ((a, b), length_m) in enumerate(zip(edges, arrays.length_m.tolist(), strict=True)):
         graph.add_edge(a, b, length_m=length_m, path_m=arrays.path_m[starts[k] : starts[k + 1]])
     return graph

@@ -11,11 +11,11 @@ from pc2grid.io.recording import is_submap_file
 from signature.database import SubmapDatabase, engine_of, open_database, refuse_existing
 from signature.database.document import DatabaseDamage, StoredSession, clean, stored_session
 from signature.database.postgres import is_url, location
-from signature.database.protocol import BuildingFrame, Entry, Place, Problem, SessionInfo
+from signature.database.protocol import BuildingFrame, Entry, Location, Problem, SessionInfo
 from signature.database.rows import Rows, refuse_other_settings
 
 
-def store(target: Place, entries: Iterable[Entry], *, keep: bool, overwrite: bool = False) -> None:
+def store(target: Location, entries: Iterable[Entry], *, keep: bool, overwrite: bool = False) -> None:
     """Write sessions in one transaction, all or none; the database is made if there is none.
 
     entries : may be iterated over more than once.
@@ -34,7 +34,7 @@ def store(target: Place, entries: Iterable[Entry], *, keep: bool, overwrite: boo
     engine_of(target).change(target, write, keep=keep, create=True)
 
 
-def remove(target: Place, names: Sequence[str]) -> None:
+def remove(target: Location, names: Sequence[str]) -> None:
     """Remove sessions from a database in one transaction, all or none.
 
     Raises DatabaseError for a name that no session has, OutputError, DatabaseBusy, and as `open_database`.
@@ -42,7 +42,7 @@ def remove(target: Place, names: Sequence[str]) -> None:
     engine_of(target).change(target, lambda rows: rows.remove(names))
 
 
-def rename(target: Place, old: str, new: str) -> None:
+def rename(target: Location, old: str, new: str) -> None:
     """Give a session another name; all else stays as it is.
 
     Raises DatabaseError if there is no session `old`, or if there is another session `new`; OutputError,
@@ -51,7 +51,7 @@ def rename(target: Place, old: str, new: str) -> None:
     engine_of(target).change(target, lambda rows: rows.rename(old, new))
 
 
-def place(target: Place, frames: Mapping[str, BuildingFrame | None]) -> None:
+def place(target: Location, frames: Mapping[str, BuildingFrame | None]) -> None:
     """Store the places of sessions in their building, by name, all or none; None: nowhere.
 
     All else stays as it is. Raises DatabaseError for a name that no session has, OutputError, DatabaseBusy,
@@ -60,7 +60,7 @@ def place(target: Place, frames: Mapping[str, BuildingFrame | None]) -> None:
     engine_of(target).change(target, lambda rows: rows.place(frames))
 
 
-def exists(target: Place) -> bool:
+def exists(target: Location) -> bool:
     """Return True if there is anything that storing without `keep` would replace."""
     return engine_of(target).exists(target)
 
@@ -70,12 +70,12 @@ def is_database(name: str) -> bool:
     return is_url(name) or is_submap_file(Path(name))
 
 
-def shown(place: Place) -> str:
+def shown(place: Location) -> str:
     """Return a path or URL for messages: never with a password."""
     return location(str(place)) if is_url(place) else str(place)
 
 
-def check(source: Place) -> tuple[Problem, ...]:
+def check(source: Location) -> tuple[Problem, ...]:
     """Read everything and return all problems; empty if it is sound.
 
     Raises NotADatabase or DatabaseVersion if `source` is no database of the format that this version reads.
@@ -85,7 +85,7 @@ def check(source: Place) -> tuple[Problem, ...]:
 
 
 def copy(
-    source: Place, target: Place, *, recover: bool = False, overwrite: bool = False
+    source: Location, target: Location, *, recover: bool = False, overwrite: bool = False
 ) -> tuple[Problem, ...]:
     """Write a compact copy, on the same or another engine.
 
@@ -103,7 +103,7 @@ def copy(
     return problems
 
 
-def merge(sources: Sequence[Place], target: Place, *, overwrite: bool = False) -> int:
+def merge(sources: Sequence[Location], target: Location, *, overwrite: bool = False) -> int:
     """Put the sessions of several databases into a new one; returns their number.
 
     A session that is in several of them is taken once. Raises DatabaseError if a database is named twice, if
@@ -111,7 +111,7 @@ def merge(sources: Sequence[Place], target: Place, *, overwrite: bool = False) -
     """
     refuse_existing(target, overwrite)
     _refuse_repeated(sources)
-    chosen: dict[str, tuple[SessionInfo, Place]] = {}
+    chosen: dict[str, tuple[SessionInfo, Location]] = {}
     for source in sources:
         with open_database(source) as database:
             for info in database.sessions():
@@ -128,7 +128,7 @@ def merge(sources: Sequence[Place], target: Place, *, overwrite: bool = False) -
     return len(chosen)
 
 
-def split(source: Place, names: Sequence[str], target: Place, *, overwrite: bool = False) -> int:
+def split(source: Location, names: Sequence[str], target: Location, *, overwrite: bool = False) -> int:
     """Copy sessions of a database into a new one; returns their number. `source` stays as it is.
 
     Raises DatabaseError for a name that no session has, or for a `target` that is `source`; OutputError if
@@ -143,7 +143,7 @@ def split(source: Place, names: Sequence[str], target: Place, *, overwrite: bool
 
 
 def _write(
-    target: Place, sources: Sequence[tuple[Place, Collection[str] | None]], *, recover: bool = False
+    target: Location, sources: Sequence[tuple[Location, Collection[str] | None]], *, recover: bool = False
 ) -> None:
     """Write sessions of databases, all or none, as the whole content of one.
 
@@ -163,7 +163,7 @@ def _write(
     )
 
 
-def _refuse_repeated(sources: Sequence[Place]) -> None:
+def _refuse_repeated(sources: Sequence[Location]) -> None:
     known = set()
     for source in sources:
         place = shown(source) if is_url(source) else Path(source).resolve()

@@ -25,7 +25,7 @@ from signature.database.protocol import (
     APPLICATION_ID,
     BUSY_TIMEOUT_S,
     FORMAT,
-    Place,
+    Location,
     Problem,
     SessionInfo,
     no_utf8,
@@ -48,7 +48,7 @@ class PostgresRows(Rows):
     for_update = " FOR UPDATE"
 
     @classmethod
-    def open(cls, place: Place, *, damaged: bool = False) -> Self:
+    def open(cls, place: Location, *, damaged: bool = False) -> Self:
         """Open the rows, see `Rows.open`."""
         with contextlib.ExitStack() as undo:
             rows = cls._connected(place)
@@ -63,7 +63,7 @@ class PostgresRows(Rows):
 
     @classmethod
     def change(
-        cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
+        cls, place: Location, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
     ) -> None:
         """Change the rows, see `Rows.change`.
 
@@ -91,7 +91,7 @@ class PostgresRows(Rows):
                         raise
 
     @classmethod
-    def exists(cls, place: Place) -> bool:
+    def exists(cls, place: Location) -> bool:
         """Return True if the database holds sessions. Raises DatabaseUnreachable if the server does not
         answer."""
         with contextlib.closing(cls._connected(place)) as rows:
@@ -102,7 +102,7 @@ class PostgresRows(Rows):
             return next(rows.select("SELECT 1 FROM session LIMIT 1"), None) is not None
 
     @classmethod
-    def _connected(cls, place: Place) -> Self:
+    def _connected(cls, place: Location) -> Self:
         return cls(place, location(str(place)), connect(str(place)))
 
     def renew(self) -> None:

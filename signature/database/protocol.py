@@ -34,7 +34,7 @@ APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
 """Marks a file, and the lock of a server, as pc2grid's."""
 BUSY_TIMEOUT_S = 30.0
 """How long a writer waits for another one; chosen by hand."""
-Place = str | Path
+Location = str | Path
 """Path of a `*.submaps` file, or URL of a PostgreSQL database."""
 
 

@@ -18,7 +18,7 @@ from pc2grid.errors import DatabaseError, DatabaseVersion
 from pc2grid.model import is_part_of
 from signature.database import document
 from signature.database.document import PARTS, DatabaseDamage, StoredSession, explained, row_crc
-from signature.database.protocol import BuildingFrame, Place, Problem, SessionInfo
+from signature.database.protocol import BuildingFrame, Location, Problem, SessionInfo
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -69,14 +69,14 @@ class Rows(ABC):
     for_update = ""
     """Ends a query whose rows nobody else may change until the transaction ends."""
 
-    def __init__(self, source: Place, location: str, connection: Any) -> None:
+    def __init__(self, source: Location, location: str, connection: Any) -> None:
         self.source, self.location, self.connection = source, location, connection
 
     # --- what an engine does in its own way -----------------------------------------------------------
 
     @classmethod
     @abstractmethod
-    def open(cls, place: Place, *, damaged: bool = False) -> Self:
+    def open(cls, place: Location, *, damaged: bool = False) -> Self:
         """Open the rows of a database for reading. damaged : in whatever state it is.
 
         Raises NotADatabase, DatabaseVersion, DatabaseCorrupt, DatabaseUnreachable.
@@ -85,7 +85,7 @@ class Rows(ABC):
     @classmethod
     @abstractmethod
     def change(
-        cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
+        cls, place: Location, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
     ) -> None:
         """Change a database in one transaction, all or nothing.
 
@@ -97,7 +97,7 @@ class Rows(ABC):
 
     @classmethod
     @abstractmethod
-    def exists(cls, place: Place) -> bool:
+    def exists(cls, place: Location) -> bool:
         """Return True if there is anything that a change without `keep` would replace."""
 
     @abstractmethod

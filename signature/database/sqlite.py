@@ -29,7 +29,7 @@ from signature.database.protocol import (
     APPLICATION_ID,
     BUSY_TIMEOUT_S,
     FORMAT,
-    Place,
+    Location,
     Problem,
     no_utf8,
     refuse_other_format,
@@ -48,7 +48,7 @@ class SqliteRows(Rows):
     """The rows of a `*.submaps` file. Finished files are never written again, so readers need no locks."""
 
     @classmethod
-    def open(cls, place: Place, *, damaged: bool = False) -> Self:
+    def open(cls, place: Location, *, damaged: bool = False) -> Self:
         """Open the rows, see `Rows.open`."""
         path = local(place)
         with contextlib.suppress(*[DatabaseCorrupt] if damaged else []):
@@ -63,7 +63,7 @@ class SqliteRows(Rows):
 
     @classmethod
     def change(
-        cls, place: Place, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
+        cls, place: Location, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
     ) -> None:
         """Change the rows, see `Rows.change`. Deleted rows take no place in the new file."""
         path = local(place)
@@ -78,7 +78,7 @@ class SqliteRows(Rows):
             connection.execute("BEGIN")
 
     @classmethod
-    def exists(cls, place: Place) -> bool:
+    def exists(cls, place: Location) -> bool:
         """Return True if there is a file, other than an empty one."""
         path = local(place)
         return path.exists() and not (path.is_file() and path.stat().st_size == 0)
@@ -125,7 +125,7 @@ class SqliteRows(Rows):
         inspect_tables(self.connection, local(self.source))
 
 
-def local(place: Place) -> Path:
+def local(place: Location) -> Path:
     """Return the path of a file. Raises DatabaseError for a URL of an unknown engine."""
     scheme, separator, _ = str(place).partition("://")
     if isinstance(place, str) and separator:

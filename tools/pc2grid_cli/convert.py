@@ -29,7 +29,7 @@ from signature.sessions import digest_of
 
 
 @dataclass(kw_only=True)
-class Convert:
+class ConvertedInputs:
     """What became of the inputs, as far as they are done.
 
     lossy : data was lost, or an input failed. severe : so much that the exit code is 3.
@@ -115,12 +115,12 @@ def _jobs(given: options.Convert) -> list[Job]:
 
 def _convert_all(
     jobs: Sequence[Job], given: options.Convert, terminal: console.Console, *, keep: bool
-) -> Convert:
+) -> ConvertedInputs:
     """Convert, here or on a cluster, and store each result in a transaction of its own, in order.
 
     keep : the sessions that the database holds.
     """
-    done = Convert(database=maintenance.shown(given.output))
+    done = ConvertedInputs(database=maintenance.shown(given.output))
     with contextlib.ExitStack() as stack:
         if len(jobs) > 1:
             stack.enter_context(_note_stored(terminal, done, len(jobs)))
@@ -175,7 +175,7 @@ def _store(outcome: conversion_jobs.Outcome, given: options.Convert, *, keep: bo
 
 
 @contextlib.contextmanager
-def _note_stored(terminal: console.Console, done: Convert, count: int) -> Iterator[None]:
+def _note_stored(terminal: console.Console, done: ConvertedInputs, count: int) -> Iterator[None]:
     """Print, if the block fails, how many sessions are stored: they stay."""
     try:
         yield
@@ -195,7 +195,7 @@ def _as_text(d: Document) -> str:
     return f"{d['session']}{floor}: {travel}{d['area_m2']:.0f} m2 free, {counted(d['submaps'], 'submap')}"
 
 
-def _join_added(done: Convert, given: options.Convert, terminal: console.Console) -> None:
+def _join_added(done: ConvertedInputs, given: options.Convert, terminal: console.Console) -> None:
     """Join the new sessions with those that the database holds.
 
     Without --join and --no-join: only if the database holds sessions that are joined already.
@@ -216,7 +216,7 @@ def _join_added(done: Convert, given: options.Convert, terminal: console.Console
         done.warnings.append(f"{', '.join(alone)}: not joined with another session; see `pc2grid db join`")
 
 
-def _conclude(done: Convert, given: options.Convert) -> int | None:
+def _conclude(done: ConvertedInputs, given: options.Convert) -> int | None:
     """Print what there is now, and what is to be said of it. Return the exit code."""
     count, path = len(given.inputs), Path(given.output)
     if given.json:

@@ -29,7 +29,7 @@ from signature.localization.answer import Answer
 from signature.localization.shown.page import write_report
 from signature.localization.shown.picture import draw_building, draw_session
 
-Frames = Mapping[str, BuildingFrame]
+BuildingFrames = Mapping[str, BuildingFrame]
 """Of the buildings that sessions are joined in, by session."""
 
 
@@ -117,7 +117,7 @@ def _write_building(
     given: options.Export,
     database: SubmapDatabase,
     names: Sequence[str],
-    frames: Frames,
+    frames: BuildingFrames,
     terminal: console.Console,
 ) -> None:
     """Write the map, the cloud and the picture of the sessions of a floor, in the frame of their building."""
@@ -162,7 +162,7 @@ def _write_session(
 
 
 def _write_map(
-    stem: Path, database: SubmapDatabase, names: Sequence[str], frames: Frames, of: MapOf | None
+    stem: Path, database: SubmapDatabase, names: Sequence[str], frames: BuildingFrames, of: MapOf | None
 ) -> None:
     """Write the map of a session, or of all of a floor that are joined. of : what it shows."""
     from signature.localization.joining.building import map_of
@@ -200,7 +200,7 @@ def _write_cloud(
     path: Path,
     database: SubmapDatabase,
     sessions: Sequence[str],
-    frames: Frames,
+    frames: BuildingFrames,
     terminal: console.Console,
 ) -> None:
     """Write the points in space of the sessions that have them; of none, a point for each occupied cell."""

@@ -49,7 +49,7 @@ class Info(LogInfo):
     bytes_lost: int
 
 
-def run(given: options.Info, terminal: console.Console) -> int | None:
+def run(given: options.ShowInfo, terminal: console.Console) -> int | None:
     """Print what is in a recording, a map or a database. Return the exit code."""
     log, path = given.log, Path(given.log)
     if "postgres" in libraries.of_addresses(log) or is_submap_file(path):

@@ -81,7 +81,7 @@ def _end_s(span: TimeSpan) -> float | None:
 
 
 @contextlib.contextmanager
-def searched(given: options.Places) -> Iterator[tuple[SubmapDatabase, list[str]]]:
+def searched(given: options.SearchedSessions) -> Iterator[tuple[SubmapDatabase, list[str]]]:
     """Open the database, or the map as one; only the sessions of a building and floor if they are given.
 
     Yields it, and what is damaged in it and left out, of which the user is warned.

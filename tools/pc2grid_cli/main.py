@@ -1,7 +1,7 @@
 """The program `pc2grid`: its commands, the options that may stand anywhere, and what was removed.
 
 A command is known by its name and one sentence until it is used. Then its declaration is imported: a type of
-`options.py`, or a function of the laboratory. What does its work is imported when it runs.
+`options.py`, or of the laboratory. What does its work is imported when it runs.
 """
 
 from __future__ import annotations
@@ -114,12 +114,11 @@ def _callback(options: Any, work: str) -> Callable[..., None]:
 class LateCommand(TyperCommand):
     """A command that is known by its name and one sentence until it is used."""
 
-    def __init__(self, name: str, sentence: str, declaration: str, work: str = "") -> None:
+    def __init__(self, name: str, sentence: str, declaration: str, work: str) -> None:
         """Name a command without importing it.
 
-        declaration : "package.module:name". work : see `_callback`; empty: the declaration is a function.
-
-        sentence : for lists of commands.
+        sentence : for lists of commands. declaration : "package.module:name" of its options. work : see
+        `_callback`.
         """
         super().__init__(name, help=sentence)
         self._declaration, self._work = declaration, work
@@ -137,7 +136,7 @@ class LateCommand(TyperCommand):
                 hint="in the clone: pip install -e .",
             ) from None
         app = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
-        app.command(self.name, cls=Command)(_callback(declared, self._work) if self._work else declared)
+        app.command(self.name, cls=Command)(_callback(declared, self._work))
         return get_command(app)
 
     def make_context(self, *arguments: Any, **more: Any) -> Any:
@@ -181,20 +180,20 @@ def _command(sentence: str, declaration: str, work: str) -> tuple[str, str, str]
     return sentence, f"pc2grid_cli.options:{declaration}", f"pc2grid_cli.{work}"
 
 
-def _experiment(sentence: str, declaration: str) -> tuple[str, str]:
+def _experiment(sentence: str, declaration: str, work: str) -> tuple[str, str, str]:
     """Return a command of the laboratory. No module of the product imports it: it is loaded by its name."""
-    return sentence, f"{LABORATORY}.commands:{declaration}"
+    return sentence, f"{LABORATORY}.commands:{declaration}", f"{LABORATORY}.{work}"
 
 
 COMMANDS = {
     "demo": _command("Map a simulated office, and find another robot in it.", "Demo", "demo:run"),
     "simulate": _command("Drive a robot through a building and record it.", "Simulate", "demo:simulate"),
-    "info": _command("Say what is in a recording, a map or a database.", "Info", "info:run"),
+    "info": _command("Say what is in a recording, a map or a database.", "ShowInfo", "info:run"),
     "convert": _command("Make a submap database from recordings or maps.", "Convert", "convert:run"),
     "relocalize": _command("Find where a recording was made.", "Relocalize", "relocalize:run"),
     "watch": _command("Find where a running robot is, while it drives.", "Watch", "watch:run"),
     "export": _command("Write a session's map, trajectory, picture or page.", "Export", "export:run"),
-    "view": _command("Look into a database in the browser, and locate there.", "View", "view:run"),
+    "view": _command("Look into a database in the browser, and locate there.", "ViewDatabase", "view:run"),
 }
 DB = {
     "info": _command("Show the sessions of a database.", "DbInfo", "db:info"),
@@ -212,12 +211,20 @@ CONFIG = {
 }
 COMPARE = {
     "recordings": _experiment(
-        "Real recordings as maps, located in each other; and what changed.", "compare_recordings_command"
+        "Real recordings as maps, located in each other; and what changed.",
+        "CompareRecordings",
+        "recordings.compare:compare_recordings",
     ),
-    "sensors": _experiment("Each sensor in the maps of each.", "compare_sensors_command"),
-    "peers": _experiment("Other programs, the same maps and queries.", "compare_peers_command"),
-    "paper": _experiment("The paper's tables and figures 9 and 10.", "compare_paper_command"),
-    "scale": _experiment("The paper's recall in larger databases.", "compare_scale_command"),
+    "sensors": _experiment("Each sensor in the maps of each.", "CompareSensors", "sensors:compare_sensors"),
+    "peers": _experiment(
+        "Other programs, the same maps and queries.", "ComparePeers", "peers.programs:compare_peers"
+    ),
+    "paper": _experiment(
+        "The paper's tables and figures 9 and 10.", "ComparePaper", "paper.tables:compare_paper"
+    ),
+    "scale": _experiment(
+        "The paper's recall in larger databases.", "CompareScale", "paper.scale:compare_scale"
+    ),
 }
 
 app = _group(

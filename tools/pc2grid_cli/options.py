@@ -120,8 +120,8 @@ class Reading(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Places:
-    """The part of a database in which is looked."""
+class SearchedSessions:
+    """The sessions of a database that are searched."""
 
     database: str
     building: Annotated[
@@ -131,7 +131,7 @@ class Places:
 
 
 @dataclass(frozen=True, kw_only=True)
-class PlacesInFrames(Places):
+class SearchedInFrames(SearchedSessions):
     """The same, and the frame of the poses."""
 
     frame: Annotated[
@@ -141,7 +141,7 @@ class PlacesInFrames(Places):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Searched(PlacesInFrames):
+class Searched(SearchedInFrames):
     """The same of a database that may also be a map."""
 
     database: Annotated[
@@ -221,7 +221,7 @@ class Simulate(Written):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Info(AsJson):
+class ShowInfo(AsJson):
     """Say what is in a recording, and which topic convert would use and why; or in a map, or a database.
 
     Example: pc2grid info monday.mcap
@@ -371,7 +371,7 @@ class Watch(Searched, KnownPose, Reading, AsJson):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Export(PlacesInFrames, Written):
+class Export(SearchedInFrames, Written):
     """Write a session's map, trajectory or picture, or a page that shows all sessions.
 
     Of sessions that are joined (`db join`), --map, --cloud and --plot show all that are on a floor as one,
@@ -419,7 +419,7 @@ class Export(PlacesInFrames, Written):
 
 
 @dataclass(frozen=True, kw_only=True)
-class View(Places, Reading):
+class ViewDatabase(SearchedSessions, Reading):
     """Look into a database in the browser, and drop recordings there to see them located, or see a running
     robot drive. Ctrl-C ends it.
 

@@ -105,7 +105,7 @@ def _refuse(options: Collection[str], reason: str, hint: str) -> None:
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class QueryInput:
     """A query: a part of a recording, or a map."""
 
     path: Path
@@ -115,7 +115,7 @@ class Window:
         return one_line(f"{self.path.name} from {self.span.start_s:g} s")
 
 
-def _windows(given: options.Relocalize, config: Config) -> list[Window]:
+def _windows(given: options.Relocalize, config: Config) -> list[QueryInput]:
     """Return the queries: of each path one, or with --every one so often, from --start on.
 
     Such a window is as long as --duration, by default --every. It ends within its recording, unless it is the
@@ -125,7 +125,7 @@ def _windows(given: options.Relocalize, config: Config) -> list[Window]:
     """
     every_s, start_s = given.every, given.start
     if every_s is None:
-        return [Window(path, given.span) for path in given.logs]
+        return [QueryInput(path, given.span) for path in given.logs]
     length_s = given.duration or every_s
     windows = []
     for path in given.logs:
@@ -134,12 +134,12 @@ def _windows(given: options.Relocalize, config: Config) -> list[Window]:
         with open_log(path, config.read, recover=given.recover) as log:
             left_s = (log.info.end_ns - log.info.start_ns) * 1e-9 - start_s - length_s
         starts_s = start_s + every_s * np.arange(max(math.floor(left_s / every_s), 0) + 1)
-        windows += [Window(path, TimeSpan(float(at_s), length_s)) for at_s in starts_s]
+        windows += [QueryInput(path, TimeSpan(float(at_s), length_s)) for at_s in starts_s]
     return windows
 
 
 def _find(
-    window: Window,
+    window: QueryInput,
     given: options.Relocalize,
     database: SubmapDatabase,
     config: Config,
@@ -172,12 +172,12 @@ class _Share(Observer):
 
 
 def _found(
-    windows: Sequence[Window],
+    windows: Sequence[QueryInput],
     given: options.Relocalize,
     database: SubmapDatabase,
     config: Config,
     observer: Observer,
-) -> Generator[tuple[Window, Found | None]]:
+) -> Generator[tuple[QueryInput, Found | None]]:
     """Locate each query, by one index of the database. One that cannot be read is warned of, and is None."""
     index = MapIndex.of(database, query_config(database, config), observer)
     with observer.step(f"locate {len(windows)} queries"):
@@ -205,7 +205,7 @@ class Said:
     left_out: list[str]
     terminal: console.Console
 
-    def one(self, window: Window, found: Found) -> int:
+    def one(self, window: QueryInput, found: Found) -> int:
         """Print the answer to one query, and write what shows it. Return the exit code."""
         stated = answer_in_building(found, self.frames)
         located = in_map(found.poses, found)
@@ -226,11 +226,11 @@ class Said:
         _warn_of_prior(stated)
         return self._code([found])
 
-    def all(self, found_in_turn: Generator[tuple[Window, Found | None]]) -> int:
+    def all(self, found_in_turn: Generator[tuple[QueryInput, Found | None]]) -> int:
         """Print the answers to several queries, and write what shows them. Return the exit code.
 
         The documents are printed one by one, the table at the end, also if the work is interrupted."""
-        rows: list[tuple[Window, Found | None]] = []
+        rows: list[tuple[QueryInput, Found | None]] = []
         all_found: list[Found] = []
         with contextlib.ExitStack() as stack:
             if not self.given.json:
@@ -474,7 +474,7 @@ _DIGITS = 6
 """Of numbers in --csv: micrometres."""
 
 
-def show(answers: Sequence[tuple[Window, Answer | None]]) -> None:
+def show(answers: Sequence[tuple[QueryInput, Answer | None]]) -> None:
     """Print a table with a line for each query."""
     counts = Counter("failed" if answer is None else answer.status for _, answer in answers)
     title = ", ".join(f"{number} {status.replace('_', ' ')}" for status, number in counts.most_common())
@@ -494,7 +494,7 @@ def show(answers: Sequence[tuple[Window, Answer | None]]) -> None:
     output.show(table)
 
 
-def write_csv(path: Path, answers: Sequence[tuple[Window, Answer | None]]) -> None:
+def write_csv(path: Path, answers: Sequence[tuple[QueryInput, Answer | None]]) -> None:
     """Write a line for each query; what is not known of it is empty. Raises OutputError."""
     with replace_file(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")

@@ -53,7 +53,7 @@ _SHARES_EVERY_S = 0.2
 _META = '<meta http-equiv="Content-Security-Policy"'
 
 
-def run(given: options.View, terminal: console.Console) -> None:
+def run(given: options.ViewDatabase, terminal: console.Console) -> None:
     """Serve the pages until the program is stopped."""
     libraries.require(libraries.of_addresses(given.source, given.database))
     settings, most_bytes = given.settings(), round(given.most_gb * 1e9)
@@ -76,7 +76,9 @@ def run(given: options.View, terminal: console.Console) -> None:
             server.stop()
 
 
-def _serve(server: ViewServer, locator: Locator, given: options.View, terminal: console.Console) -> None:
+def _serve(
+    server: ViewServer, locator: Locator, given: options.ViewDatabase, terminal: console.Console
+) -> None:
     """Print the address, and serve; follow the source, if there is one."""
     print(server.url, flush=True)
     if given.source is None:

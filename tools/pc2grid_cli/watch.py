@@ -85,7 +85,7 @@ class Following:
     """
 
     given: options.Watch
-    drive: Followed
+    drive: ScanSource
     database: SubmapDatabase
     config: Config
     end_s: float
@@ -249,12 +249,12 @@ def _now(estimate: Estimate, live: LiveLog) -> tuple[int, SE2]:
     return stamp_ns, T_map_odom @ SE2.from_matrix(T_odom_base)
 
 
-def _print_news(drive: Followed) -> None:
+def _print_news(drive: ScanSource) -> None:
     for sentence in drive.news.take():
         console.warn(sentence)
 
 
-def _summarize(drive: Followed, terminal: console.Console) -> None:
+def _summarize(drive: ScanSource, terminal: console.Console) -> None:
     """Print what was left out, at the end."""
     _print_news(drive)
     report, counts = drive.report(), drive.counts
@@ -295,7 +295,7 @@ def as_text(estimate: Estimate, published: list[str]) -> str:
     )
 
 
-def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: list[str]) -> Any:
+def _document(estimate: Estimate, drive: ScanSource, robot: _Robot, published: list[str]) -> Any:
     answer, session = estimate.answer, estimate.answer.session
     watched = None
     if session is not None:
@@ -325,7 +325,7 @@ def _document(estimate: Estimate, drive: Followed, robot: _Robot, published: lis
 
 
 @contextlib.contextmanager
-def followed(source: str, config: ReadConfig, *, real_time: bool = False) -> Iterator[Followed]:
+def followed(source: str, config: ReadConfig, *, real_time: bool = False) -> Iterator[ScanSource]:
     """Open a robot by its address, or a recording by its path.
 
     real_time : a recording is replayed at its own pace. Raises what `open_live` and `open_log` do.
@@ -385,12 +385,12 @@ class WholeRecording:
         return self._pose.newest
 
 
-Followed = LiveLog | WholeRecording
+ScanSource = LiveLog | WholeRecording
 """Scans, part after part, and what is known of how they come."""
 
 
 def feed(
-    drive: Followed,
+    drive: ScanSource,
     follower: Follower[Any],
     config: Config,
     poll: Callable[[], bool],
@@ -421,7 +421,7 @@ def feed(
     poll()
 
 
-def live(drive: Followed, elapsed_s: float) -> Document:
+def live(drive: ScanSource, elapsed_s: float) -> Document:
     """Return how it is followed so far. elapsed_s : time that the estimate took."""
     return {
         "scans": drive.report().scans_read,

@@ -16,6 +16,8 @@ from pc2grid_cli import output
 
 ALPHA = 0.05
 
+Cell = dict[str, Any]
+"""A row of a printed table, by the names of its columns."""
 Heads = tuple[Sequence[str], Sequence[str], Sequence[str]]
 """Of columns of text, of columns of numbers, and of further columns of text."""
 

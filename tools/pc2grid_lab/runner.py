@@ -221,7 +221,7 @@ def _error(code: int, complaint: str) -> str:
     return f"ended by signal {-code}" if code < 0 else said
 
 
-def kept(file: Path) -> Finished | None:
+def kept_result(file: Path) -> Finished | None:
     """Return the result that is kept in a file; None if it is not there."""
     return Finished(**json.loads(file.read_text())) if file.exists() else None
 

@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +35,8 @@ from pc2grid.simulate.drive import Drive
 from pc2grid.submaps.submaps import partition
 from pc2grid_cli.console import Console, json_text
 from pc2grid_cli.output import make_folder
-from pc2grid_lab.pages import print_cells
+from pc2grid_lab.commands import CompareSensors
+from pc2grid_lab.pages import Cell, print_cells
 from pc2grid_lab.recordings.table import Counts, QueryRow
 from pc2grid_lab.runner import in_processes, once, write_text
 from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, fit_frame, is_right
@@ -340,9 +340,6 @@ def _retrieved_rank(index: MapIndex, query: QueryMap, T_map_query: SE2) -> int |
     return int(right[0]) if len(right) else None
 
 
-Cell = dict[str, Any]
-
-
 def matrix(trials: Sequence[Trial]) -> list[Cell]:
     """Return the figures of the trials that lie in the map of their own building, by map sensor, query sensor
     and travel: shares of all, of the located ones (wrong), of the first right place among the first
@@ -374,17 +371,10 @@ def _figures(rows: Sequence[QueryRow]) -> Cell:
     }
 
 
-def compare_sensors(
-    plans: Sequence[Path],
-    out: Path,
-    terminal: Console,
-    *,
-    queries: int,
-    seed: int,
-    jobs: int | None,
-    **setting: float,
-) -> None:
-    """Map the plans, locate the sessions, and write the table. setting : as of `PlanDrives`."""
+def compare_sensors(given: CompareSensors, terminal: Console) -> None:
+    """Map the plans, locate the sessions, and write the table."""
+    plans, out = given.plans, given.out
+    setting = {name: getattr(given, name) for name in ("map_length", "clutter", "rate", "travel")}
     names = [plan.stem for plan in plans]
     if len(set(names)) != len(names):
         raise ConfigError(f"two plans share a name: {', '.join(names)}", hint="rename one of the files")
@@ -392,16 +382,19 @@ def compare_sensors(
     drives = PlanDrives(out=out, setting=tuple(setting.items()))
     with terminal.progress("map") as advance:
         mapped = [(drives, *one) for one in product(plans, SENSORS)]
-        in_processes(PlanDrives.map, mapped, jobs=jobs, advance=advance)
+        in_processes(PlanDrives.map, mapped, jobs=given.jobs, advance=advance)
     with terminal.progress("locate") as advance:
-        asked = [(drives, *one, plans) for one in product(range(seed, seed + queries), plans, SENSORS)]
-        found = in_processes(_locate, asked, jobs=jobs, advance=advance)
+        asked = [
+            (drives, *one, plans)
+            for one in product(range(given.seed, given.seed + given.queries), plans, SENSORS)
+        ]
+        found = in_processes(_locate, asked, jobs=given.jobs, advance=advance)
     trials = [trial for some in found for trial in some]
     cells, elsewhere = matrix(trials), Counter(t.row.status for t in trials if not t.in_building)
     document = {
         "plans": names,
-        "queries": queries,
-        "setting": {**setting, "seed": seed},
+        "queries": given.queries,
+        "setting": {**setting, "seed": given.seed},
         "cells": cells,
         "outside_the_map": sum(t.in_building and not t.row.covered for t in trials),
         "elsewhere": dict(sorted(elsewhere.items())),

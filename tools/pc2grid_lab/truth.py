@@ -76,7 +76,7 @@ def nearest(stamps_ns: I64, wanted_ns: I64, within_ns: float = SAME_NS) -> I64:
     return np.where(np.abs(stamps_ns[number] - wanted_ns) <= within_ns, number, -1)
 
 
-def pose_at(trajectory: Trajectory, stamp_ns: int, *, same_ns: float, gap_ns: float) -> F64 | None:
+def pose_at_stamp(trajectory: Trajectory, stamp_ns: int, *, same_ns: float, gap_ns: float) -> F64 | None:
     """Return t_session_base (4, 4) at a stamp: the pose whose stamp differs by no more than `same_ns`, else
     between two poses no more than `gap_ns` apart; None if there are none."""
     stamps_ns, poses = trajectory.stamps_ns, trajectory.T_session_base
@@ -133,7 +133,7 @@ def trajectory_error(estimated: Trajectory, truth: Trajectory) -> TrajectoryErro
         (estimated.T_session_base[k, :3, 3], true[:3, 3])
         for k, stamp_ns in enumerate(estimated.stamps_ns.tolist())
         if not (estimated.health and estimated.health[k] is Health.LOST)
-        and (true := pose_at(truth, stamp_ns, same_ns=0.0, gap_ns=MAX_GAP_S * 1e9)) is not None
+        and (true := pose_at_stamp(truth, stamp_ns, same_ns=0.0, gap_ns=MAX_GAP_S * 1e9)) is not None
     ]
     if len(found) < 3:
         return None

@@ -235,9 +235,9 @@ def join_maps(
     return _best(target, source, candidates, decoys, prior, parameters)
 
 
-def _candidates(target: JoinableMap, points_m: F32, pieces: Sequence[Piece]) -> list[_Candidate]:
+def _candidates(target: JoinableMap, points_m: F32, pieces: Sequence[Piece]) -> list[_ExactTransform]:
     """Return the transforms of a source that its pieces propose, no two alike."""
-    found: list[_Candidate] = []
+    found: list[_ExactTransform] = []
     for proposal in proposals(target.index, pieces):
         refined = _refined(target, points_m, pieces, proposal)
         if not any(_same(refined, other) for other in found):
@@ -246,7 +246,7 @@ def _candidates(target: JoinableMap, points_m: F32, pieces: Sequence[Piece]) -> 
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Candidate:
+class _ExactTransform:
     """A transform that was made exact by walls. at : the piece of the source that proposed it. fits : of each
     piece of the source. links : of those that agree. covariance : (3, 3) of the transform at `at`."""
 
@@ -257,11 +257,13 @@ class _Candidate:
     covariance: F64
 
 
-def _same(a: _Candidate, b: _Candidate) -> bool:
+def _same(a: _ExactTransform, b: _ExactTransform) -> bool:
     return same_pose(a.T_target_source @ a.at, b.T_target_source @ a.at)
 
 
-def _refined(target: JoinableMap, points_m: F32, pieces: Sequence[Piece], proposal: Proposal) -> _Candidate:
+def _refined(
+    target: JoinableMap, points_m: F32, pieces: Sequence[Piece], proposal: Proposal
+) -> _ExactTransform:
     """Make the transform that one piece proposes exact by the walls of all."""
     pose = proposal.T_target_source
     fits = align_pieces(target.search, pieces, pose, proposal.at_m)
@@ -272,7 +274,7 @@ def _refined(target: JoinableMap, points_m: F32, pieces: Sequence[Piece], propos
         T_target_source = whole
     deviations = (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)
     covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
-    return _Candidate(
+    return _ExactTransform(
         T_target_source=T_target_source,
         at=SE2(*proposal.at_m),
         fits=fits,
@@ -284,8 +286,8 @@ def _refined(target: JoinableMap, points_m: F32, pieces: Sequence[Piece], propos
 def _best(
     target: JoinableMap,
     source: JoinableMap,
-    candidates: Sequence[_Candidate],
-    decoys: Sequence[_Candidate],
+    candidates: Sequence[_ExactTransform],
+    decoys: Sequence[_ExactTransform],
     prior: float,
     parameters: JoinParameters,
 ) -> Join:
@@ -305,7 +307,7 @@ def _best(
     return best
 
 
-def _evidence(source: JoinableMap, candidate: _Candidate, number: int, fits: PieceFits) -> Evidence:
+def _evidence(source: JoinableMap, candidate: _ExactTransform, number: int, fits: PieceFits) -> Evidence:
     """Return the evidence for a transform: the walls of the source that lie on known ground of the target.
 
     number : its row in `fits`; the other rows are of its rivals.
@@ -339,7 +341,7 @@ def _bound(evidence: Evidence, prior: float) -> float:
 def _judged(
     target: JoinableMap,
     source: JoinableMap,
-    candidate: _Candidate,
+    candidate: _ExactTransform,
     number: int,
     fits: PieceFits,
     evidence: Evidence,

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid_lab.fit.posterior import Compared, compared_of, fit_in_space, left_out, main, shuffled
+from pc2grid_lab.fit.posterior import Compared, compared_of, fit_factor_in_space, left_out, main, shuffled
 from signature.localization.in_space import masses_in_space
 from signature.localization.posterior import Evidence
 
@@ -38,7 +38,7 @@ def queries(count: int) -> list[Compared]:
 
 def test_the_fit_recovers_what_each_kind_of_ray_tells() -> None:
     """To what the number of queries allows; that some truths are taken for none makes the fit steeper."""
-    on, through, before, left = fit_in_space(queries(3000))
+    on, through, before, left = fit_factor_in_space(queries(3000))
     assert on == pytest.approx(TRUTH[0], rel=0.4)
     assert before == pytest.approx(TRUTH[2], rel=0.4)
     assert before < 2.0 * through and through < 0.0 and left < 0.0
@@ -47,14 +47,14 @@ def test_the_fit_recovers_what_each_kind_of_ray_tells() -> None:
 def test_a_query_is_judged_without_its_building() -> None:
     """In building c the rays tell the opposite, which the others do not show."""
     some = [replace(q, terms=-q.terms) if q.building == "c" else q for q in queries(300)]
-    of_others = fit_in_space([q for q in some if q.building != "c"])
-    judged = [q.masses(x) for q, x in zip(some, left_out(some, fit_in_space), strict=True)]
+    of_others = fit_factor_in_space([q for q in some if q.building != "c"])
+    judged = [q.masses(x) for q, x in zip(some, left_out(some, fit_factor_in_space), strict=True)]
     assert all(
         masses == pytest.approx(q.masses(of_others))
         for q, masses in zip(some, judged, strict=True)
         if q.building == "c"
     )
-    assert np.abs(fit_in_space(some) - of_others).max() > 1.0
+    assert np.abs(fit_factor_in_space(some) - of_others).max() > 1.0
 
 
 def test_shuffled_rays_do_not_tell_places_apart() -> None:

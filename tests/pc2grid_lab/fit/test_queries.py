@@ -11,7 +11,7 @@ import pytest
 from pc2grid.geometry import SE2
 from pc2grid.observer import TimeSpan
 from pc2grid_lab.fit import queries
-from pc2grid_lab.fit.queries import Window, office_floor, pairs_of
+from pc2grid_lab.fit.queries import KnownWindow, office_floor, pairs_of
 from pc2grid_lab.recordings.catalogue import Catalogue
 from pc2grid_lab.recordings.run import Folder
 from signature.config import Config
@@ -42,12 +42,12 @@ def test_windows_are_taken_one_at_a_time_where_the_map_knows_them(monkeypatch: p
         end = truth
     query, pair = window.map(), Catalogue.of().pairs[0]
 
-    def known() -> Iterator[Window]:
+    def known() -> Iterator[KnownWindow]:
         for covered in (False, True, True):
             taken.append(covered)
-            yield Window(pair, TimeSpan(0.0, 3.0), query, None, query, {"office": end}, covered)
+            yield KnownWindow(pair, TimeSpan(0.0, 3.0), query, None, query, {"office": end}, covered)
 
-    monkeypatch.setattr(queries, "index_of", lambda _: OFFICE)
+    monkeypatch.setattr(queries, "index_of_database", lambda _: OFFICE)
     asked = queries.in_maps(known(), Folder(Path("data"), Path("work")))
     _, T_map_query, ((grid, _),) = next(asked)
     assert taken == [False, True] and grid is OFFICE.grids[0]

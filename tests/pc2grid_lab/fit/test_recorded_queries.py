@@ -4,7 +4,7 @@ import math
 
 from pc2grid.observer import TimeSpan
 from pc2grid_lab.fit.posterior import known_of
-from pc2grid_lab.fit.queries import Window, rows
+from pc2grid_lab.fit.queries import KnownWindow, rows
 from pc2grid_lab.recordings.catalogue import Catalogue
 from signature.config import Config
 from signature.localization.query import Query
@@ -21,7 +21,7 @@ def test_each_question_says_what_tells_for_its_places() -> None:
     last.add(registered, planar_scan)
     catalogue = Catalogue.of()
     pair = next(pair for pair in catalogue.pairs if (pair.query, pair.map) == ("wean 1", "wean 2"))
-    window = Window(pair, TimeSpan(0.0, 20.0), whole.map(), None, last.map(), {"office": end}, True)
+    window = KnownWindow(pair, TimeSpan(0.0, 20.0), whole.map(), None, last.map(), {"office": end}, True)
     asked = list(
         rows(window, building({"office": office()}), {"fr079": building({"other": OTHER})}, catalogue)
     )

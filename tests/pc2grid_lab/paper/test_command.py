@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from pc2grid.errors import ConfigError, MapFileError
@@ -18,7 +17,7 @@ from pc2grid.io.maps import save_map
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
 from pc2grid_cli import console
-from pc2grid_lab.commands import compare_paper_command
+from pc2grid_cli.main import app
 from pc2grid_lab.paper import experiment
 from pc2grid_lab.paper.experiment import (
     NOISE_LEVELS,
@@ -35,15 +34,14 @@ from pc2grid_lab.paper.tables import (
     TABLE_3,
     TABLE_4,
     _cell,
-    cells_of,
+    computed_cells,
     paper_tasks,
     read_map,
     that_share_submaps,
 )
 from tests.helpers.rooms import cross, grid_of, l_shape, rectangle
 
-app = typer.Typer()
-app.command()(compare_paper_command)
+COMPARE = ("compare", "paper")
 runner = CliRunner()
 
 
@@ -66,7 +64,7 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
     maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(console, "_LINE_EVERY_S", 0.0)
-    arguments = ["--maps", str(maps), "--out", str(tmp_path), "--queries", "4", "--jobs", "1"]
+    arguments = [*COMPARE, "--maps", str(maps), "--out", str(tmp_path), "--queries", "4", "--jobs", "1"]
     arguments += ["--offset", "0.5", "--methods", "proposed", "--methods", "as_used_here"]
     first = runner.invoke(app, arguments)
     assert first.exit_code == 0, first.output
@@ -90,8 +88,8 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
 
 
 def test_the_tables_answer_one_question_after_the_other(maps: Path, tmp_path: Path) -> None:
-    arguments = ["--maps", str(maps), "--out", str(tmp_path), "--queries", "3", "--jobs", "1", "--ablation"]
-    arguments += ["--offset", "1.0"]
+    arguments = [*COMPARE, "--maps", str(maps), "--out", str(tmp_path), "--queries", "3", "--jobs", "1"]
+    arguments += ["--offset", "1.0", "--ablation"]
     for method in ("unlearned", "proposed_ln_bc", "sdf", "proposed"):
         arguments += ["--methods", method]
     shown = runner.invoke(app, arguments).stdout
@@ -110,7 +108,7 @@ def test_of_several_maps_the_mean_difference_has_a_narrower_interval(maps: Path,
         for t in paper_tasks([maps / "intel.yaml"], methods=["unlearned"], offsets_m=[1.0], queries=4, seed=1)
         if t.level == 0
     ]
-    (cell,) = cells_of([task], tmp_path)
+    (cell,) = computed_cells([task], tmp_path)
     half = MatchMeasures(0.02, 0.02, 0.02, 0.02)
     cells = [
         replace(cell, task=replace(task, map_path=Path(f"{name}.yaml")), half_widths=half)
@@ -149,7 +147,7 @@ def test_queries_are_drawn_once_a_level_and_databases_fitted_once(
     with monkeypatch.context() as patched:
         patched.setattr(experiment, "draw_queries", drawing)
         patched.setattr(DistanceFeatures, "fit", fitting)
-        found = cells_of(groups[0], tmp_path)
+        found = computed_cells(groups[0], tmp_path)
     assert (len(fitted), len(drawn)) == (1, 3)
     grid = read_map(maps / "intel.yaml")
     submaps = partition(grid, PartitionConfig.paper())
@@ -163,7 +161,8 @@ def test_queries_are_drawn_once_a_level_and_databases_fitted_once(
 def test_the_ablation_and_any_floor(tmp_path: Path) -> None:
     """A floor that the paper does not have gets its own column, without published figures."""
     save_map(grid_of(np.hstack([cross(6.0, 2.0), rectangle(8.0, 5.0), l_shape()])), tmp_path / "depot")
-    arguments = ["--maps", str(tmp_path / "depot.yaml"), "--out", str(tmp_path / "out"), "--queries", "3"]
+    arguments = [*COMPARE, "--maps", str(tmp_path / "depot.yaml"), "--out", str(tmp_path / "out")]
+    arguments += ["--queries", "3"]
     arguments += ["--jobs", "1", "--offset", "1.0", "--methods", "proposed", "--ablation"]
     run = runner.invoke(app, arguments)
     assert run.exit_code == 0, run.output
@@ -197,7 +196,7 @@ def test_intervals_shrink_with_more_queries() -> None:
 def test_wrong_arguments_say_what_is_wrong(
     options: list[str], kind: type[Exception], words: str, maps: Path, tmp_path: Path
 ) -> None:
-    error = runner.invoke(app, ["--maps", str(maps), "--out", str(tmp_path), *options]).exception
+    error = runner.invoke(app, [*COMPARE, "--maps", str(maps), "--out", str(tmp_path), *options]).exception
     assert isinstance(error, kind) and words in str(error)
 
 

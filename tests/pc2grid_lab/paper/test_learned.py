@@ -14,8 +14,8 @@ from pc2grid.io.maps import save_map
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
 from pc2grid_lab.paper import methods
-from pc2grid_lab.paper.methods import COLUMNS, CONFIG, Learned, Unlearned, Vectors, vector, weight
-from pc2grid_lab.paper.tables import cells_of, paper_tasks, read_map
+from pc2grid_lab.paper.methods import COLUMNS, CONFIG, Learned, Unlearned, Vectors, submap_vector, weight
+from pc2grid_lab.paper.tables import computed_cells, paper_tasks, read_map
 from signature.boundary import boundary_edges, boundary_points
 from signature.paper import describe
 from tests.helpers.field import DATA
@@ -33,7 +33,7 @@ from tests.helpers.rooms import (
 
 def test_a_vector_has_the_shares_of_weighed_pairs() -> None:
     submap = submap_of(random_rooms(2))
-    found = vector(submap)
+    found = submap_vector(submap)
     edges = boundary_edges(submap, CONFIG)
     points_m = (boundary_points(edges, RESOLUTION_M, CONFIG) - (np.array(edges.shape) - 1) / 2) * RESOLUTION_M
     away_m = np.hypot(*points_m.T)
@@ -58,7 +58,7 @@ def test_a_vector_has_the_shares_of_weighed_pairs() -> None:
 
 
 def test_of_an_empty_submap_all_is_zero() -> None:
-    assert not vector(submap_of(canvas())).any()
+    assert not submap_vector(submap_of(canvas())).any()
 
 
 def test_a_point_weighs_less_the_farther_it_is() -> None:
@@ -75,7 +75,10 @@ def test_the_distance_is_that_of_mahalanobis_with_a_shrunk_covariance() -> None:
     covariance = within[:, columns].T @ within[:, columns] / 600
     covariance = 0.4 * covariance + 0.6 * np.diag(np.diag(covariance))
     query = submap_of(random_rooms(1))
-    rows, wanted = np.array([vector(room) for room in rooms])[:, columns], vector(query)[None, columns]
+    rows, wanted = (
+        np.array([submap_vector(room) for room in rooms])[:, columns],
+        submap_vector(query)[None, columns],
+    )
     plain = cdist(wanted, rows, "mahalanobis", VI=np.linalg.inv(covariance))[0]
     found = Learned(Vectors(), parts, within).fit(rooms).similarities(query)
     np.testing.assert_allclose(-found, plain, rtol=1e-4)
@@ -84,9 +87,9 @@ def test_the_distance_is_that_of_mahalanobis_with_a_shrunk_covariance() -> None:
 def test_without_learning_the_distances_of_the_parts_are_added() -> None:
     rooms, query = [submap_of(rectangle(8.0, 5.0)), submap_of(l_shape())], submap_of(random_rooms(1))
     found = Unlearned(Vectors(), {"boundary": 0.7, "radial": 0.3}).fit(rooms).similarities(query)
-    asked = vector(query)
+    asked = submap_vector(query)
     for room, similarity in zip(rooms, found, strict=True):
-        bc = [(asked * vector(room))[COLUMNS[part]].sum() for part in ("boundary", "radial")]
+        bc = [(asked * submap_vector(room))[COLUMNS[part]].sum() for part in ("boundary", "radial")]
         assert -similarity == pytest.approx(0.7 * (1 - bc[0]) ** 0.5 + 0.3 * (1 - bc[1]) ** 0.5, abs=1e-6)
 
 
@@ -105,13 +108,13 @@ def test_nothing_is_learned_from_the_map_that_is_asked(
         )
         if t.level == 2
     )
-    (cell,) = cells_of([task], tmp_path / "cells")
+    (cell,) = computed_cells([task], tmp_path / "cells")
     kept = sorted(file.name.split(".")[1] for file in (tmp_path / "cells").glob("differences.*"))
     assert kept == ["b", "c"] and len(cell.matches.correct) == 3
     (tmp_path / "maps/b.yaml").unlink()
     (tmp_path / "maps/c.yaml").unlink()
     with pytest.raises(MapFileError, match="no other map to learn from"):
-        cells_of([replace(task, level=0)], tmp_path / "cells")
+        computed_cells([replace(task, level=0)], tmp_path / "cells")
 
 
 def test_on_a_real_floor_it_is_right_more_often_than_the_paper(
@@ -131,5 +134,5 @@ def test_on_a_real_floor_it_is_right_more_often_than_the_paper(
         for t in paper_tasks([maps / "csail.yaml"], methods=names, offsets_m=[1.0], queries=40, seed=1)
         if (t.level, t.radius_m) == (2, 8.0)
     ]
-    right = {cell.task.method: cell.measures.r_at_1 for cell in cells_of(tasks, tmp_path)}
+    right = {cell.task.method: cell.measures.r_at_1 for cell in computed_cells(tasks, tmp_path)}
     assert right["learned"] > right["unlearned"] > right["proposed"], right

@@ -10,7 +10,7 @@ import pytest
 from pc2grid.geometry import F64
 from pc2grid.model import Submap
 from pc2grid_lab.paper.experiment import Matcher, Method, rotated_submap
-from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, Proposed, make_methods, vector
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, Proposed, make_methods, submap_vector
 from pc2grid_lab.paper.rivals import DistanceFeatures, ShapeContext
 from signature.config import SignatureConfig
 from signature.freespace import freespace_paths
@@ -41,7 +41,7 @@ def within() -> F64:
     """How other rooms differ from themselves after a turn."""
     others = [submap_of(random_rooms(seed)) for seed in range(10, 14)]
     turned = [rotated_submap(s.grid, s.center_m, 8.0, 1.0 + k) for k, s in enumerate(others)]
-    return np.array([vector(a) for a in turned]) - np.array([vector(b) for b in others])
+    return np.array([submap_vector(a) for a in turned]) - np.array([submap_vector(b) for b in others])
 
 
 @pytest.mark.parametrize("name", ALL)

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from pc2grid.io.maps import load_map, save_map
 from pc2grid.model import OccupancyGrid
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
-from pc2grid_lab.commands import compare_scale_command
+from pc2grid_cli.main import app
 from pc2grid_lab.paper import methods, scale
 from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, draw_queries
 from pc2grid_lab.paper.methods import make_methods
@@ -89,9 +88,8 @@ def test_counts_are_those_of_the_methods_of_the_tables(level: int, maps: Path, t
 def test_a_run_draws_the_curves_and_the_next_one_only_reads_its_counts(
     maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    app = typer.Typer()
-    app.command()(compare_scale_command)
-    arguments = ["--maps", str(maps), "--out", str(tmp_path / "out"), "--queries", "3", "--jobs", "1"]
+    arguments = ["compare", "scale", "--maps", str(maps), "--out", str(tmp_path / "out")]
+    arguments += ["--queries", "3", "--jobs", "1"]
     first = CliRunner().invoke(app, arguments)
     assert first.exit_code == 0, first.output
     assert (tmp_path / "out/scale.png").read_bytes().startswith(b"\x89PNG")

@@ -29,7 +29,7 @@ from pc2grid_lab.peers.programs import (
     _tasks,
     answers,
     best_threshold,
-    missing,
+    how_to_install,
     save_beams,
 )
 from pc2grid_lab.runner import once
@@ -118,7 +118,7 @@ def test_the_carmen_log_has_a_line_for_each_step_of_motion() -> None:
 def test_what_is_missing_is_named_with_its_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setattr(programs, "ENVIRONMENT", tmp_path / "none")
-    commands = {kind.name: missing(kind) for kind in PEERS}
+    commands = {kind.name: how_to_install(kind) for kind in PEERS}
     assert commands["pc2grid"] is None and commands["fpfh-ransac"] is None
     assert commands["particle-filter"] == "apt-get install mrpt-apps"
     assert PINS[0] in (commands["map-closures"] or "") and PINS[1] in (commands["kiss-matcher"] or "")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid_lab.recordings.catalogue import KINDS, PAIRS, RECORDINGS, Catalogue, evenly_spaced
+from pc2grid_lab.recordings.catalogue import PAIR_KINDS, PAIRS, RECORDINGS, Catalogue, evenly_spaced
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[4] / ".." / "shared" / "data"))
 needs_data = pytest.mark.skipif(not (DATA / "README.md").is_file(), reason="PC2GRID_DATA is not there")
@@ -47,7 +47,7 @@ def test_names_are_unique_and_pairs_name_recordings() -> None:
             assert len(files) == 1, pair
         else:
             assert pair.query != pair.map, pair
-    assert {pair.kind for pair in PAIRS} == set(KINDS)
+    assert {pair.kind for pair in PAIRS} == set(PAIR_KINDS)
 
 
 def test_the_quick_form_is_a_part_of_all() -> None:
@@ -56,7 +56,7 @@ def test_the_quick_form_is_a_part_of_all() -> None:
     for pair in quick.pairs:
         few, all_ = quick.windows(pair, 300.0), whole.windows(pair, 300.0)
         assert set(few) < set(all_)
-    assert {pair.kind for pair in quick.pairs} == set(KINDS)
+    assert {pair.kind for pair in quick.pairs} == set(PAIR_KINDS)
 
 
 def test_only_names_recordings_buildings_sensors_and_kinds() -> None:

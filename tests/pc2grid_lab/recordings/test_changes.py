@@ -17,7 +17,7 @@ from pc2grid_lab.recordings.table import (
     RowChange,
     Table,
     changes,
-    page,
+    markdown_page,
     sensor_matrix,
     show,
 )
@@ -139,7 +139,7 @@ def test_the_page_shows_each_row() -> None:
         pair_row(problem="laser/x.mcap: not in the data folder", query="x"),
         pair_row("wrong", kind="elsewhere", truth="elsewhere", building="intel"),
     )
-    text = page(table(*rows), [RowChange(row="hall", text="error 0.030 -> 0.730 m", worse=True)])
+    text = markdown_page(table(*rows), [RowChange(row="hall", text="error 0.030 -> 0.730 m", worse=True)])
     (bent,) = [line for line in text.splitlines() if line.startswith("| hall | hall | lidar")]
     assert "bent (false)" in bent and "| 0.030 |" in bent
     assert "| wean\\|3 |" in text and "internal error: KeyError |" in text
@@ -186,7 +186,7 @@ def test_answers_that_are_not_judged_are_counted_beside_right_and_wrong() -> Non
     located = replace(query(0, "right"), right=None)
     row = pair_row(queries=(query(1, "right"), query(2, "refused"), located), sensors="laser in map")
     assert (row.counts.right, row.counts.wrong, row.counts.unjudged, row.counts.refused) == (1, 0, 1, 1)
-    text = page(table(row))
+    text = markdown_page(table(row))
     assert "0 wrong, 1 not judged (1 building)" in text
     assert "No answer that is judged is wrong." in text and "## Not judged" in text
     assert "not judged" not in sensor_matrix(table(pair_row("right", "wrong")))[2]
@@ -195,7 +195,7 @@ def test_answers_that_are_not_judged_are_counted_beside_right_and_wrong() -> Non
 def test_wrong_answers_are_counted_by_confidence_and_by_drive() -> None:
     sure = pair_row("right", "wrong", "wrong", query="d")
     unsure = replace(query(1, "refused"), confidence=0.6)
-    text = page(table(sure, pair_row("right", query="e"), pair_row(queries=(unsure,))))
+    text = markdown_page(table(sure, pair_row("right", query="e"), pair_row(queries=(unsure,))))
     section = text.split("## By confidence")[1].split("##")[0]
     assert "| 0.99 and above | 4 | 2 of 4 [0.07, 0.93] | 1 of 2 [0.01, 0.99] |" in section
     assert "| 0.50 to 0.75 | 0 | 0 of 1 [0.00, 0.97] | 0 of 1 [0.00, 0.97] |" in section
@@ -215,7 +215,7 @@ def test_what_nobody_judges_is_not_called_right(
 ) -> None:
     found = table(map_row(), pair_row(queries=queries, truth=None))
     show(found)
-    assert words in page(found) and words in capsys.readouterr().out
+    assert words in markdown_page(found) and words in capsys.readouterr().out
 
 
 def test_a_terminal_shows_each_row(capsys: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid.simulate.scene import extrude
 from pc2grid_cli.main import app
 from pc2grid_lab.recordings import catalogue, run
-from pc2grid_lab.recordings.catalogue import Drive, Pair, Recording
+from pc2grid_lab.recordings.catalogue import Pair, Recording, SimulatedDrive
 from pc2grid_lab.recordings.run import Followed
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.shared_folders import shared_folder
@@ -34,7 +34,7 @@ RECORDINGS = (
         file="floor.obj",
         building="office",
         sensor="lidar",
-        drive=Drive(sensor="lidar", length_m=18.0, seed=2),
+        drive=SimulatedDrive(sensor="lidar", length_m=18.0, seed=2),
         mapped=False,
         poses="floor.obj",
         of_base=True,

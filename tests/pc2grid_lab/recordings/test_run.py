@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from pc2grid_lab.runner import Finished, Task, kept, run_tasks
+from pc2grid_lab.runner import Finished, Task, kept_result, run_tasks
 
 
 @pytest.mark.parametrize(("code", "is_kept"), [(0, True), (1, True), (-11, True), (130, False), (143, False)])
@@ -16,4 +16,4 @@ def test_a_command_that_was_stopped_is_done_by_the_next_run(tmp_path: Path, code
     file, told = tmp_path / "answers" / "a.json", list[float]()
     run_tasks([Task(file, lambda: done, 0.0)], 1, told.append)
     assert told == [1]
-    assert (kept(file) is not None) == is_kept
+    assert (kept_result(file) is not None) == is_kept

@@ -228,7 +228,7 @@ HOW = {
 @pytest.mark.parametrize("part", PART)
 @pytest.mark.parametrize("how", HOW)
 def test_a_damaged_part_is_named_and_costs_as_little_as_it_can(
-    place: maintenance.Place, part: str, how: str, tmp_path: Path
+    place: maintenance.Location, part: str, how: str, tmp_path: Path
 ) -> None:
     """A search needs grids and submaps; a copy also poses and loops, and makes the rest again."""
     (statement, what), where = HOW[how], f"{part} of session 'monday'"
@@ -254,7 +254,7 @@ def test_a_damaged_part_is_named_and_costs_as_little_as_it_can(
 
 
 @pytest.mark.parametrize("how", HOW)
-def test_a_session_that_is_damaged_itself_is_left_out(place: maintenance.Place, how: str) -> None:
+def test_a_session_that_is_damaged_itself_is_left_out(place: maintenance.Location, how: str) -> None:
     if how == "lost" and isinstance(place, str):
         pytest.skip("a server refuses it")
     sql(place, HOW[how][0].format("session") + " WHERE id = 1")
@@ -278,7 +278,7 @@ def assert_only(database: SubmapDatabase, names: list[str]) -> None:
             database.grid("monday")
 
 
-def test_a_wholly_damaged_database_is_refused(place: maintenance.Place) -> None:
+def test_a_wholly_damaged_database_is_refused(place: maintenance.Location) -> None:
     sql(place, "UPDATE part SET crc32 = crc32 + 1 WHERE name = 'submaps'")
     with (
         open_database(place) as database,
@@ -317,7 +317,7 @@ def test_relocalize_leaves_a_damaged_session_out_with_a_warning(
 # --- fault 45: many readers, two writers --------------------------------------------------------------
 
 
-def _write(place: maintenance.Place, mine: str, until: float, results: Any) -> None:
+def _write(place: maintenance.Location, mine: str, until: float, results: Any) -> None:
     """Add sessions and replace them with others of the name, as fast as it goes; one of them both write."""
     done = busy = number = 0
     while time.time() < until:
@@ -331,7 +331,7 @@ def _write(place: maintenance.Place, mine: str, until: float, results: Any) -> N
     results.put(("written", done, busy))
 
 
-def _read(place: maintenance.Place, known: dict[str, set[str]], until: float, results: Any) -> None:
+def _read(place: maintenance.Location, known: dict[str, set[str]], until: float, results: Any) -> None:
     """Read everything repeatedly: every session is complete and equals one that was written."""
     done = 0
     while time.time() < until:
@@ -346,7 +346,7 @@ def _read(place: maintenance.Place, known: dict[str, set[str]], until: float, re
 def test_fuzz_eight_readers_and_two_writers(path: Path, engine: str, monkeypatch) -> None:
     """No error but busy, no torn read; sessions that were not changed are still there."""
     folder = path.parent
-    place: maintenance.Place = path
+    place: maintenance.Location = path
     if engine == "postgres":
         place = postgresql.new_database()
         monkeypatch.setattr(postgres, "BUSY_TIMEOUT_S", 1.0)  # whole seconds there
@@ -480,7 +480,7 @@ def test_structure_that_no_row_shows(path: Path, statement: str, words: str) -> 
     assert any(words in problem.what for problem in problems), problems
 
 
-def test_what_follows_from_the_map_is_made_again(empty: maintenance.Place, tmp_path: Path) -> None:
+def test_what_follows_from_the_map_is_made_again(empty: maintenance.Location, tmp_path: Path) -> None:
     """Damaged submaps, signatures, graphs and views cost nothing; a damaged grid costs the session."""
     place = empty
     config, grid = Config(), small_house()
@@ -515,7 +515,7 @@ def test_names_that_cannot_be_files(tmp_path: Path) -> None:
         open_database(tmp_path / ("a" * 300))
 
 
-def test_words_that_are_no_text_are_shown(empty: maintenance.Place) -> None:
+def test_words_that_are_no_text_are_shown(empty: maintenance.Location) -> None:
     """As a shell or a file system of another encoding gives them."""
     session_map, signatures, origin = make_entry("friday", 5)
     label = Label(building="north\udcff", floor="\udcff")

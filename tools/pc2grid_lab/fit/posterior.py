@@ -40,7 +40,7 @@ RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
 that count as true are good to some centimetres."""
 NEAR_M = 1.0
 """Answers so near to the place of a query that is not in the map are left out: neither right nor wrong."""
-KINDS = {
+QUERY_KINDS = {
     "in the map": "in its own building",
     "elsewhere": "in another building",
     "blanked": "place blanked",
@@ -87,11 +87,11 @@ def known_of(rows: Iterable[dict[str, Any]]) -> Iterator[Known]:
         if not errors or beside or (own and not math.isfinite(errors[0][0])):
             continue
         yield Known(
-            kind=KINDS[row["place"]],
+            kind=QUERY_KINDS[row["place"]],
             buildings=frozenset((row["log"], row["map"])),
             session=f"{row['log']} {row['start']}",
             places=tuple(Evidence(**evidence) for evidence in row["evidence"]),
-            first=next((k for k, error in enumerate(errors) if own and is_right(error)), None),
+            first=next((k for k, error in enumerate(errors) if own and is_near(error)), None),
         )
 
 
@@ -99,7 +99,7 @@ Q = TypeVar("Q", "Known", "Compared")
 P = TypeVar("P")
 
 
-def is_right(error: Sequence[float]) -> bool:
+def is_near(error: Sequence[float]) -> bool:
     """Return whether a place is right, by metres and radians from the truth."""
     return error[0] <= RIGHT_M and error[1] <= RIGHT_RAD
 
@@ -238,11 +238,11 @@ def compared_of(rows: Iterable[dict[str, Any]]) -> Iterator[Compared]:
             buildings=frozenset((row["log"], row["map"])),
             in_plane=masses(places),
             terms=terms,
-            right=frozenset(k for k, error in errors.items() if is_right(error)),
+            right=frozenset(k for k, error in errors.items() if is_near(error)),
         )
 
 
-def fit_in_space(queries: Sequence[Compared]) -> F64:
+def fit_factor_in_space(queries: Sequence[Compared]) -> F64:
     """Fit the parameters (4,) under which the truth is likeliest."""
     weights = balanced(np.array([bool(q.right) for q in queries]))
 
@@ -298,8 +298,8 @@ def print_plane(rows: Sequence[dict[str, Any]]) -> None:
 def print_space(rows: Sequence[dict[str, Any]]) -> None:
     """Fit, judge and print those of its factor in space."""
     queries = list(compared_of(rows))
-    in_space = fit_in_space(queries)
-    judged = (q.masses(x) for q, x in zip(queries, left_out(queries, fit_in_space), strict=True))
+    in_space = fit_factor_in_space(queries)
+    judged = (q.masses(x) for q, x in zip(queries, left_out(queries, fit_factor_in_space), strict=True))
     print_in_space(queries, "in the plane", (q.in_plane for q in queries))
     print_in_space(queries, "in use", (q.masses(_IN_USE) for q in queries))
     print_in_space(queries, "in use, shuffled", (q.masses(_IN_USE) for q in shuffled(queries)))

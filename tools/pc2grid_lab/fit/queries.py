@@ -59,7 +59,7 @@ from signature.localization.query import Query, QueryInSpace, QueryMap, best_obs
 from signature.visible import PROFILE_BEARINGS, seen_signatures, viewpoints_of
 from signature.weights import Pairs, SeenStatistics
 
-TRAVELS_M = (1.0, 3.0, 8.0)
+ASKED_AFTER_M = (1.0, 3.0, 8.0)
 """Metres of travel after which a query is asked."""
 _VIEWS = 16
 """Views of each query, closer together than those that are looked up."""
@@ -84,12 +84,12 @@ def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
 
 
 def queries_of(session: RegisteredSession, config: Config) -> Iterator[tuple[QueryMap, SE2]]:
-    """Yield the query after each of `TRAVELS_M`: what has been seen, and its true frame in the plan.
+    """Yield the query after each of `ASKED_AFTER_M`: what has been seen, and its true frame in the plan.
 
     Without those whose true pose is not known.
     """
     query, path_m = Query(config, config.relocalize), session.path_m()
-    asked_after = np.array([np.argmax(path_m >= d) for d in TRAVELS_M if d <= path_m.max(initial=0.0)])
+    asked_after = np.array([np.argmax(path_m >= d) for d in ASKED_AFTER_M if d <= path_m.max(initial=0.0)])
     for number, scan in enumerate(session.scans()):
         if not session.lost[number]:
             query.add(*scan)
@@ -109,7 +109,7 @@ Drawn = tuple[OccupancyGrid, list[RegisteredSession]]
 def read(data: Path, name: str, queries: int, kept: Path, config: Config) -> Drawn:
     """Read the map of the first part of a log, and its later parts as registered queries; `kept` has them."""
     log = data / "laser" / f"{name}.mcap"
-    travel_m, mapped_s = TRAVELS_M[-1] + 2.0, MAPPED_S[name]
+    travel_m, mapped_s = ASKED_AFTER_M[-1] + 2.0, MAPPED_S[name]
     site = recorded_site(log, kept / name, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s)
     sessions = [RegisteredSession.load(site.stem(number).with_suffix(".pickle")) for number in site.queries()]
     return load_map(site.map_stem.with_suffix(".yaml")), sessions
@@ -168,7 +168,7 @@ OTHERS = (
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class KnownWindow:
     """A window with its query, whole, in space, and standing, and where its base is in each session of its
     map."""
 
@@ -181,7 +181,7 @@ class Window:
     covered: bool
 
 
-def windows(catalogue: Catalogue, folder: Folder) -> Iterator[Window]:
+def windows(catalogue: Catalogue, folder: Folder) -> Iterator[KnownWindow]:
     """Yield every window whose place is known, or that is of another building."""
     judge = Judge(catalogue, folder)
     for pair in catalogue.pairs:
@@ -199,11 +199,11 @@ def windows(catalogue: Catalogue, folder: Folder) -> Iterator[Window]:
             except Pc2GridError:
                 continue
             last.add(*scan)
-            yield Window(pair, span, query.map(), query.in_space, last.map(), truth, seen)
+            yield KnownWindow(pair, span, query.map(), query.in_space, last.map(), truth, seen)
 
 
 def rows(
-    window: Window, index: MapIndex, others: Mapping[str, MapIndex], catalogue: Catalogue
+    window: KnownWindow, index: MapIndex, others: Mapping[str, MapIndex], catalogue: Catalogue
 ) -> Iterator[dict[str, Any]]:
     """Yield the evidence of the places of a window, in its map and in those of other buildings, by name."""
     building = {name: r.building for name, r in catalogue.recordings.items()}
@@ -267,7 +267,7 @@ def _error(
     return (math.inf, math.pi) if expected is None else apart(expected, T_map_base)
 
 
-def _blanked(index: MapIndex, window: Window) -> MapIndex:
+def _blanked(index: MapIndex, window: KnownWindow) -> MapIndex:
     """Return the index with all that the window sees made unknown."""
     query, grids = window.whole, dict(zip(index.sessions, index.grids, strict=True))
     for name, T_map_base in window.truth.items():
@@ -290,7 +290,7 @@ def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> Occupan
 
 
 @functools.cache
-def index_of(database: Path) -> MapIndex:
+def index_of_database(database: Path) -> MapIndex:
     """Return the maps of a database, which stays open: they are read when they are first used."""
     opened = open_database(database)
     return MapIndex.of(opened, opened.config())
@@ -311,12 +311,12 @@ def in_logs(logs: Mapping[str, Drawn], config: Config) -> Iterator[Asked]:
                 yield query, T_map_query, [(grid, SE2())]
 
 
-def in_maps(known: Iterable[Window], folder: Folder) -> Iterator[Asked]:
+def in_maps(known: Iterable[KnownWindow], folder: Folder) -> Iterator[Asked]:
     """Yield windows of recordings, each in the session of its map that shows its place; one is in memory at a
     time, as those of a lidar hold its points."""
     for window in known:
         if window.covered:
-            index = index_of(folder.map(window.pair.map_name))
+            index = index_of_database(folder.map(window.pair.map_name))
             session, T_map_base = next(iter(window.truth.items()))
             grid = index.grids[index.sessions.index(session)]
             yield window.whole, T_map_base @ window.whole.T_odom_base.inverse(), [(grid, SE2())]
@@ -345,8 +345,10 @@ def evidence(
         if not others:
             raise SystemExit(f"{folder.work}: holds no map of another building")
         chosen = others if everywhere else [others[number % len(others)]]
-        elsewhere = {name: index_of(folder.map(name)) for name in chosen}
-        collected.extend(rows(window, index_of(folder.map(window.pair.map_name)), elsewhere, catalogue))
+        elsewhere = {name: index_of_database(folder.map(name)) for name in chosen}
+        collected.extend(
+            rows(window, index_of_database(folder.map(window.pair.map_name)), elsewhere, catalogue)
+        )
         out.write_text(json.dumps(collected))
         print(window.pair.query, "in", window.pair.map_name, f"{window.span.start_s:.1f} s", flush=True)
 
@@ -377,7 +379,9 @@ def weights(
     floors = [load_map(data / "maps" / f"{name}.yaml") for name in names]
     floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
     floors += [grid for grid, _ in drawn.values()]
-    floors += [index_of(folder.map(name)).grids[0] for name in sorted({pair.map_name for pair in asked})]
+    floors += [
+        index_of_database(folder.map(name)).grids[0] for name in sorted({pair.map_name for pair in asked})
+    ]
     known = windows(replace(catalogue, pairs=tuple(asked)), folder)
     pairs = pairs_of(chain(in_logs(drawn, config), in_maps(known, folder)), floors, config)
     SeenStatistics.of(pairs).save(out)

@@ -16,7 +16,6 @@ from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.metrics import auc, precision_recall_curve
 
 from pc2grid.geometry import F64, I64
 from pc2grid.libraries import compiled
@@ -106,6 +105,8 @@ class PrecisionRecall:
         """Return the area under the curve (AUPRC), trapezoids from (0, precision of the first point)."""
         if len(self.recall) == 0:
             return 0.0
+        from sklearn.metrics import auc
+
         return float(auc([0.0, *self.recall], [self.precision[0], *self.precision]))
 
     @property
@@ -125,6 +126,8 @@ def precision_recall(similarity: F64, correct: NDArray[np.bool_]) -> PrecisionRe
     """Return the curve of best matches with similarity (Q,) and truth (Q,); empty if no match is true."""
     if not correct.any():
         return PrecisionRecall(recall=np.empty(0), precision=np.empty(0))
+    from sklearn.metrics import precision_recall_curve
+
     precision, recall, _ = precision_recall_curve(correct, similarity)
     # scikit-learn begins at the lowest threshold, and ends with a point that no match has.
     return PrecisionRecall(recall=recall[-2::-1], precision=precision[-2::-1])

@@ -107,7 +107,7 @@ def weight(distance_m: F64, full_m: float, none_m: float) -> F64:
     return np.asarray(0.5 + 0.5 * np.cos(np.pi * np.clip((distance_m - full_m) / (none_m - full_m), 0, 1)))
 
 
-def vector(submap: Submap) -> F64:
+def submap_vector(submap: Submap) -> F64:
     """Return all parts of a submap of 8 m (SIZE,): square roots of shares, and the symmetry as a share of
     white.
 
@@ -151,7 +151,7 @@ UNLEARNED = {"boundary": 0.5, "near": 0.4, "radial": 0.1}
 
 @dataclass(slots=True)
 class Vectors:
-    """`vector`, with the last submap cached: methods that share it describe a query once."""
+    """`submap_vector`, with the last submap cached: methods that share it describe a query once."""
 
     _read: Submap | None = None
     _vector: F64 = field(default_factory=lambda: np.empty(0))
@@ -159,7 +159,7 @@ class Vectors:
     def of(self, submap: Submap) -> F64:
         """Return the vector of a submap."""
         if self._read is not submap:
-            self._read, self._vector = submap, vector(submap)
+            self._read, self._vector = submap, submap_vector(submap)
         return self._vector
 
 
@@ -167,11 +167,11 @@ def differences(grid: OccupancyGrid, submaps: Sequence[Submap], seed: int) -> F6
     """Return the vectors (Q, SIZE) of queries of a map, without noise, less those of the submaps of their
     places."""
     centers_m = np.array([submap.center_m for submap in submaps])
-    table = np.array([vector(submap) for submap in submaps])
+    table = np.array([submap_vector(submap) for submap in submaps])
     experiment = Experiment(queries=LEARNED_FROM, seed=seed)
     queries = list(draw_queries(grid, centers_m, submaps[0].radius_m, experiment, NOISE_LEVELS[0]))
     own = cKDTree(centers_m).query([query.center_m for query in queries])[1]
-    return np.asarray(np.array([vector(query) for query in queries]) - table[own])
+    return np.asarray(np.array([submap_vector(query) for query in queries]) - table[own])
 
 
 def metric(within: F64) -> F64:

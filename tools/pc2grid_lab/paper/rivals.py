@@ -29,8 +29,6 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from sklearn.cluster import KMeans
-from sklearn.feature_extraction.text import TfidfTransformer
 
 from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.libraries import compiled
@@ -373,6 +371,8 @@ class Vocabulary:
 
     def learn(self, submaps: Sequence[Submap]) -> F64:
         """Learn the words from the features of N submaps; counts of each word in each submap (N, words)."""
+        from sklearn.cluster import KMeans
+
         if self._learned is submaps:
             return self.counts
         features = [self.feature(submap_image(submap)) for submap in submaps]
@@ -415,6 +415,8 @@ class Words:
 
     def fit(self, submaps: Sequence[Submap]) -> _Counts:
         """Learn the words and their weights from the submaps of a map."""
+        from sklearn.feature_extraction.text import TfidfTransformer
+
         counts = self.vocabulary.learn(submaps)
         weights = np.ones(counts.shape[1])
         if self.tfidf and counts.size:

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 from scipy.stats import hypergeom
 
+from pc2grid import libraries
 from pc2grid.geometry import F64, I64
 from pc2grid.io.maps import load_map
 from pc2grid.model import OccupancyGrid, Submap
@@ -28,6 +29,7 @@ from pc2grid.simulate.plan import office_floorplan
 from pc2grid.submaps.submaps import partition
 from pc2grid_cli.console import Console, json_text
 from pc2grid_cli.output import make_folder, show, table
+from pc2grid_lab.commands import CompareScale
 from pc2grid_lab.pages import picture
 from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, draw_queries
 from pc2grid_lab.paper.methods import BOUNDARY_PARTS, COLUMNS, Signatures, boundary_vector, metric
@@ -44,7 +46,7 @@ FACTORS = (1.0, 0.8)
 distances nor one of path lengths changes."""
 FLOORS = 12
 """Simulated office floors beside them."""
-KINDS = ("real", "rescaled", "simulated", "own building")
+PLACE_KINDS = ("real", "rescaled", "simulated", "own building")
 """Of places that are not the right one."""
 APART_M = 3.0
 """A place of the own building is another one if it is so far from the query."""
@@ -69,7 +71,7 @@ class Described:
 
 
 @dataclass(frozen=True, slots=True)
-class Source:
+class MapSource:
     """A map whose places are in the database: name and kind of the building, file of its places."""
 
     building: str
@@ -84,20 +86,22 @@ class Source:
         )
 
 
-def sources_of(maps: Path) -> list[Source]:
+def sources_of(maps: Path) -> list[MapSource]:
     """Return the maps beside each other in a folder, at all sizes, and the simulated floors."""
     found = [
-        Source(path.stem, int(factor != 1.0), f"{path.stem}.x{factor:g}", partial(_sized, path, factor))
+        MapSource(path.stem, int(factor != 1.0), f"{path.stem}.x{factor:g}", partial(_sized, path, factor))
         for path in sorted(maps.glob("*.yaml"))
         for factor in FACTORS
     ]
     floors = (f"floor{seed}" for seed in range(FLOORS))
-    return found + [Source(n, 2, n, partial(office_floorplan, seed)) for seed, n in enumerate(floors)]
+    return found + [MapSource(n, 2, n, partial(office_floorplan, seed)) for seed, n in enumerate(floors)]
 
 
-def own_of(asked: Path) -> Source:
+def own_of(asked: Path) -> MapSource:
     """Return the map that is asked, in the size that the paper has it."""
-    return Source(asked.stem, KINDS.index("own building"), f"{asked.stem}.own", partial(read_map, asked))
+    return MapSource(
+        asked.stem, PLACE_KINDS.index("own building"), f"{asked.stem}.own", partial(read_map, asked)
+    )
 
 
 def _sized(path: Path, factor: float) -> OccupancyGrid:
@@ -107,8 +111,8 @@ def _sized(path: Path, factor: float) -> OccupancyGrid:
 
 @dataclass(frozen=True, slots=True)
 class Counted:
-    """For Q queries of a map at a noise level, by kind (Q, KINDS): how many places there are that are not the
-    right one, and how many of them each method finds at least as alike."""
+    """For Q queries of a map at a noise level, by kind (Q, PLACE_KINDS): how many places there are that are
+    not the right one, and how many of them each method finds at least as alike."""
 
     map_name: str
     level: int
@@ -126,7 +130,7 @@ class Counted:
 
 
 def count(
-    asked: Path, level: int, experiment: Experiment, sources: Sequence[Source], folder: Path
+    asked: Path, level: int, experiment: Experiment, sources: Sequence[MapSource], folder: Path
 ) -> Counted:
     """Ask the queries of a map."""
     file = f"counted.{asked.stem}.noise{level}.q{experiment.queries}.seed{experiment.seed}.pickle"
@@ -134,7 +138,7 @@ def count(
 
 
 def _count(
-    asked: Path, level: int, experiment: Experiment, sources: Sequence[Source], folder: Path
+    asked: Path, level: int, experiment: Experiment, sources: Sequence[MapSource], folder: Path
 ) -> Counted:
     grid = read_map(asked)
     centers_m = np.array([submap.center_m for submap in partition(grid, PartitionConfig.paper())])
@@ -147,7 +151,7 @@ def _count(
     here = own.places(folder)
     right = cKDTree(here.signatures.center_m).query(centers_m[cKDTree(centers_m).query(at_m)[1]])[1]
     is_other = cdist(at_m, here.signatures.center_m) > APART_M
-    places = np.zeros((len(at_m), len(KINDS)), np.int64)
+    places = np.zeros((len(at_m), len(PLACE_KINDS)), np.int64)
     before = {method: places.copy() for method in METHODS}
     limits: dict[str, F64] = {}
     for source in (own, *(s for s in sources if s.building != asked.stem)):
@@ -215,12 +219,14 @@ def print_curves(drawn: Sequence[Mapping[str, Any]], results: Sequence[Counted])
             str(curve["level"]), curve["database"], curve["method"], f"R@{curve['rank']}", *cells, last
         )
     show(shown, "+-: half of the interval from 5 to 95 %, by bootstrap over the queries.")
-    alone = table("R@1 by the kind of places, in thousandths", ("noise", "method", "places"), KINDS)
+    alone = table("R@1 by the kind of places, in thousandths", ("noise", "method", "places"), PLACE_KINDS)
     for level in LEVELS:
         here = [counted for counted in results if counted.level == level]
         number = int(min(counted.places.min() for counted in here)) + 1
         for method in METHODS:
-            cells = [_cell(*mean_recall(here, method, (kind,), 1, number)) for kind in range(len(KINDS))]
+            cells = [
+                _cell(*mean_recall(here, method, (kind,), 1, number)) for kind in range(len(PLACE_KINDS))
+            ]
             alone.add_row(str(level), method, str(number), *cells)
     show(alone, "As many places of each kind as the smallest building has.")
 
@@ -252,18 +258,20 @@ def draw_curves(drawn: Sequence[Mapping[str, Any]], path: Path) -> None:
         figure.axes[0].legend(fontsize=7, loc="lower left")
 
 
-def run(maps: Path, out: Path, terminal: Console, *, queries: int, jobs: int | None, seed: int) -> None:
-    """Count what is not in `out` yet, and write and draw the curves."""
+def compare_scale(given: CompareScale, terminal: Console) -> None:
+    """Count what is not in the folder yet, and write and draw the curves."""
+    libraries.require({"paper": "compare scale"})
+    maps, out, queries, seed = given.maps, given.out, given.queries, given.seed
     asked, sources = known_maps(maps), sources_of(maps)
     make_folder(out)
     kept = kept_in(out, sorted(maps.glob("*.yaml")))
     experiment = Experiment(queries=queries, seed=seed)
     with terminal.progress(f"places of {len(sources)} maps") as advance:
         described = [(source, kept) for source in [*map(own_of, asked), *sources]]
-        in_processes(Source.places, described, jobs=jobs, advance=advance)
+        in_processes(MapSource.places, described, jobs=given.jobs, advance=advance)
     tasks = [(path, level, experiment, sources, kept) for level in LEVELS for path in asked]
     with terminal.progress(f"queries of {len(asked)} maps") as advance:
-        results = in_processes(count, tasks, jobs=jobs, advance=advance)
+        results = in_processes(count, tasks, jobs=given.jobs, advance=advance)
     drawn = list(curves(results))
     write_text(out / "results.json", json_text({"queries": queries, "seed": seed, "curves": drawn}) + "\n")
     draw_curves(drawn, out / "scale.png")

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 
+from pc2grid import libraries
 from pc2grid.errors import ConfigError, MapFileError
 from pc2grid.geometry import F64
 from pc2grid.io.maps import load_map
@@ -24,6 +25,7 @@ from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
 from pc2grid_cli.console import Console, json_text
 from pc2grid_cli.output import make_folder, show, table
+from pc2grid_lab.commands import ComparePaper
 from pc2grid_lab.pages import picture
 from pc2grid_lab.paper.experiment import (
     NOISE_LEVELS,
@@ -96,7 +98,7 @@ def paper_tasks(
 
 
 def that_share_submaps(tasks: Iterable[PaperTask]) -> list[list[PaperTask]]:
-    """Return the tasks of each map and radius, for `cells_of`: by the queries that they share; the most
+    """Return the tasks of each map and radius, for `computed_cells`: by the queries that they share; the most
     first."""
     groups: dict[tuple[Path, float], list[PaperTask]] = {}
     for task in sorted(tasks, key=lambda task: (task.offset_m, task.level)):
@@ -163,7 +165,7 @@ class PaperCell:
         return {**task, "submaps": self.submaps, **measures}
 
 
-def cells_of(tasks: Sequence[PaperTask], folder: Path) -> list[PaperCell]:
+def computed_cells(tasks: Sequence[PaperTask], folder: Path) -> list[PaperCell]:
     """Return the results of tasks of one map and radius, kept in a folder. Raises MapFileError, OutputError.
 
     Methods are fitted once for all levels, and queries drawn once for all methods of a level: tasks that
@@ -330,33 +332,28 @@ def draw_figure(results: Sequence[PaperCell], offset_m: float, out: Path) -> Pat
     return path
 
 
-def run(
-    maps: Path,
-    out: Path,
-    terminal: Console,
-    *,
-    queries: int,
-    methods: Sequence[str] | None,
-    offset: Sequence[float] | None,
-    ablation: bool,
-    jobs: int | None,
-    seed: int,
-) -> None:
-    """Compute the cells that are not in `out` yet, and write the tables and figures."""
-    chosen = (*_chosen(methods), *(ABLATION if ablation else ()))
-    offsets_m = tuple(offset or (1.0, 0.5))
+def compare_paper(given: ComparePaper, terminal: Console) -> None:
+    """Compute the cells that are not in the folder yet, and write the tables and figures."""
+    libraries.require({"paper": "compare paper"})
+    out = given.out
+    chosen = (*_chosen(given.methods), *(ABLATION if given.ablation else ()))
+    offsets_m = tuple(given.offset or (1.0, 0.5))
     if min(offsets_m) <= 0:
         raise ConfigError("--offset: expected a distance above 0 m")
-    found = known_maps(maps)
+    found = known_maps(given.maps)
     make_folder(out)
-    tasks = list(paper_tasks(found, methods=chosen, offsets_m=offsets_m, queries=queries, seed=seed))
+    tasks = list(
+        paper_tasks(found, methods=chosen, offsets_m=offsets_m, queries=given.queries, seed=given.seed)
+    )
     with terminal.progress(f"{len(tasks)} cells of the tables") as advance:
         kept = kept_in(out, found)
         groups = [(group, kept) for group in that_share_submaps(tasks)]
-        cells = itertools.chain.from_iterable(in_processes(cells_of, groups, jobs=jobs, advance=advance))
+        cells = itertools.chain.from_iterable(
+            in_processes(computed_cells, groups, jobs=given.jobs, advance=advance)
+        )
     by_task = {cell.task: cell for cell in cells}
     results = [by_task[task] for task in tasks]
-    document = {"queries": queries, "seed": seed, "cells": [cell.summary() for cell in results]}
+    document = {"queries": given.queries, "seed": given.seed, "cells": [cell.summary() for cell in results]}
     write_text(out / "results.json", json_text(document) + "\n")
     pictures = [draw_figure(results, offset_m, out) for offset_m in offsets_m]
     print_tables(results, chosen)

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
-Found = tuple[Matrix, float] | None
+PoseAndScore = tuple[Matrix, float] | None
 """T_map_base (4, 4) and a score, or None."""
 
 
-def serve(locator: Callable[[str, str], Callable[[str], Found]]) -> None:
+def serve(locator: Callable[[str, str], Callable[[str], PoseAndScore]]) -> None:
     """Answer the queries of the command line.
 
     locator : what locates the queries, of the name of the program and the stem of the map. The first query is
@@ -61,7 +61,7 @@ def _peak_mb() -> float:
 
 
 Cloud = NDArray[np.floating]
-Locate = Callable[[Cloud], Found]
+Locate = Callable[[Cloud], PoseAndScore]
 """Where the points, in the frame of the query's last base, lie in the map."""
 
 SUBMAP_M = 15.0
@@ -91,7 +91,7 @@ def map_closures(path: Matrix, clouds: list[Cloud]) -> Locate:
         closures.get_best_closure(len(poses) - 1, np.ascontiguousarray(local, np.float64))
     asked = len(poses)
 
-    def locate(points_m: Cloud) -> Found:
+    def locate(points_m: Cloud) -> PoseAndScore:
         # The three newest submaps are never matched, and a query becomes a submap. Therefore each query gets
         # a number far from those of the map.
         nonlocal asked
@@ -112,7 +112,7 @@ def kiss_matcher(_: Matrix, clouds: list[Cloud]) -> Locate:
     matcher = library.KISSMatcher(library.KISSMatcherConfig(VOXEL_M))
     building = thinned(np.concatenate(clouds), VOXEL_M)
 
-    def locate(points_m: Cloud) -> Found:
+    def locate(points_m: Cloud) -> PoseAndScore:
         matcher.reset()
         found = matcher.estimate(thinned(points_m, VOXEL_M), building)
         T = np.eye(4)
@@ -140,7 +140,7 @@ def fpfh_ransac(_: Matrix, clouds: list[Cloud]) -> Locate:
 
     building, features = described(np.concatenate(clouds))
 
-    def locate(points_m: Cloud) -> Found:
+    def locate(points_m: Cloud) -> PoseAndScore:
         open3d.utility.random.seed(0)
         query, own = described(points_m)
         coarse = steps.registration_ransac_based_on_feature_matching(
@@ -173,7 +173,7 @@ def thinned(points_m: Cloud, edge_m: float) -> Cloud:
     return points_m[np.sort(first)]
 
 
-def locator(name: str, map_stem: str) -> Callable[[str], Found]:
+def locator(name: str, map_stem: str) -> Callable[[str], PoseAndScore]:
     """Return a program that has the clouds of the map."""
     with np.load(f"{map_stem}.npz") as file:
         path, points_m, count = file["T_map_base"], file["points_m"], file["count"]

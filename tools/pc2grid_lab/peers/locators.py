@@ -21,7 +21,7 @@ import numpy as np
 from pc2grid.errors import Pc2GridError
 from pc2grid.geometry import F32, F64, SE2
 from pc2grid.io.maps import load_map
-from pc2grid_lab.peers.cloud_matchers import Found, serve
+from pc2grid_lab.peers.cloud_matchers import PoseAndScore, serve
 from pc2grid_lab.sensors import RegisteredSession, index_of
 from pc2grid_lab.truth import apart
 from signature.config import Config
@@ -106,7 +106,7 @@ LF_alternateAverageMethod=0
 """
 
 
-def particle_filter(map_stem: str) -> Callable[[str], Found]:
+def particle_filter(map_stem: str) -> Callable[[str], PoseAndScore]:
     """Prepare MRPT: the pose is the mean of the particles at the last scan, in one map.
 
     The score is minus the root of the trace of their covariance, metres and radians: particles in several
@@ -129,7 +129,7 @@ def particle_filter(map_stem: str) -> Callable[[str], Found]:
     }
     _run("ros-map-yaml2mrpt", "-q", "-w", "-i", f"{map_stem}.yaml", "-d", folder.name)
 
-    def locate(query: str) -> Found:
+    def locate(query: str) -> PoseAndScore:
         log, config = Path(folder.name, "query.log"), Path(folder.name, "query.ini")
         with np.load(f"{query}.ranges.npz") as file:
             ranges_m, fov_rad, T_base_middle = file["ranges_m"], float(file["fov_rad"]), file["T_base_middle"]
@@ -191,7 +191,7 @@ def _after_motion(T_odom_base: F64) -> list[int]:
     return kept
 
 
-def own(map_stem: str) -> Callable[[str], Found]:
+def own(map_stem: str) -> Callable[[str], PoseAndScore]:
     """Return what locates queries with pc2grid itself, in one map.
 
     It gets the nav2 map and the registered planar scans, and asks as `pc2grid relocalize` does: again after
@@ -199,7 +199,7 @@ def own(map_stem: str) -> Callable[[str], Found]:
     """
     index = index_of("map", load_map(Path(f"{map_stem}.yaml")), Config())
 
-    def locate(query: str) -> Found:
+    def locate(query: str) -> PoseAndScore:
         localizer = Localizer(index)
         for scan in RegisteredSession.load(Path(f"{query}.pickle")).scans():
             localizer.add(*scan)

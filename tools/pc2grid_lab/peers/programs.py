@@ -45,7 +45,8 @@ from pc2grid.pipeline import follow
 from pc2grid.simulate import Session, load_building, prepare_session
 from pc2grid_cli.console import Console, json_text, warn
 from pc2grid_cli.output import make_folder
-from pc2grid_lab.pages import clopper_pearson, print_cells
+from pc2grid_lab.commands import ComparePeers
+from pc2grid_lab.pages import Cell, clopper_pearson, print_cells
 from pc2grid_lab.peers.locators import PROGRAMS
 from pc2grid_lab.recordings.catalogue import drive_config
 from pc2grid_lab.recordings.judging import known_share
@@ -360,7 +361,7 @@ class PeerFailed(Pc2GridError):
     """A program has not answered."""
 
 
-def missing(kind: PeerKind) -> str | None:
+def how_to_install(kind: PeerKind) -> str | None:
     """Return the command that installs a program; None if it can be run."""
     if kind.name == "particle-filter" and not all(map(shutil.which, PROGRAMS)):
         return "apt-get install mrpt-apps"
@@ -387,7 +388,7 @@ def answers(kind: PeerKind, map_stem: Path, queries: Sequence[Path], kept: Path)
     return found
 
 
-Place = Literal["covered", "uncovered", "elsewhere"]
+Coverage = Literal["covered", "uncovered", "elsewhere"]
 """covered: the map shows what the query saw last. uncovered: it does not. elsewhere: the map is of another
 building."""
 
@@ -405,7 +406,7 @@ class PeerTrial:
 
     peer: str
     site: str
-    place: Place
+    place: Coverage
     pose: tuple[float, float, float] | None
     score: float
     cpu_s: float
@@ -416,7 +417,7 @@ class PeerTrial:
     @staticmethod
     def of(peer: str, site: str, map_: str, query: SiteQuery, answer: Mapping[str, Any]) -> PeerTrial:
         """Judge the answer to a query. map_ : the building of the map."""
-        place: Place = "elsewhere" if map_ != site else "covered" if query.covered else "uncovered"
+        place: Coverage = "elsewhere" if map_ != site else "covered" if query.covered else "uncovered"
         right, error_m = False, None
         if answer["pose"] is not None and place != "elsewhere":
             right, error_m = is_right(SE2(*answer["pose"]), SE2(*query.pose), JUDGEMENT.right_recorded_m)
@@ -440,10 +441,7 @@ def best_threshold(trials: Sequence[PeerTrial]) -> float:
     return max([math.inf, *sorted(scores, reverse=True)], key=gain)
 
 
-Cell = dict[str, Any]
-
-
-def counted(trials: Sequence[PeerTrial]) -> list[Cell]:
+def cells_of_trials(trials: Sequence[PeerTrial]) -> list[Cell]:
     """Return a cell for each site and program, in their order. A program has one threshold for all.
 
     threshold: None if the program decides by itself, or never answers. right, wrong: of the covered queries;
@@ -488,19 +486,11 @@ def _median(values: Iterable[float]) -> float | None:
     return median(some) if some else None
 
 
-def compare_peers(
-    recordings: Sequence[Path],
-    out: Path,
-    terminal: Console,
-    *,
-    queries: int,
-    travel: float,
-    mapped: Sequence[str],
-    of_base: bool,
-) -> None:
+def compare_peers(given: ComparePeers, terminal: Console) -> None:
     """Ask every program that is installed, and write the table."""
-    seconds = _seconds(mapped, recordings)
-    not_installed = {kind.name: command for kind in PEERS if (command := missing(kind)) is not None}
+    recordings, out = given.recordings, given.out
+    seconds = _seconds(given.mapped or (), recordings)
+    not_installed = {kind.name: command for kind in PEERS if (command := how_to_install(kind)) is not None}
     for name, command in not_installed.items():
         warn(f"{name} is not installed: {command}")
     work = out / digest_of_sources((FRONT, BACK, LABORATORY))
@@ -508,7 +498,7 @@ def compare_peers(
     sites, trials = [], []
     with terminal.progress("prepare") as advance:
         for recording in recordings:
-            sites.append(_site(recording, work, queries, travel, seconds.get(recording.stem), of_base))
+            sites.append(_site(recording, work, given, seconds.get(recording.stem)))
             advance(len(sites) / len(recordings))
     tasks = _tasks(sites, not_installed)
     with terminal.progress("locate") as advance:
@@ -519,8 +509,14 @@ def compare_peers(
             for query, answer in zip(asked.values(), found, strict=True):
                 trials.append(PeerTrial.of(kind.name, site.name, map_site.name, query, answer))
             advance(done / len(tasks))
-    cells = counted(trials)
-    setting = {"queries": queries, "travel": travel, "pins": PINS, "not_installed": not_installed, **seconds}
+    cells = cells_of_trials(trials)
+    setting = {
+        "queries": given.queries,
+        "travel": given.travel,
+        "pins": PINS,
+        "not_installed": not_installed,
+        **seconds,
+    }
     document = {"setting": setting, "cells": cells, "trials": list(map(asdict, trials))}
     write_text(out / "peers.json", json_text(document) + "\n")
     print_cells("later parts of recordings in a map of an earlier part", 2, cells)
@@ -542,21 +538,25 @@ def _tasks(sites: Sequence[Site], not_installed: Mapping[str, str]) -> list[tupl
     return tasks
 
 
-def _site(
-    recording: Path, work: Path, queries: int, travel_m: float, mapped_s: float | None, of_base: bool
-) -> Site:
+def _site(recording: Path, work: Path, given: ComparePeers, mapped_s: float | None) -> Site:
     """Return the building of a recording, or of a 3D scan; what was prepared from the same before is used
     again."""
     if not recording.exists():
         raise LogNotFound(f"{recording}: no such file")
     config, is_building = Config(), is_building_file(recording)
     truth = b"" if is_building else truth_file(recording).read_bytes()
-    made_of = (digest_of(recording, config), truth, queries, travel_m, mapped_s, of_base)
+    made_of = (digest_of(recording, config), truth, given.queries, given.travel, mapped_s, given.of_base)
     folder = work / f"{recording.stem}.{hashlib.sha256(repr(made_of).encode()).hexdigest()[:12]}"
     if is_building:
-        return simulated_site(recording, folder, config, queries=queries, travel_m=travel_m)
+        return simulated_site(recording, folder, config, queries=given.queries, travel_m=given.travel)
     return recorded_site(
-        recording, folder, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s, of_base=of_base
+        recording,
+        folder,
+        config,
+        queries=given.queries,
+        travel_m=given.travel,
+        mapped_s=mapped_s,
+        of_base=given.of_base,
     )
 
 

@@ -29,19 +29,19 @@ from pc2grid.observer import TimeSpan
 from pc2grid.simulate import Building, SimulationConfig, load_building, simulate_session
 from pc2grid_lab.runner import digest_of_sources
 
-Kind = Literal[
+PairKind = Literal[
     "later part", "fewer scans", "same recording", "other day", "other sensor", "published map", "elsewhere"
 ]
 """How the query of a pair differs from what its map was made from. "same recording": all of it is the map,
 and the query may lack odometry. "elsewhere": it is of another building."""
-KINDS: tuple[Kind, ...] = get_args(Kind)
+PAIR_KINDS: tuple[PairKind, ...] = get_args(PairKind)
 
 Source = Literal["lidar", "depth", "laser", "map", "unknown"]
 """What a recording is of; "map": it is a map or a 3D scan; "unknown": it cannot be read."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drive:
+class SimulatedDrive:
     """A simulated drive through the real 3D scan of a building. seed : of its way and of its obstacles."""
 
     sensor: SensorKind
@@ -71,7 +71,7 @@ class Recording:
     file: str
     building: str
     sensor: Source
-    drive: Drive | None = None
+    drive: SimulatedDrive | None = None
     options: tuple[str, ...] = ()
     every: int = 1
     mapped: bool = True
@@ -116,7 +116,7 @@ class Pair:
 
     query: str
     map: str
-    kind: Kind
+    kind: PairKind
     window_s: float
     windows: int
     until_s: float | None = None
@@ -226,7 +226,7 @@ def _driven(name: str, sensor: SensorKind, length_m: float, seed: int, *, mapped
         file=_SCAN,
         building="fr079",
         sensor=sensor,
-        drive=Drive(sensor=sensor, length_m=length_m, seed=seed),
+        drive=SimulatedDrive(sensor=sensor, length_m=length_m, seed=seed),
         mapped=mapped,
         truth=_SCAN,
         poses=_SCAN,
@@ -331,7 +331,9 @@ def _later(name: str, until_s: float, window_s: float, windows: int, *, quick: b
     return replace(_pair("later part", name, name, window_s, windows, quick=quick), until_s=until_s)
 
 
-def _pair(kind: Kind, query: str, map_: str, window_s: float, windows: int, *, quick: bool = False) -> Pair:
+def _pair(
+    kind: PairKind, query: str, map_: str, window_s: float, windows: int, *, quick: bool = False
+) -> Pair:
     return Pair(query=query, map=map_, kind=kind, window_s=window_s, windows=windows, quick=quick)
 
 
@@ -607,7 +609,7 @@ def _row(data: Path, file: Path, of_base: bool) -> tuple[Recording, float | None
     return recording, length_s
 
 
-def _asked(kind: Kind, query: Recording, map_: Recording, asked_s: float) -> Pair:
+def _asked(kind: PairKind, query: Recording, map_: Recording, asked_s: float) -> Pair:
     """Return windows of the last `asked_s` of a recording, or of all of it."""
     window_s = round(min(_WINDOW_S, asked_s / 2), 1)
     windows = min(_WINDOWS, round(2 * asked_s / max(window_s, 0.1)))
@@ -619,7 +621,7 @@ _CLUTTER, _RATE_HZ, _COLUMNS = 15, 5.0, 720
 10 Hz sends them: fewer scans save time, not detail. Chosen by hand."""
 
 
-def write_drive(scan: Path, target: Path, drive: Drive) -> None:
+def write_drive(scan: Path, target: Path, drive: SimulatedDrive) -> None:
     """Drive through a 3D scan: write the MCAP file `target`, and its true poses beside it as `.tum`.
 
     Raises MapFileError if the scan cannot be read or is a plan, ConfigError if there is no room in it.
@@ -647,7 +649,7 @@ def drive_config(length_m: float, seed: int, start_m: tuple[float, float] | None
 
 
 @cache
-def digest_of_drive(scan: Path, drive: Drive) -> str:
+def digest_of_drive(scan: Path, drive: SimulatedDrive) -> str:
     """Return twelve hexadecimal digits that change with the scan, the drive and the simulation."""
     sources = digest_of_sources((Path(simulate.__file__).parent, Path(__file__)))
     shown = hashlib.sha256(f"{sources} {drive}".encode() + scan.read_bytes())

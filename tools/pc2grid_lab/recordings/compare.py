@@ -9,35 +9,23 @@ from pathlib import Path
 from pc2grid.errors import ConfigError
 from pc2grid_cli.console import Console
 from pc2grid_cli.output import make_folder
+from pc2grid_lab.commands import CompareRecordings
 from pc2grid_lab.recordings.catalogue import Catalogue, own_recordings, state_of
 from pc2grid_lab.recordings.judging import judged_table
 from pc2grid_lab.recordings.run import Folder, followed_in, run_all
-from pc2grid_lab.recordings.table import Table, change_lines, changes, page, show
+from pc2grid_lab.recordings.table import Table, change_lines, changes, markdown_page, show
 from pc2grid_lab.runner import commit, digest_of_product, write_text
 
 
-def compare_recordings(
-    data: Path,
-    out: Path,
-    kept: Path,
-    terminal: Console,
-    *,
-    only: str | None,
-    of_base: bool,
-    quick: bool,
-    as_page: bool,
-    jobs: int,
-) -> None:
-    """Map and locate what is not in `out` yet, judge all, and print the table and what changed.
-
-    kept : the table of an earlier run, which a whole run replaces.
-    """
-    own = own_recordings(data, without=out, of_base=of_base)
+def compare_recordings(given: CompareRecordings, terminal: Console) -> None:
+    """Map and locate what is not in the folder yet, judge all, and print the table and what changed."""
+    data, out, only = given.data, given.out, given.only
+    own = own_recordings(data, without=out, of_base=given.of_base)
     named = Catalogue.in_folder(data)
     recordings, pairs = [*named[0], *own[0]], [*named[1], *own[1]]
     if not recordings:
         raise ConfigError(f"{data}: holds no recording", hint="they end in .mcap, .bag or .db3")
-    catalogue = Catalogue.of(recordings, pairs, only=only, quick=quick)
+    catalogue = Catalogue.of(recordings, pairs, only=only, quick=given.quick)
     work = out / "work" / (digest_of_product() + state_of(data, own[0]))
     make_folder(work)
     for other in work.parent.iterdir():  # of another version, whose results are not used again
@@ -47,10 +35,11 @@ def compare_recordings(
     followed = followed_in(catalogue, folder, only)
     if not (catalogue.mapped or catalogue.pairs or followed):
         raise ConfigError(f"--only {only}: no recording, building, sensor or kind is named so")
+    kept = given.table or out / "real.json"
     before = _read(kept)
     try:
         with terminal.progress("recordings") as advance:
-            run_all(catalogue, folder, followed=followed, jobs=jobs, advance=advance)
+            run_all(catalogue, folder, followed=followed, jobs=given.jobs, advance=advance)
     except KeyboardInterrupt:
         terminal.note(f"what is done is kept in {out}; the same command goes on from there")
         raise
@@ -59,11 +48,11 @@ def compare_recordings(
             catalogue, folder, followed, program=digest_of_product(), commit=commit(), advance=advance
         )
     changed = [] if before is None else changes(before, found)
-    if only is None and not quick:
+    if only is None and not given.quick:
         write_text(kept, found.to_text())
-        write_text(kept.with_suffix(".md"), page(found, changed))
-    if as_page:
-        print(page(found))
+        write_text(kept.with_suffix(".md"), markdown_page(found, changed))
+    if given.page:
+        print(markdown_page(found))
     else:
         show(found)
     if before is None:

@@ -36,10 +36,10 @@ from pc2grid_lab.recordings.table import (
     QueryRow,
     Table,
     Truth,
-    Verdict,
     Warned,
+    WarningVerdict,
 )
-from pc2grid_lab.runner import Finished, kept
+from pc2grid_lab.runner import Finished, kept_result
 from pc2grid_lab.truth import (
     AHEAD_M,
     JUDGEMENT,
@@ -52,7 +52,7 @@ from pc2grid_lab.truth import (
     fit_frame,
     is_right,
     nearest,
-    pose_at,
+    pose_at_stamp,
     read_relations,
     registered_clouds,
     relation_error,
@@ -118,7 +118,7 @@ class RecordedDrive:
         """Return t_world_base by the true poses; where they are far apart, carried on by the own
         trajectory."""
         assert self.truth is not None
-        T = pose_at(self.truth, stamp_ns - self.late_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
+        T = pose_at_stamp(self.truth, stamp_ns - self.late_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
         return self._carried(stamp_ns - self.late_ns) if T is None else SE2.from_matrix(T)
 
     def _carried(self, stamp_ns: int) -> SE2 | None:
@@ -237,7 +237,7 @@ def map_row(recording: Recording, folder: Folder) -> MapRow:
     }
     if folder.missing(recording):
         return MapRow(**row, problem=MISSING)
-    done = kept(folder.result(recording.name))
+    done = kept_result(folder.result(recording.name))
     if done is None:
         return MapRow(**row, problem=NOT_RUN)
     if done.failed:
@@ -258,7 +258,7 @@ def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, 
     reports = [session["report"] for session in stored]
     read = sum(report["scans_read"] for report in reports)
     skipped = sum(sum(report["scans_skipped"].values()) for report in reports)
-    bare = kept(folder.bare(recording.name))
+    bare = kept_result(folder.bare(recording.name))
     bare_of: dict[str, Any] = {} if bare is None or bare.failed else bare.document
     error = _error(recording, folder)
     texts = itertools.chain.from_iterable(report["warnings"] for report in reports)
@@ -349,7 +349,7 @@ def _about(text: str) -> str:
     return " ".join(text.split()[:5])
 
 
-def _verdict(about: str, error_m: float | None) -> Verdict:
+def _verdict(about: str, error_m: float | None) -> WarningVerdict:
     if about == "height":  # each of the recordings is of one floor
         return "false"
     if about in _SHAPE and error_m is not None:
@@ -512,7 +512,7 @@ class Judge:
         """Return the row of a recording that was followed; where there is no result, one that says why."""
         building = self._catalogue.recordings[one.map].building
         row = FollowedRow(before=one.before, after=one.after, map=one.map, building=building)
-        done = kept(self._folder.followed(one))
+        done = kept_result(self._folder.followed(one))
         if done is None or done.failed:
             return replace(row, problem=NOT_RUN if done is None else done.error or MISSING)
         if one.after is not None:
@@ -559,7 +559,7 @@ class Judge:
         """
         drive = drive_of(self._catalogue.recordings[name], self._folder)
         if (name, map_) not in self._followed:
-            done = kept(self._folder.followed(Followed(before=name, map=map_)))
+            done = kept_result(self._folder.followed(Followed(before=name, map=map_)))
             looks = [] if done is None or done.failed else done.document["looks"]
             clues = [
                 Clue(own[1], _pose(said), (name, number), said["confidence"])
@@ -573,7 +573,7 @@ class Judge:
     def _problem(self, pair: Pair) -> str:
         if gaps := self._folder.gaps(self._catalogue, pair):
             return f"{gaps[0]}: {MISSING}"
-        done = kept(self._folder.result(pair.map_name))
+        done = kept_result(self._folder.result(pair.map_name))
         if done is None:
             return f"{pair.map_name}: {NOT_RUN}"
         return f"no map: {done.error}" if done.failed else ""
@@ -587,7 +587,7 @@ class Judge:
         return self._windows[pair]
 
     def _one(self, pair: Pair, query: Recording, number: int, span: TimeSpan) -> LocatedWindow:
-        one = LocatedWindow(pair.query, number, span, kept(self._folder.answer(pair, span)))
+        one = LocatedWindow(pair.query, number, span, kept_result(self._folder.answer(pair, span)))
         if one.answer is None or pair.kind == "elsewhere":
             return one
         stamp_ns = int(one.answer["query"]["stamp_ns"])

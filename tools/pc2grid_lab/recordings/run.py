@@ -39,7 +39,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Scan, Trajectory
 from pc2grid.observer import TimeSpan
 from pc2grid_lab.recordings.catalogue import Catalogue, Pair, Recording, digest_of_drive, write_drive
-from pc2grid_lab.runner import Finished, Task, in_processes, kept, pc2grid, run, run_tasks
+from pc2grid_lab.runner import Finished, Task, in_processes, kept_result, pc2grid, run, run_tasks
 from pc2grid_lab.truth import trajectory_error
 
 _RESULTS = ("maps", "bare", "answers", "followed")
@@ -64,7 +64,7 @@ class Folder:
         """
         file = self.data / recording.file
         if recording.drive is not None:
-            made = f"{plain(recording.name)}.{digest_of_drive(file, recording.drive)}.mcap"
+            made = f"{as_file_name(recording.name)}.{digest_of_drive(file, recording.drive)}.mcap"
             return self.work.parents[1] / "drives" / made
         if recording.every > 1:
             return self.work / "thinned" / f"{file.stem}_{recording.every}{file.suffix}"
@@ -78,7 +78,7 @@ class Folder:
 
     def map(self, name: str) -> Path:
         """Return the database of a map, beside the result of `convert`."""
-        return self.work / "maps" / f"{plain(name)}.submaps"
+        return self.work / "maps" / f"{as_file_name(name)}.submaps"
 
     def result(self, name: str) -> Path:
         """Return the result of `convert` for a map."""
@@ -86,7 +86,7 @@ class Folder:
 
     def bare(self, name: str) -> Path:
         """Return the result of bare KISS-ICP."""
-        return self.work / "bare" / f"{plain(name)}.json"
+        return self.work / "bare" / f"{as_file_name(name)}.json"
 
     def has_bare(self, recording: Recording) -> bool:
         """Return whether bare KISS-ICP runs on it: it knows lidars, and real ones are there to be
@@ -95,12 +95,12 @@ class Folder:
 
     def answer(self, pair: Pair, window: TimeSpan) -> Path:
         """Return the result of `relocalize` for a window."""
-        named = f"{plain(pair.query)}.in.{plain(pair.map_name)}"
+        named = f"{as_file_name(pair.query)}.in.{as_file_name(pair.map_name)}"
         return self.work / "answers" / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
 
     def followed(self, one: Followed) -> Path:
         """Return the result of `watch` for a row."""
-        return self.work / "followed" / f"{plain(one.name)}.in.{plain(one.map)}.json"
+        return self.work / "followed" / f"{as_file_name(one.name)}.in.{as_file_name(one.map)}.json"
 
     def missing(self, recording: Recording) -> bool:
         """Return whether the data folder lacks the recording, so that it is a gap of the page."""
@@ -113,7 +113,7 @@ class Folder:
 
     def cpu_s(self) -> float:
         """Return the processor time of all commands whose result is here."""
-        results = (kept(file) for kind in _RESULTS for file in (self.work / kind).glob("*.json"))
+        results = (kept_result(file) for kind in _RESULTS for file in (self.work / kind).glob("*.json"))
         return sum(done.cpu_s for done in results if done is not None)
 
     def length_s(self, recording: Recording) -> float:
@@ -122,7 +122,7 @@ class Folder:
             return (opened.info.end_ns - opened.info.start_ns) * 1e-9
 
 
-def plain(name: str) -> str:
+def as_file_name(name: str) -> str:
     """Return a name as a part of the name of a file."""
     return "".join(c if c.isalnum() or c in "-.+" else "_" for c in name)
 
@@ -205,11 +205,11 @@ def _watched(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
         put_down_ns = shift_ns = None
         source = folder.source(catalogue.recordings[one.before])
         if one.after is not None:
-            source = folder.work / "carried" / f"{plain(one.name)}.mcap"
+            source = folder.work / "carried" / f"{as_file_name(one.name)}.mcap"
             source.parent.mkdir(parents=True, exist_ok=True)
             before, after = (folder.source(catalogue.recordings[name]) for name in (one.before, one.after))
             half_s = 0.5 * folder.length_s(catalogue.recordings[one.before]) if before == after else None
-            parts = Part(before, begin_s=half_s or 0.0), Part(after, end_s=half_s)
+            parts = McapPart(before, begin_s=half_s or 0.0), McapPart(after, end_s=half_s)
             put_down_ns, shift_ns = write_joined(*parts, source)
         done = pc2grid("-q", "watch", source, "-d", folder.map(one.map), "--json")
         looks = done.document if isinstance(done.document, list) else [done.document]
@@ -266,7 +266,7 @@ def _make(folder: Folder, recording: Recording) -> None:
     """Make a recording that is thinned or driven."""
     file, target = folder.data / recording.file, folder.source(recording)
     if recording.drive is not None:
-        for old in target.parent.glob(f"{plain(recording.name)}.*"):
+        for old in target.parent.glob(f"{as_file_name(recording.name)}.*"):
             old.unlink()
         write_drive(file, target, recording.drive)
     elif recording.every > 1:
@@ -387,7 +387,7 @@ _STATIC = "/tf_static"
 
 
 @dataclass(frozen=True, slots=True)
-class Part:
+class McapPart:
     """A part of an MCAP. begin_s, end_s : seconds after its first scan; end_s None: to its last scan."""
 
     path: Path
@@ -395,7 +395,7 @@ class Part:
     end_s: float | None = None
 
 
-def write_joined(before: Part, after: Part, target: Path) -> tuple[int, int]:
+def write_joined(before: McapPart, after: McapPart, target: Path) -> tuple[int, int]:
     """Write the MCAP file `target`: the scans and odometry of `before`, then those of `after`.
 
     Moving transforms are left out, as they may hold the odometry; static ones are those of `before`.
@@ -414,7 +414,7 @@ def write_joined(before: Part, after: Part, target: Path) -> tuple[int, int]:
     return second[0].log_time_ns + shift_ns, shift_ns
 
 
-def _messages(part: Part) -> list[Stored]:
+def _messages(part: McapPart) -> list[Stored]:
     """Return scans and odometry of a part, from its first scan to its last one."""
     found = [m for m in stored_messages(part.path) if m.schema.name.endswith(("/LaserScan", "/Odometry"))]
     scans_ns = [m.log_time_ns for m in found if not _is_odometry(m)]

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from pc2grid_cli import output
 from pc2grid_lab.pages import ALPHA, by_chance, markdown, number, share, strong
-from pc2grid_lab.recordings.catalogue import KINDS
+from pc2grid_lab.recordings.catalogue import PAIR_KINDS
 
 MISSING = "not in the data folder"
 NOT_RUN = "was not run"
@@ -26,7 +26,7 @@ NOT_RUN = "was not run"
 FINE = 0.9
 """A missed window whose true pose is at least so probable by `--check` is missed by the search, not by the
 walls; by hand."""
-Verdict = Literal["right", "false", "unknown"]
+WarningVerdict = Literal["right", "false", "unknown"]
 Truth = Literal["poses", "trajectory", "hand", "clouds", "agreement", "elsewhere"]
 """How answers are judged: by true poses of query and map, by the trajectory of the recording whose beginning
 is the map, by a pose found by hand, by clouds, by each other, or as nothing can be right."""
@@ -37,7 +37,7 @@ class Warned:
     """A warning of `convert`: what it is about, whether it is right, and its sentence."""
 
     about: str
-    verdict: Verdict
+    verdict: WarningVerdict
     text: str
 
 
@@ -265,7 +265,7 @@ _READING = ("no tf", "gaps", "empty scans")
 """Warnings about the file, that say nothing of the map."""
 
 
-def page(table: Table, changed: Sequence[RowChange] = ()) -> str:
+def markdown_page(table: Table, changed: Sequence[RowChange] = ()) -> str:
     """Return the page in Markdown. changed : against the run before."""
     return "\n".join(
         [
@@ -394,7 +394,7 @@ _PLACES = (
 
 def _places(table: Table) -> list[str]:
     lines: list[str] = []
-    for kind in KINDS:
+    for kind in PAIR_KINDS:
         rows = [row for row in table.pairs if row.kind == kind]
         if rows:
             lines += [f"### {kind.capitalize()}", "", *markdown(_PLACES, [_pair_cells(r) for r in rows]), ""]
