@@ -17,8 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64, I64
-from pc2grid.libraries import compiled
+from pc2grid.geometry import F64
 from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid, Submap
 
 Key = TypeVar("Key")
@@ -309,21 +308,3 @@ class Method(Protocol):
     def fit(self, submaps: Sequence[Submap]) -> Matcher:
         """Describe the submaps of a map and learn from them what the method needs, such as a vocabulary."""
         ...
-
-
-@compiled()
-def weighed_pairs(cells: I64, weights: F64, bin_of: NDArray[np.int32], bins: int) -> F64:
-    """Return the products of the weights of all pairs of cells (N, 2), summed by the bin of their distance:
-    (W, bins).
-
-    weights (W, N). bin_of : as of `signature.boundary.pair_counts`.
-    """
-    sums = np.zeros((bins, len(weights)))
-    for i in range(len(cells)):
-        for j in range(i + 1, len(cells)):
-            down, across = cells[j, 0] - cells[i, 0], cells[j, 1] - cells[i, 1]
-            squared = down * down + across * across
-            at = bin_of[squared] if squared < len(bin_of) else bins - 1
-            for w in range(len(weights)):
-                sums[at, w] += weights[w, i] * weights[w, j]
-    return sums.T

@@ -20,9 +20,9 @@ from scipy.spatial import cKDTree
 
 from pc2grid.geometry import F64
 from pc2grid.model import OccupancyGrid, Submap
-from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, Method, draw_queries, weighed_pairs
+from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, Method, draw_queries
 from pc2grid_lab.paper.rivals import DistanceFeatures, ShapeContext, Vocabulary, Words, sift, surf
-from signature.boundary import bins_of_squares, boundary_edges, boundary_points
+from signature.boundary import boundary_edges, boundary_points, weighed_pairs
 from signature.config import SignatureConfig
 from signature.freespace import freespace_paths
 from signature.paper import Signature, SignatureTable, described, distances, similarity
@@ -125,8 +125,10 @@ def boundary_vector(submap: Submap) -> F64:
     away_m = np.hypot(*((cells - (np.array(edges.shape) - 1) / 2) * resolution_m).T)
     weights = np.stack((np.ones(len(cells)), weight(away_m, *_SOFT_M), weight(away_m, *_NEAR_M)))
     bins = _SIZES["boundary"]
-    bin_of = bins_of_squares(resolution_m / CONFIG.boundary_bin_m, bins)
-    whole, soft, near = weighed_pairs(cells, weights, bin_of, bins)
+    pairs = np.zeros((1, len(weights), bins + 2))
+    points = cells * (resolution_m / CONFIG.boundary_bin_m)
+    weighed_pairs(points[None], weights[None], np.zeros_like(weights)[None], pairs)
+    whole, soft, near = pairs[0, :, :bins]
     rings = np.bincount(np.minimum((away_m / _RING_M).astype(np.int64), _RINGS - 1), minlength=_RINGS)
     return np.concatenate([_roots(counts) for counts in (whole, soft, near[:_NEAR_BINS], rings)])
 
