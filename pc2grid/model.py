@@ -358,6 +358,8 @@ class Submap:
 
 MISSING_FILES = "files of the recording that are missing"
 """The reason in `ReadReport.scans_skipped` for files of a split recording that are not there."""
+MOST_LISTED = 20
+"""Places of a recording that a report lists of one kind of fault, the longest first."""
 SEVERE_SHARE = 0.01
 """Lost scans per scan read from which on a loss is severe; chosen by hand."""
 

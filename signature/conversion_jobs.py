@@ -27,11 +27,8 @@ from pc2grid.libraries import require
 from pc2grid.mapping.drawn import is_drawn_map
 from pc2grid.observer import Observer, TimeSpan
 from signature.config import Config
-from signature.database.protocol import Entry, Label, Provenance
+from signature.database.protocol import CONNECT_TIMEOUT_S, Entry, Label, Provenance
 from signature.sessions import build_sessions, describe_all, digest_of, provenance
-
-CONNECT_TIMEOUT_S = 10.0
-"""How long a scheduler may take to answer, and to have its first worker; chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -82,7 +82,7 @@ AROUND_M = 1.2
 """A viewpoint farther than this from every place is left out: places are 1 m apart by default."""
 CLEARANCE_M = 0.2
 """A viewpoint is at least so far from walls and unknown cells."""
-SIGNATURE_UNITS = 255
+SIGNATURE_UNITS = np.iinfo(np.uint8).max
 """Units of a column of a signature up to 1."""
 SIGNATURE_COLUMNS = 1 + max(part.stop for part in parts().values())
 """Columns of the three signatures of what was seen, and of the share that was seen."""

@@ -134,6 +134,13 @@ class SeenStatistics:
             )
 
 
+def shrunk(covariance: F64, ridge: float) -> F64:
+    """Return a covariance (D, D) shrunk to its diagonal by `_SHRINK`. ridge : added to the diagonal, as a
+    share of its mean."""
+    variances = np.diag(covariance)
+    return np.asarray((1.0 - _SHRINK) * covariance + np.diag(_SHRINK * variances + ridge * variances.mean()))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeenWeights:
     """A linear map of signatures to vectors whose Euclidean distance tells places apart.
@@ -153,10 +160,7 @@ class SeenWeights:
 
         columns = statistics.columns(names)
         chosen = np.ix_(columns, columns)
-        within = statistics.within[chosen]
-        variances = np.diag(within)
-        within = (1.0 - _SHRINK) * within + np.diag(_SHRINK * variances + _RIDGE * variances.mean())
-        quotients, directions = eigh(statistics.between[chosen], within)
+        quotients, directions = eigh(statistics.between[chosen], shrunk(statistics.within[chosen], _RIDGE))
         matrix = np.zeros((len(statistics.query_mean), min(DIMENSIONS, len(columns))))
         matrix[columns] = directions[:, np.argsort(-quotients)[: matrix.shape[1]]]
         return SeenWeights(query_mean=statistics.query_mean, place_mean=statistics.place_mean, matrix=matrix)

@@ -28,7 +28,7 @@ from pc2grid.estimation.scan_matching import MatchedScan, MatchSelector, ScanMat
 from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, PoseWithCovariance, ScanFactors, Smoother
 from pc2grid.estimation.spatial import SpatialMatcher
 from pc2grid.geometry import F32, F64, SE2, invert_pose, motion_size
-from pc2grid.model import Health, OdometryCheck, OdometryOutlier, RegisteredScan, Scan
+from pc2grid.model import MOST_LISTED, Health, OdometryCheck, OdometryOutlier, RegisteredScan, Scan
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
 
 
@@ -347,8 +347,6 @@ _INEXACT_M, _INEXACT_RAD, _INEXACT_SHARE = 0.1, 0.1, 0.1
 """Odometry that differs by less, or by less than this share of the motion, is merely inexact; by hand."""
 _TOGETHER_NS = 10**9
 """OdometryOutlier scans that follow each other within this time are one stretch; chosen by hand."""
-_SHOWN = 20
-"""Stretches that are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -394,5 +392,5 @@ def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreemen
     ]
     stretches.sort(key=lambda s: (-(s.distance_m + s.turn_rad), s.from_ns))
     return OdometryCheck(
-        compared=len(compared), overruled=len(overruled), stretches=tuple(stretches[:_SHOWN])
+        compared=len(compared), overruled=len(overruled), stretches=tuple(stretches[:MOST_LISTED])
     )

@@ -148,7 +148,6 @@ def write_graph(path: str | Path, graph: nx.Graph) -> None:
 
 # --- recordings ---------------------------------------------------------------------------------------
 
-_FLOAT32 = 7  # sensor_msgs/PointField
 _FARTHEST_DEPTH_M = 65.0  # an image of 16UC1 ends at 65.535 m
 _MARKER_TYPES = {"lines": 5, "spheres": 7}  # LINE_LIST, SPHERE_LIST of visualization_msgs/Marker
 
@@ -225,9 +224,8 @@ class LogWriter:
         columns = np.asarray(points, dtype=np.float32).reshape(-1, 3)
         if offsets_s is not None:
             columns = np.column_stack((columns, np.asarray(offsets_s, dtype=np.float32)))
-        fields = [
-            new("sensor_msgs/PointField", name, 4 * index, _FLOAT32, 1) for index, name in enumerate(names)
-        ]
+        field: Any = typestore().types["sensor_msgs/msg/PointField"]
+        fields = [field(name, 4 * k, field.FLOAT32, 1) for k, name in enumerate(names)]
         count, step = len(columns), 4 * len(names)
         cloud = (1, count, fields, False, step, step * count, _bytes_of(columns, "<f4"), True)
         self._add(topic, stamp_ns, new("sensor_msgs/PointCloud2", header(stamp_ns, frame), *cloud))

@@ -379,7 +379,7 @@ def _yaml_number(value: float) -> str:
 
 MAX_CELLS = 100_000_000
 _MAX_BYTES = 4 * MAX_CELLS + (1 << 20)
-_DEEPEST = 65_535  # the largest white of a PGM
+_DEEPEST = np.iinfo(np.uint16).max  # the largest white of a PGM
 _NUMBER = rb"(?:\s|#[^\n]*\n)+(\d{1,9})"
 _PNM = re.compile(rb"P([1-6])" + _NUMBER * 2 + rb"(?:" + _NUMBER + rb")?\s")  # bitmaps have no white
 _PNG_KIND, _PNG_GREY, _PNG_FIRST = 25, 0, 33  # where the kind of pixels stands, and where the header ends
@@ -431,7 +431,7 @@ def _decoded(path: Path, data: bytes, size: _Size) -> MapImage:
         raise MapFileError(f"{path}: a damaged image", hint="copy or save the map again")
     deep = found.dtype == np.uint16
     pixels: NDArray[Any] = np.atleast_3d(found)
-    opaque = size.white or (65_535 if deep else 255)
+    opaque = size.white or (_DEEPEST if deep else 255)
     if size.white is not None:
         np.minimum(pixels, size.white, out=pixels)
     if size.transparent is not None and pixels.shape[2] == 1:

@@ -40,7 +40,7 @@ from pc2grid.io.building_file import (
     kind_of,
     neighbour_distances_m,
 )
-from pc2grid.io.maps import is_map_file, load_map
+from pc2grid.io.maps import MAX_CELLS, is_map_file, load_map
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.settings import Config, ProjectionConfig, ReadConfig
@@ -228,7 +228,7 @@ class CloudMapParameters:
     obstacle_voxels: int = 2
     gap_m: float = 0.2
     margin_m: float = 0.5
-    max_cells: int = 100_000_000
+    max_cells: int = MAX_CELLS
 
     tile_m: float = 16.0
     spacing_m: float = 1.0
@@ -651,12 +651,12 @@ def _refined(points: F64, ground: Ground, p: CloudMapParameters) -> Ground:
 
 _CELL_M = 0.2
 """Edge of the cells and voxels in which a building is judged: a door is four of them wide."""
-_SLICE_M = 0.05  # of heights, in which level surfaces are searched for
-_NEAR_M = 0.15  # points this near to a surface belong to it
+_SLICE_M = CLOUD_MAP.resolution_m  # of heights, in which level surfaces are searched for
+_NEAR_M = CLOUD_MAP.floor_m  # points this near to a surface belong to it
 _BAND_M = 0.5  # what stands within this from a floor separates its rooms
 _LEAST_HEIGHT_M = 1.9  # of a ceiling, or of another floor, above the floor
-_PASSAGE_M = 1.6  # free height above a floor on which nothing stands
-_AROUND_SLICES = 10  # half a metre: a level surface has more points than the heights around it
+_PASSAGE_M = CLOUD_MAP.passage_m[1]  # free height above a floor on which nothing stands
+_AROUND_SLICES = round(_BAND_M / _SLICE_M)  # a level surface has more points than the heights around it
 _CEILING_SHARE = 0.4  # of the points of the floor, at least, that a ceiling has
 _FLOOR_SHARE = 0.25  # the same of another floor
 _OVERHEAD_SHARE = 0.02  # of the cells of a floor, at least, that have walls or a ceiling above head height

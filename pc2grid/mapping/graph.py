@@ -313,9 +313,8 @@ class HeightStep:
 class FloorLevelParameters:
     """Numbers of the least squares; chosen by hand.
 
-    sigmas : standard deviations at which a floor or a loop has half of its weight (Cauchy). rounds : of
-        reweighting; the first begins so wide that the worst has half of its weight, each narrows it by
-        `annealing`.
+    rounds : of reweighting; the first begins so wide that the worst has half of its weight (Cauchy), each
+        narrows it by `annealing`, to `PoseGraphParameters.robust_sigmas`.
     around : keyframes on either side of the two of a loop whose points are compared.
     reach_m : the passes of a loop differ in height by no more. layer_m, cell_m : height and edge of the
         voxels in which they are. thin : layers that a column without a wall fills at most: floor, table and
@@ -326,7 +325,6 @@ class FloorLevelParameters:
     apart_from_m : spread of the floors of a map above which there is a warning.
     """
 
-    sigmas: float = 3.0
     rounds: int = 12
     annealing: float = 2.0
     around: int = 2
@@ -384,7 +382,7 @@ def optimised_heights(
     for _ in range(p.rounds):
         heights_m = splu((A.T @ A.multiply(weight[:, None])).tocsc()).solve(A.T @ (weight * rise_m))
         off = np.abs(A @ heights_m - rise_m) / sigma_m
-        scale = max(min(scale / p.annealing, off[may_be_wrong].max(initial=0.0)), p.sigmas)
+        scale = max(min(scale / p.annealing, off[may_be_wrong].max(initial=0.0)), POSE_GRAPH.robust_sigmas)
         weight = sigma_m**-2 * np.where(may_be_wrong, 1.0 / (1.0 + (off / scale) ** 2), 1.0)
     return np.asarray(heights_m)
 

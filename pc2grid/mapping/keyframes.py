@@ -48,6 +48,10 @@ class Keyframe:
     restart: bool = False
 
 
+TURN_M_PER_RAD = 0.3
+"""Travel that a turn on the spot counts as; chosen by hand."""
+
+
 class Keyframes:
     """The keyframes of a session, a sequence that only grows; their planar scans are in a `Spool`.
 
@@ -103,7 +107,7 @@ def grid_of(keyframes: Iterable[tuple[Keyframe, SE2]], projection: ProjectionCon
     return builder.grid()
 
 
-_STEPS = 32767  # of int16, from the origin of the base to the farthest point
+_STEPS = np.iinfo(np.int16).max  # from the origin of the base to the farthest point
 _MOUNTED_M = 3.0  # farthest place of a sensor on its base
 
 

@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from pc2grid.estimation.line_map import evenly
 from pc2grid.geometry import F64, I64, SE2, freeze
 from pc2grid.mapping.graph import Edge, Solution, WallDirection, between, compose, optimise, wall_direction
-from pc2grid.mapping.keyframes import Keyframe, Keyframes, grid_of
+from pc2grid.mapping.keyframes import TURN_M_PER_RAD, Keyframe, Keyframes, grid_of
 from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps, pose_at
 from pc2grid.mapping.part_maps import OptimisedKeyframes, interpolate_corrections
 from pc2grid.mapping.parts import connected
@@ -50,7 +50,6 @@ class LoopParameters:
     Cutting into local maps:
 
     travel_m : travel after which a local map is complete.
-    turn_m_per_rad : travel that a turn on the spot counts as.
 
     Which pairs are compared:
 
@@ -62,7 +61,6 @@ class LoopParameters:
     certain_m, certain_rad : the window directly after a loop.
     drift_per_m, drift_rad_per_m : growth of the window per metre of travel.
     max_window_m, max_window_rad : its largest size.
-    lost_m : travel that a lost part of the session counts as; enough for the largest window.
 
     Their information in the pose graph:
 
@@ -82,7 +80,6 @@ class LoopParameters:
     """
 
     travel_m: float = 4.0
-    turn_m_per_rad: float = 0.3
     near_m: float = 8.0
     compared: int = 10
     certain_m: float = 0.3
@@ -91,7 +88,6 @@ class LoopParameters:
     drift_rad_per_m: float = 0.006
     max_window_m: float = 3.0
     max_window_rad: float = math.radians(20.0)
-    lost_m: float = 150.0
     information_share: float = 0.1
     tracking_sigma_m: float = 0.02
     tracking_sigma_per_m: float = 0.01
@@ -109,6 +105,11 @@ class LoopParameters:
             min(self.certain_m + self.drift_per_m * drift_m, self.max_window_m),
             min(self.certain_rad + self.drift_rad_per_m * drift_m, self.max_window_rad),
         )
+
+    @property
+    def lost_m(self) -> float:
+        """Return the travel that a lost part of the session counts as: that of the largest window."""
+        return self.max_window_m / self.drift_per_m
 
     def tracked_information(self, length_m: float, restart: bool) -> F64:
         """Return the information (3, 3) of a tracked step between anchors. restart : tracking was lost in
@@ -173,7 +174,7 @@ class CandidateParameters:
     alone: float = 1.0
     supported: float = 2.5
     possible: float = 3.8
-    known_way_m: float = 18.0
+    known_way_m: float = 1.5 * LOOPS.maps_per_place * LOOPS.travel_m
     margin: float = 3.0
     pending: int = 100
 
@@ -215,7 +216,7 @@ class LoopCloser:
         """Keep the next keyframe; every few metres this completes a local map."""
         if len(self._keyframes):
             step = self._keyframes.pose(len(self._keyframes) - 1).inverse() @ keyframe.T_session_base
-            self._travel_m += math.hypot(step.x, step.y) + self._parameters.turn_m_per_rad * abs(step.yaw)
+            self._travel_m += math.hypot(step.x, step.y) + TURN_M_PER_RAD * abs(step.yaw)
             if self._travel_m > self._parameters.travel_m or keyframe.restart:
                 self._complete_local_map()
         self._keyframes.append(keyframe)

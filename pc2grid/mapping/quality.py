@@ -33,9 +33,17 @@ from scipy.spatial import cKDTree
 
 from pc2grid.geometry import F64, I64, SE2, BoolGrid, wrap_angle
 from pc2grid.mapping.graph import Edge, WallDirection, information_matrix
-from pc2grid.mapping.keyframes import Keyframe
+from pc2grid.mapping.keyframes import TURN_M_PER_RAD, Keyframe
 from pc2grid.mapping.parts import PARTS
-from pc2grid.model import Consistency, Contradiction, OccupancyGrid, Precision, Trajectory, UncertainSegment
+from pc2grid.model import (
+    MOST_LISTED,
+    Consistency,
+    Contradiction,
+    OccupancyGrid,
+    Precision,
+    Trajectory,
+    UncertainSegment,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +60,6 @@ class ConsistencyParameters:
     same_m : a neighbouring keyframe confirms a hit if it has a hit within this distance; two cells of the
         default resolution.
     window_m : travel over which the share of contradicting hits is averaged.
-    turn_m_per_rad : travel that a turn on the spot counts as, as in loop closure.
     fewest_hits : of a window; with fewer, the share is computed as if there were so many.
     contradicted_from : share of the hits of a window from which its middle contradicts the map.
     bent_from : share of the travel that contradicts a map from which the map is called bent.
@@ -69,11 +76,10 @@ class ConsistencyParameters:
     behind_m: float = 0.3
     same_m: float = 0.1
     window_m: float = 5.0
-    turn_m_per_rad: float = 0.3
     fewest_hits: int = 30
     contradicted_from: float = 0.2
     bent_from: float = 0.005
-    shown: int = 20
+    shown: int = MOST_LISTED
 
 
 CONSISTENCY = ConsistencyParameters()
@@ -209,7 +215,7 @@ def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m
 def _window_shares(poses: F64, hits: I64, contradicting: I64, parameters: ConsistencyParameters) -> F64:
     """Return the share of contradicting hits in the window of travel around each of the poses (K, 3)."""
     steps = np.diff(poses, axis=0)
-    step_m = np.hypot(steps[:, 0], steps[:, 1]) + parameters.turn_m_per_rad * np.abs(wrap_angle(steps[:, 2]))
+    step_m = np.hypot(steps[:, 0], steps[:, 1]) + TURN_M_PER_RAD * np.abs(wrap_angle(steps[:, 2]))
     travel_m = np.concatenate(([0.0], np.cumsum(step_m)))
     first = np.searchsorted(travel_m, travel_m - 0.5 * parameters.window_m, side="left")
     last = np.searchsorted(travel_m, travel_m + 0.5 * parameters.window_m, side="right")

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F32, F64, BoolGrid, cells_of, freeze
+from pc2grid.geometry import F32, F64, SUBPIXEL_BITS, BoolGrid, cells_of, freeze, polygon_corners
 from pc2grid.libraries import compiled
 from pc2grid.model import OCCUPIED, OCCUPIED_FROM, UNKNOWN, OccupancyGrid, Submap
 from pc2grid.settings import PartitionConfig
@@ -192,12 +192,10 @@ def polygon_mask(view: Isovist, grid: OccupancyGrid, *, margin_m: float = 0.0) -
     `margin_m`."""
     angles = 2 * np.pi * np.arange(len(view.ranges_m)) / len(view.ranges_m)
     reach = np.minimum(view.ranges_m + margin_m, view.sight_m + margin_m)
-    x = (view.center_m[0] + reach * np.cos(angles) - grid.origin_m[0]) / grid.resolution_m - 0.5
-    y = (view.center_m[1] + reach * np.sin(angles) - grid.origin_m[1]) / grid.resolution_m - 0.5
-    shift = 4
-    corners = np.round(np.column_stack((x, y)) * (1 << shift)).astype(np.int32)
+    x = (view.center_m[0] + reach * np.cos(angles) - grid.origin_m[0]) / grid.resolution_m
+    y = (view.center_m[1] + reach * np.sin(angles) - grid.origin_m[1]) / grid.resolution_m
     mask = np.zeros(grid.cells.shape, dtype=np.uint8)
-    cv2.fillPoly(mask, [corners], 1, lineType=cv2.LINE_8, shift=shift)
+    cv2.fillPoly(mask, [polygon_corners(np.column_stack((x, y)))], 1, shift=SUBPIXEL_BITS)
     return mask.astype(bool)
 
 

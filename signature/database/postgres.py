@@ -24,6 +24,7 @@ from pc2grid.libraries import require
 from signature.database.protocol import (
     APPLICATION_ID,
     BUSY_TIMEOUT_S,
+    CONNECT_TIMEOUT_S,
     FORMAT,
     Location,
     Problem,
@@ -157,8 +158,6 @@ TABLES = definitions(
 can keep a whole building on one node (examples/buildings.md)."""
 CONVERT = "make one with `pc2grid convert LOG -o URL`"
 EXAMPLE = "postgresql://user@host:5432/database, the password in PGPASSWORD or ~/.pgpass"
-_CONNECT_TIMEOUT_S = 10
-"""Chosen by hand."""
 
 
 def is_url(path_or_url: object) -> bool:
@@ -209,7 +208,7 @@ def connect(url: str) -> Connection[Any]:
     """Open a connection in autocommit mode. Raises DatabaseUnreachable or NotADatabase."""
     psycopg, where = driver(), location(url)
     parts = psycopg.conninfo.conninfo_to_dict(url)
-    defaults = {"connect_timeout": _CONNECT_TIMEOUT_S, "application_name": "pc2grid"}
+    defaults = {"connect_timeout": round(CONNECT_TIMEOUT_S), "application_name": "pc2grid"}
     try:
         connection: Connection[Any] = psycopg.connect(
             url, autocommit=True, **{k: v for k, v in defaults.items() if k not in parts}

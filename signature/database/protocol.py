@@ -32,6 +32,8 @@ FORMAT = 1
 """The format that is written and read."""
 APPLICATION_ID = int.from_bytes(SUBMAPS_ID, "big")
 """Marks a file, and the lock of a server, as pc2grid's."""
+CONNECT_TIMEOUT_S = 10.0
+"""How long a server, or a scheduler and its first worker, may take to answer; chosen by hand."""
 BUSY_TIMEOUT_S = 30.0
 """How long a writer waits for another one; chosen by hand."""
 Location = str | Path

@@ -22,13 +22,11 @@ from pc2grid.io.recording import is_submap_file
 from pc2grid.io.robots import Namespaces, camera_info_topic
 from pc2grid.io.source import Choice, LogInfo
 from pc2grid.model import SENSOR_MODELS
-from pc2grid_cli import console, options
+from pc2grid_cli import console, options, output
 
 if TYPE_CHECKING:
     from pc2grid.mapping.drawn import DrawnMap
 
-_WIDEST = 1000
-"""Characters of the widest table of topics."""
 _TRIED_SCANS = 10
 """So many scans are read, to say what convert would say of them."""
 
@@ -183,7 +181,7 @@ def _show(info: Info) -> None:
         number = "?" if topic.message_count is None else str(topic.message_count)
         table.add_row(escape(topic.topic), escape(topic.type), number, uses.get(topic.topic, ""))
     # As wide as the names are: a terminal wraps long lines better than a table breaks names.
-    Console(width=_WIDEST).print(table)
+    Console(width=output.WIDEST).print(table)
     if choice is not None:
         out.print(f"convert uses {escape(choice.topic)}: {escape(choice.reason)}", soft_wrap=True)
         frames = ", ".join((choice.sensor_frame or "(unnamed)", *choice.further_frames))

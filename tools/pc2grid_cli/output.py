@@ -110,7 +110,7 @@ def make_folder(path: Path) -> None:
     require_writable(path / "results", overwrite=True)
 
 
-_WIDEST = 10_000
+WIDEST = 10_000
 """Columns of text: a table is as wide as what it holds. A narrow terminal breaks its lines, but nothing is
 left out."""
 
@@ -140,7 +140,7 @@ def show(*parts: Table | str) -> None:
     """Print tables, and sentences between them."""
     from rich.console import Console
 
-    console = Console(width=_WIDEST, highlight=False)
+    console = Console(width=WIDEST, highlight=False)
     for part in parts:
         if isinstance(part, str):
             print(part)

@@ -49,7 +49,6 @@ from signature.localization.map_index import MapIndex
 from signature.localization.shown.page import page
 from signature.sessions import find, query_config
 
-_SHARES_EVERY_S = 0.2
 _META = '<meta http-equiv="Content-Security-Policy"'
 
 
@@ -181,7 +180,7 @@ class _Shares(Observer):
 
     def on_progress(self, share: float) -> None:
         """See `Observer.on_progress`."""
-        if time.monotonic() - self._told_s >= _SHARES_EVERY_S:
+        if time.monotonic() - self._told_s >= _SENT_EVERY_S:
             self._told_s = time.monotonic()
             self._events.publish("share", {"share": round(share, 4)})
 
@@ -223,8 +222,8 @@ _MOST_WAITING = 1000
 """Events that wait for a page that does not read them; older ones are dropped."""
 _MOST_SCANS = 4000
 """Scans of the path so far, for pages that come later; of a longer path every second one is left out."""
-_SCANS_EVERY_S = 0.1
-"""Scans are sent together, so often; more could not be seen."""
+_SENT_EVERY_S = 0.1
+"""Scans are sent together, and shares of the work, so often; more could not be seen."""
 
 
 class Events:
@@ -320,7 +319,7 @@ class Progress:
             return
         self._base = _planar(registered)
         self._waiting.append([*self._base, int(registered.health is Health.LOST)])
-        if time.monotonic() - self._sent_s >= _SCANS_EVERY_S:
+        if time.monotonic() - self._sent_s >= _SENT_EVERY_S:
             self.flush()
 
     def tell(self, estimate: Estimate) -> None:
@@ -354,8 +353,6 @@ def _planar(registered: RegisteredScan) -> tuple[float, float, float]:
 
 _ADDRESS = "127.0.0.1"
 _BLOCK_BYTES = 1 << 20
-_POLL_S = 0.2
-"""How often the server looks whether it is to stop."""
 _SILENCE_S = 60.0
 """A client that sends nothing for so long is gone."""
 _LINGER_S = 1.0
@@ -404,10 +401,6 @@ class ViewServer(http.server.ThreadingHTTPServer):
     def url(self) -> str:
         """Return the address of the first page."""
         return f"http://{_ADDRESS}:{self.server_port}/{self.token}/"
-
-    def serve_forever(self, poll_interval: float = _POLL_S) -> None:
-        """Serve until the process is interrupted."""
-        super().serve_forever(poll_interval)
 
     @contextlib.contextmanager
     def in_background(self) -> Iterator[None]:

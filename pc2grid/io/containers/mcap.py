@@ -214,8 +214,8 @@ def _wanted(chunks: list[ChunkIndex], channels: set[int], low_ns: int, high_ns: 
 MAGIC = b"\x89MCAP0\r\n"
 _FOOTER = struct.Struct("<9xQQI8s")  # offsets of the summary and of its parts, checksum, magic
 _RECORD = struct.Struct("<BQ")  # kind, length
-_CHUNK_BYTES = 49  # of a chunk's record, without the name of the compression and the data
-_MESSAGE_BYTES = 31  # of a message's record, without the data
+_CHUNK_BYTES = struct.calcsize("<BQQQQIIQ")  # of a chunk's record, without its compression and its data
+_MESSAGE_BYTES = struct.calcsize("<BQHIQQ")  # of a message's record, without the data
 _RUN_BYTES = 1 << 20
 """Length of the runs in which messages outside of chunks are listed; by hand, as long as usual chunks."""
 

@@ -42,9 +42,9 @@ if TYPE_CHECKING:
     from rosbags.interfaces.typing import Typesdict
 
 
-# Counts that no real message reaches.
-_MOST_CLOUD_FIELDS = 1000
-_MOST_DISTORTION = 100
+_MOST_FIELDS = 1000
+"""Fields of a message, of a cloud and numbers of distortion that no real message reaches. The known types
+flatten to some tens of fields; the limit bounds the time for a crafted text to half a second."""
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
@@ -113,7 +113,7 @@ def _store_of(channel: TopicInfo, ros1: bool, needed: str) -> tuple[str, Any]:
 
 
 def _point_cloud(m: Any) -> PointCloud2:
-    if len(m.fields) > _MOST_CLOUD_FIELDS:
+    if len(m.fields) > _MOST_FIELDS:
         raise PointCloudError(f"a cloud with {len(m.fields)} fields")
     fields = tuple((f.name, f.offset, f.datatype, f.count) for f in m.fields)
     big = bool(m.is_bigendian)
@@ -138,7 +138,7 @@ def _compressed_image(m: Any) -> CompressedImage:
 
 
 def _camera_info(m: Any) -> CameraInfo:
-    if len(m.d) > _MOST_DISTORTION:
+    if len(m.d) > _MOST_FIELDS:
         raise PointCloudError(f"a CameraInfo with {len(m.d)} numbers of distortion")
     d, k, p = (tuple(values.tolist()) for values in (m.d, m.k, m.p))
     return CameraInfo(_header(m.header), m.height, m.width, m.distortion_model, d, k, p)
@@ -229,9 +229,7 @@ _TF = (
 )  # rosbags knows it of ROS 2 only
 
 
-# The known types flatten to some tens of fields; their published definitions with all comments have up to
-# 15,000 characters. The limits bound the time for a crafted text to half a second.
-_MOST_FIELDS = 1000
+# The published definitions of the known types, with all comments, have up to 15,000 characters.
 _MOST_CHARACTERS = 1 << 16
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 

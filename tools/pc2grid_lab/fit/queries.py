@@ -53,6 +53,7 @@ from signature.config import Config
 from signature.database import open_database
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import SPACE, fit_in_space, terms_in_space
+from signature.localization.joining.join import JOIN
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import evidence_of
 from signature.localization.query import Query, QueryInSpace, QueryMap, best_observed
@@ -68,8 +69,6 @@ _EVERY = 3
 _BESIDE_M = 0.3
 """The place of the map lies up to so far from the view along each axis: places are a metre apart."""
 _VIEW_SPACING_M = 2.0 * _BESIDE_M
-_WALL_M = 0.4
-"""What a query has seen is widened by this: the far side of a wall does not count as unseen. By hand."""
 
 
 def office_floor(seed: int, clutter: int = 30) -> OccupancyGrid:
@@ -277,7 +276,7 @@ def _blanked(index: MapIndex, window: KnownWindow) -> MapIndex:
 
 def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:
     """Return a map in which all that a query has seen, placed at a pose, is made unknown."""
-    n = math.ceil(_WALL_M / grid.resolution_m)
+    n = math.ceil(JOIN.wall_m / grid.resolution_m)  # the far side of a wall does not count as unseen
     known = (query.grid.cells != UNKNOWN).astype(np.uint8)
     known = cv2.dilate(known, np.ones((2 * n + 1, 2 * n + 1), np.uint8))
     cells = np.argwhere(grid.cells != UNKNOWN)

@@ -86,8 +86,9 @@ class _Shapes:
 _GRID, _ORIENTATIONS = 4, 8
 """SIFT's layout (Lowe 2004): 4 x 4 fields with 8 directions each."""
 
-_DIRECTION_BINS = 36
-"""Of the histogram in which a keypoint's own direction is found (Lowe 2004)."""
+_DIRECTIONS = 36
+"""Bins of the histogram in which a keypoint's own direction is found (Lowe 2004), and directions in which the
+sector of 60 degrees of SURF is tried (by hand)."""
 
 _LEAST_PAIR_M = 1.0
 """Two matches nearer to each other than this do not determine a rotation well enough; chosen by hand."""
@@ -219,7 +220,7 @@ def _turns(gx: F32, gy: F32) -> F64:
 def _directions(keypoints: I64, strength: F32, turns: F64, radius: float) -> F64:
     """Return the main direction (K,), radians, of the gradient (H, W) in the `radius` (cells) of keypoints
     (K, 2)."""
-    bins, reach = _DIRECTION_BINS, int(radius)
+    bins, reach = _DIRECTIONS, int(radius)
     offsets = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
     squared = (offsets**2).sum(axis=1)
     near = squared <= radius * radius
@@ -441,10 +442,6 @@ def _unit(rows: F64) -> F64:
     return np.asarray(rows / np.where(lengths > 0, lengths, 1.0))
 
 
-_SECTORS = 36
-"""Directions in which the sector of 60 degrees is tried for the orientation; chosen by hand."""
-
-
 def surf_descriptors(image: NDArray[np.uint8], max_points: int) -> F32:
     """Return up to `max_points` SURF descriptors (K, 64) of length 1, of the points with the strongest
     response."""
@@ -497,7 +494,7 @@ def orientations(integral: F64, points: F64) -> F64:
     dx, dy = haar(integral, y + i * scale, x + j * scale, half)
     weights = np.exp(-(i**2 + j**2) / (2 * 2.5 * 2.5))
     dx, dy = weights * dx, weights * dy
-    sums = sector_sums(np.arctan2(dy, dx), dx, dy, _SECTORS)
+    sums = sector_sums(np.arctan2(dy, dx), dx, dy, _DIRECTIONS)
     best = (sums**2).sum(axis=1).argmax(axis=0)
     sum_x, sum_y = sums[best, :, np.arange(len(points))].T
     return np.asarray(np.arctan2(sum_y, sum_x))
