@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -237,40 +238,28 @@ def convert(*inputs: Path, output: Path, hash_seed: int, threads: int | None = N
     return output.read_bytes()
 
 
-def test_recordings_of_each_sensor_give_the_same_database_again(tmp_path: Path) -> None:
+def test_recordings_and_a_map_give_the_same_database_again(tmp_path: Path) -> None:
+    """Of each sensor; in two folders, by two processes at once, each slowed down by the other at another
+    place each time: no path, clock, number of a process or of its threads is in the bytes."""
     lengths_m: dict[SensorKind, float] = {"laser": 1.5, "lidar": 0.4, "depth": 0.8}
+    (tmp_path / "1").mkdir()
     for sensor, length_m in lengths_m.items():
         config = SimulationConfig(length_m=length_m, seed=3, clutter=2)
-        simulate_session(tmp_path / f"{sensor}.mcap", sensor=sensor, grid=small_house(), config=config)
-    logs = [tmp_path / f"{sensor}.mcap" for sensor in lengths_m]
-    first = convert(*logs, output=tmp_path / "a.submaps", threads=1, hash_seed=1)
-    again = convert(*logs, output=tmp_path / "b.submaps", hash_seed=2)
-    assert first == again
+        simulate_session(tmp_path / "1" / f"{sensor}.mcap", sensor=sensor, grid=small_house(), config=config)
+    save_map(small_house(), tmp_path / "1" / "house")
+    shutil.copytree(tmp_path / "1", tmp_path / "2")
 
-
-def test_two_processes_at_once_give_the_same_database(tmp_path: Path) -> None:
-    """Each is slowed down by the other, at another place each time."""
-    config = SimulationConfig(length_m=1.0, seed=3, clutter=2)
-    simulate_session(tmp_path / "drive.mcap", sensor="lidar", grid=small_house(), config=config)
-    with ThreadPoolExecutor(2) as pool:
-        outputs = [tmp_path / "a.submaps", tmp_path / "b.submaps"]
-        first, second = pool.map(
-            lambda output: convert(tmp_path / "drive.mcap", output=output, hash_seed=1), outputs
-        )
-    assert first == second
-    assert sorted(path.name for path in tmp_path.glob(".*")) == []
-
-
-def test_a_map_gives_the_same_database_wherever_it_lies(tmp_path: Path) -> None:
-    """Two folders, two working directories: no path, clock or process number is in the bytes."""
-    results = []
-    for number in (1, 2):
+    def made(number: int) -> bytes:
         folder = tmp_path / str(number)
-        folder.mkdir()
-        yaml, _ = save_map(small_house(), folder / "house")
-        os.utime(yaml, (number * 1000, number * 1000))
-        results.append(convert(yaml, output=folder / "x.submaps", hash_seed=number))
-    assert results[0] == results[1]
+        inputs = [*(folder / f"{sensor}.mcap" for sensor in lengths_m), folder / "house.yaml"]
+        os.utime(inputs[-1], (number * 1000, number * 1000))
+        threads = 1 if number == 1 else None
+        return convert(*inputs, output=folder / "x.submaps", hash_seed=number, threads=threads)
+
+    with ThreadPoolExecutor(2) as pool:
+        first, second = pool.map(made, (1, 2))
+    assert first == second
+    assert sorted(path.name for path in tmp_path.glob("*/.*")) == []
 
 
 def test_a_simulated_recording_is_the_same_again(tmp_path: Path) -> None:
