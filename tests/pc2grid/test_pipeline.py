@@ -192,6 +192,7 @@ def test_no_scans_no_trajectory() -> None:
     assert grid.cells.size == 0 and len(trajectory) == 0 and loops == ()
 
 
+@pytest.mark.nightly
 @needs_data
 def test_the_hall_with_its_turns_of_forty_degrees() -> None:
     with open_log(DATA / "lidar" / "hall.mcap") as log:

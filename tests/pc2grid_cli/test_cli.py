@@ -281,6 +281,6 @@ def test_help_takes_little_longer_than_typer_itself(tmp_path: Path) -> None:
 
     pairs = [
         (seconds("from pc2grid_cli.main import main; main()"), seconds("import typer, typer.main"))
-        for _ in range(7)
+        for _ in range(5)
     ]
     assert statistics.median(ours / bare for ours, bare in pairs) < 4.0

@@ -172,14 +172,12 @@ def test_a_laser_without_odometry_does_not_stand_still_in_a_corridor() -> None:
 
 
 @needs_data
-@pytest.mark.parametrize(("icp", "lost"), [("kiss-icp", 0), ("none", 6)])
-def test_a_lidar_in_the_hand_with_scans_far_apart_is_followed_by_kiss_icp(icp: ICP, lost: int) -> None:
-    """Every third scan of the hall, 12 in all. Without KISS-ICP most are lost."""
-    config = Config(registration=RegistrationConfig(icp=icp))
+def test_a_lidar_in_the_hand_with_scans_far_apart_is_lost_without_kiss_icp() -> None:
+    """Every third scan of the hall, 12 in all; with KISS-ICP none is, see test_tracker.py."""
+    config = Config(registration=RegistrationConfig(icp="none"))
     with open_log(DATA / "lidar/hall.mcap") as log:
         healths = [r.health for r, _ in follow(islice(log.scans(), 0, None, 3), config)]
-    found = healths.count(Health.LOST)
-    assert (found == 0) if not lost else (found >= lost)
+    assert healths.count(Health.LOST) >= 6
 
 
 # --- The floor under a robot on wheels, and which sensors are on wheels ---

@@ -89,15 +89,27 @@ def test_a_lidar_in_the_hand_is_followed_through_turns_of_40_degrees_between_sca
 
 
 @pytest.mark.skipif(not HALL.is_file(), reason="no real lidar: set PC2GRID_DATA")
-@pytest.mark.parametrize(("every", "first"), [(2, 0), (2, 1), (3, 0), (3, 2), (4, 0)])
-def test_a_hall_of_which_scans_are_dropped_is_followed_or_lost(every, first):
-    """At one scan in two seconds and less the sensor turns by up to 110 degrees from one to the next."""
+@pytest.mark.parametrize(
+    ("every", "first", "least"),
+    [
+        (2, 1, 0.7),
+        (3, 0, 1.0),
+        (4, 0, 0.7),
+        pytest.param(2, 0, 0.7, marks=pytest.mark.nightly),
+        pytest.param(3, 2, 0.7, marks=pytest.mark.nightly),
+    ],
+)
+def test_a_hall_of_which_scans_are_dropped_is_followed_or_lost(every, first, least):
+    """At one scan in two seconds and less the sensor turns by up to 110 degrees from one to the next.
+
+    least : share of the scans that is not lost.
+    """
     true = read_tum(HALL.with_suffix(".tum")).T_session_base
     with open_log(HALL) as log:
         scans = list(log.scans())[first::every]
     pairs = list(zip(follow(scans), true[first::every], strict=True))
     found = [(r.T_session_base, T) for r, T in pairs if r.health is not Health.LOST]
-    assert len(found) >= 0.7 * len(scans)
+    assert len(found) >= least * len(scans)
     distance_m, _ = relative_errors([pose for pose, _ in found], [T for _, T in found])
     assert distance_m.max() < 0.1
 

@@ -117,6 +117,7 @@ def test_nothing_is_learned_from_the_map_that_is_asked(
         computed_cells([replace(task, level=0)], tmp_path / "cells")
 
 
+@pytest.mark.nightly
 def test_on_a_real_floor_it_is_right_more_often_than_the_paper(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -33,7 +33,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pc2grid.errors import ConfigError, LogNotFound, Pc2GridError
-from pc2grid.geometry import F32, F64, SE2, transform_points
+from pc2grid.geometry import F64, SE2, transform_points
 from pc2grid.io import Log, open_log
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.building_file import is_building_file
@@ -47,6 +47,7 @@ from pc2grid_cli.console import Console, json_text, warn
 from pc2grid_cli.output import make_folder
 from pc2grid_lab.commands import ComparePeers
 from pc2grid_lab.pages import Cell, clopper_pearson, print_cells
+from pc2grid_lab.peers.cloud_matchers import thinned
 from pc2grid_lab.peers.locators import PROGRAMS
 from pc2grid_lab.recordings.catalogue import drive_config
 from pc2grid_lab.recordings.judging import known_share
@@ -223,7 +224,8 @@ def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
         ((registered, planar_scan),) = follow([scan], config)
         builder.add(planar_scan, SE2.from_matrix(T_world_base))
         path.append(T_world_base)
-        clouds.append(_thinned(transform_points(T_world_base, registered.scan.points_m)))
+        points_m = transform_points(T_world_base, registered.scan.points_m)
+        clouds.append(thinned(points_m, SITE.cloud_voxel_m).astype(np.float32))
     grid = builder.grid()
     site.folder.mkdir(parents=True, exist_ok=True)
     if not site.planar:
@@ -267,7 +269,10 @@ def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Con
     else:
         T_query_odom = np.linalg.inv(seen[-1].T_session_base)
         cloud = [transform_points(T_query_odom @ r.T_session_base, r.scan.points_m) for r in seen]
-        _write_arrays(stem.with_suffix(".cloud.npz"), points_m=_thinned(np.concatenate(cloud)))
+        _write_arrays(
+            stem.with_suffix(".cloud.npz"),
+            points_m=thinned(np.concatenate(cloud), SITE.cloud_voxel_m).astype(np.float32),
+        )
     # What registration made of the scans before must not decide which queries count.
     ((_, alone),) = follow([seen[-1].scan], config)
     grid = load_map(site.map_stem.with_suffix(".yaml"))
@@ -308,13 +313,6 @@ def save_beams(path: Path, scans: list[Scan]) -> None:
 def _write_arrays(path: Path, **arrays: Any) -> None:
     with replace_file(path) as draft, draft.open("wb") as file:
         np.savez(file, **arrays)
-
-
-def _thinned(points_m: F64) -> F32:
-    """Return one point for each voxel."""
-    voxels = np.floor(points_m / SITE.cloud_voxel_m).astype(np.int32)
-    _, first = np.unique(voxels, axis=0, return_index=True)
-    return points_m[np.sort(first)].astype(np.float32)
 
 
 PINS = ("map-closures==2.2.0", "kiss-matcher==1.0.2")
