@@ -55,7 +55,7 @@ def test_of_places_drawn_at_random_the_recall_is_hypergeometric() -> None:
     assert mean == pytest.approx(0.5) and 0.2 < half <= 0.5
 
 
-@pytest.mark.parametrize("level", [0, 2])
+@pytest.mark.parametrize("level", [pytest.param(0, marks=pytest.mark.nightly), 2])
 def test_counts_are_those_of_the_methods_of_the_tables(level: int, maps: Path, tmp_path: Path) -> None:
     """Fitted to all places at once, and asked one query after the other."""
     asked, kept, experiment = maps / "a.yaml", tmp_path / "kept", Experiment(queries=5)
