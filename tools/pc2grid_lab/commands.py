@@ -13,7 +13,7 @@ OutputFolder = Annotated[
     Path, typer.Option(*OUTPUT_FOLDER, metavar="FOLDER", help="for results; run again to go on")
 ]
 Queries = Annotated[int, typer.Option(min=1, help="queries of each map, or of each plan and sensor")]
-Travel = Annotated[float, typer.Option(min=0.0, help="metres that a query drives at most")]
+Travel = Annotated[float, typer.Option(min=1.0, help="metres that a query drives at most")]
 OfBase = Annotated[bool, typer.Option("--of-base", help="true poses are of the base, not of the sensor")]
 
 
