@@ -171,8 +171,8 @@ class Localizer:
         return self._answer or self.search(self.query)[1]
 
     def restart(self) -> None:
-        """The scans do not go on from those before: what comes next is a search of its own, and a prior of an
-        earlier time says nothing of it."""
+        """Begin a new query: the next scans do not continue those before, and a prior of an earlier time does
+        not apply to them."""
         self.query.restart()
         self._answer = None
         self._history.clear()
@@ -259,7 +259,7 @@ def _with_prior(
 
 
 def _elsewhere(query: Query, alone: Answer, place: Hypothesis) -> float:
-    """What a query can be, as a multiple of "nowhere": this, and each place that it has alone but one."""
+    """Return the mass of all that a query can be but one place, as a multiple of the mass of "nowhere"."""
     here = Masses.of(query.map(), alone).mass([place])
     odds = alone.masses[0] and math.exp(alone.evidence.log_odds()) / alone.masses[0] if alone.masses else 0.0
     return 1.0 + odds * (sum(alone.masses) - here)

@@ -184,9 +184,11 @@ class MapIndex:
         return restricted
 
     def at_look(self, number: int) -> MapIndex:
-        """An index of which a search ends in time for a robot: beside the likeliest places it has one part of
-        the others, at each look the next one. All that is prepared is shared. The index itself if there is
-        only one part."""
+        """Return an index whose searches end in time for a robot: beside the likeliest places they take one
+        part of the others, at each look the next one.
+
+        number : of the look. All that is prepared is shared. If there is only one part, it is this index.
+        """
         if len(self.places.table) <= 11 * FIRST_PLACES:
             return self
         limited = copy.copy(self)

@@ -148,7 +148,7 @@ class QueryInSpace:
             self._views.popleft()
 
     def since(self, travel_m: float) -> QueryInSpace:
-        """The same without the scans from before the last so many metres of travel."""
+        """Return the query without the scans from before the last so many metres of travel."""
         later, first_m = copy(self), self._spacing.path_m - travel_m
         later._spacing = copy(self._spacing)
         later._views = deque(view for view in self._views if view[0] >= first_m)
@@ -239,7 +239,7 @@ class Query:
             self._keyframes.popleft()
 
     def restart(self) -> None:
-        """The scans do not go on from those before, and a prior of an earlier time says nothing of them."""
+        """Forget the scans: the next ones do not continue them, and an earlier prior does not apply."""
         self.part += 1
         self._slipped_m, self.first_ns = 0.0, None
         self._keyframes.clear()
@@ -248,7 +248,8 @@ class Query:
         self.in_space = self.in_space and QueryInSpace()
 
     def since(self, scans: int) -> Query:
-        """The query that begins with the last so many `QueryMap.keyframes`, before which tracking slipped."""
+        """Return the query that begins with the last so many `QueryMap.keyframes`, before which tracking
+        slipped."""
         later = copy(self)
         later._keyframes = deque(self.map().keyframes[-scans:])
         later._drawn = None

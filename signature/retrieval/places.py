@@ -153,8 +153,8 @@ class Places:
         return likelihood
 
     def _at_once(self, rows: I64, likelihood: F64) -> Order:
-        """The order of the places (R,) of such log-likelihoods that are in the maps that are searched at
-        once."""
+        """Return the order of those of the places (R,) of such log-likelihoods that are in the maps that are
+        searched at once."""
         if self._areas_m2.sum() > AT_ONCE_M2:
             of = self.table.session_index[rows]
             sessions = np.array(list(dict.fromkeys(of.tolist())))

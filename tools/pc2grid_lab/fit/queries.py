@@ -225,7 +225,7 @@ def rows(
 def _asked(
     index: MapIndex, query: QueryMap, truth: Mapping[str, SE2], in_space: QueryInSpace | None = None
 ) -> dict[str, Any]:
-    """What tells for each place that is found, and how far it is from the truth."""
+    """Return the evidence of each place that is found, and how far it is from the truth."""
     *_, (found, _) = index.search(query)
     evidence = evidence_of([h.fit for h in found], query)
     errors = [error_of(index, query, h, truth) for h in found]
