@@ -285,7 +285,6 @@ _LIBRARIES = (
     "open3d-cpu",
     "open3d",
     "opencv-python-headless",
-    "scikit-learn",
     "scipy",
 )
 """The distributions that compute a session. open3d has two names, of which one is installed."""
