@@ -83,15 +83,14 @@ def align(
     places: Places,
     maps: Sequence[SearchMap],
     config: RelocalizeConfig,
-    best: float = 0.0,
 ) -> Iterator[tuple[Hypothesis, ...]]:
     """Align the query with any heading wherever the robot may stand; yields what fits in each batch of areas.
 
     batches : likeliest first; what is clearly less than the best so far is not looked for in the next.
-    maps : prepared map of each session, by session_index. best : score of a place that is known before.
+    maps : prepared map of each session, by session_index.
     """
     most = HYPOTHESES.refined * config.hypotheses
-    scores, enough = [best, 0.0], config.coarse_keep * best  # the best so far, and what is worth refining
+    scores, enough = [0.0], 0.0  # the best so far, and what is worth refining
     for areas in batches:
         coarse: list[tuple[float, int, int, SE2]] = []
         for session, squares_m in areas:

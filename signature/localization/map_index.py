@@ -227,8 +227,7 @@ class MapIndex:
             parts = [parts[0], parts[1 + self.look % (len(parts) - 1)]]
         batches = [self.places.areas(rows[part]) for part in parts]
         batches[0] = chain(batches[0], self._allowed(query))
-        best = max((h.fit.score for h in found if self.allows(query, h)), default=0.0)
-        aligned, left = align(query, batches, self.places, maps, self.config, best), 1.0
+        aligned, left = align(query, batches, self.places, maps, self.config), 1.0
         for part, fits in zip(parts, aligned, strict=True):
             found, left = self._worth_keeping(query, fits, found), left - float(mass[part].sum())
             yield found, left

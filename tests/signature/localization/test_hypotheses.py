@@ -8,13 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pc2grid.geometry import F32, F64, SE2, wrap_angle
+from pc2grid.geometry import F32, SE2, wrap_angle
 from pc2grid.mapping.loops import PlaceMap
 from pc2grid.matching.score import score_fit
-from pc2grid.matching.search import SearchMap, SearchParameters
+from pc2grid.matching.search import SearchMap
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config, RelocalizeConfig, ShortlistBy
-from signature.localization import hypotheses, map_index
+from signature.localization import map_index
 from signature.localization.answer import ambiguous_line
 from signature.localization.decision import decide
 from signature.localization.hypotheses import (
@@ -126,22 +126,6 @@ def test_the_looks_of_a_robot_search_one_part_after_the_other(monkeypatch: pytes
     assert sum(first - second for (_, first), (_, second) in looks) == pytest.approx(left)
     best = [found[0].fit for _, (found, _) in looks if found]
     assert sum(abs(fit.T_map_query.x - 15.0) + abs(fit.T_map_query.y - 5.0) < 0.1 for fit in best) == 1
-
-
-def test_what_is_clearly_less_than_a_known_place_is_not_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    config, floors = Config(), []
-
-    def search_windows(*_: object, parameters: SearchParameters, **__: object) -> F64:
-        floors.append(parameters.floor)
-        return np.empty((0, 4))
-
-    monkeypatch.setattr(hypotheses, "search_windows", search_windows)
-    index = building({"office": office()}, config)
-    query = query_of(office_part((15.0, 5.0), 4.5), np.empty((0, 2)), config, config.relocalize)
-    known = fitted(query, 0, -1, index.maps[0], SE2(15.0, 5.0, 0.0))
-    next(index.search(query, (known,)))
-    least = config.relocalize.coarse_keep * known.fit.score
-    assert floors == pytest.approx([0.0, least], abs=1e-3)  # around the place, and next to the likeliest
 
 
 # --- Likely places that lie on one line ---
