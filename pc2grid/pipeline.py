@@ -41,7 +41,7 @@ from pc2grid.settings import Config, PartitionConfig
 from pc2grid.submaps.submaps import divide
 
 if TYPE_CHECKING:
-    from pc2grid.io import Log
+    from pc2grid.io.recording import Log
     from pc2grid.mapping.loops import PlaceRecognizer
 
 _SHARE_BEFORE_LOOPS = 0.8

@@ -20,8 +20,8 @@ import numpy as np
 from pc2grid._version import __version__
 from pc2grid.clouds.cloud import VoxelCloud
 from pc2grid.errors import ConfigError, OutputError
-from pc2grid.io import open_log
 from pc2grid.io.atomic import require_writable
+from pc2grid.io.recording import open_log
 from pc2grid.libraries import one_blas_thread
 from pc2grid.mapping.drawn import digest_of_map, is_drawn_map, load_drawn_map
 from pc2grid.mapping.part_maps import lost_warnings

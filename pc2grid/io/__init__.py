@@ -1,7 +1,6 @@
 """Files in and out: recordings, maps, trajectories. Submaps are unknown here.
 
-`open_log` is the way in for recordings; the rest is imported by module. A recording passes through the
-folders in this order:
+`recording.open_log` is the way in for recordings. A recording passes through the folders in this order:
 
     containers/  files and folders -> timed messages of bytes (`source.MessageSource`)
     messages/    bytes of a ROS or Foxglove message -> one of our few message types
@@ -12,10 +11,3 @@ folders in this order:
 `stream` yields the scans in order. A running robot is followed by live/. Results are written by `export`,
 `maps` and `trajectory`, all through `atomic`.
 """
-
-from __future__ import annotations
-
-from pc2grid.io.recording import Log, open_log
-from pc2grid.io.source import Choice, LogInfo, TopicInfo
-
-__all__ = ["Choice", "Log", "LogInfo", "TopicInfo", "open_log"]

@@ -24,13 +24,16 @@ from pc2grid.io.map_pose import MapPose, last_map_pose
 from pc2grid.io.plan import Plan, make_plan
 from pc2grid.io.source import (
     LFS_HINT,
+    SQLITE,
     Choice,
     LogInfo,
     MessageSource,
     RawMessage,
+    first_bytes,
     guarded,
     guarded_stream,
     is_lfs_pointer,
+    is_submap_database,
 )
 from pc2grid.io.stream import LogPart, Stream
 from pc2grid.model import ReadReport, Scan
@@ -211,9 +214,6 @@ def _last_ns(source: MessageSource, names: Collection[str], first_ns: int) -> in
 
 
 _BAG = b"#ROSBAG V2.0\n"
-_SQLITE = b"SQLite format 3\0"
-SUBMAPS_ID = b"pcsm"
-"""The application id in the header of a submap database."""
 _READ = "pc2grid reads MCAP, ROS 1 bags, rosbag2 folders and .db3"
 _OTHERS = (
     (
@@ -257,25 +257,6 @@ def open_source(path: Path, config: ReadConfig, *, recover: bool) -> MessageSour
     return _open_file(path, head, config, recover)
 
 
-def first_bytes(path: Path) -> bytes:
-    """Return the first 100 bytes of a file, which identify its format. Raises OSError."""
-    with path.open("rb") as file:
-        return file.read(100)
-
-
-def is_submap_database(head: bytes) -> bool:
-    """Return True if a file is a submap database, by its first 100 bytes."""
-    return head.startswith(_SQLITE) and head[68:72] == SUBMAPS_ID
-
-
-def is_submap_file(path: Path) -> bool:
-    """Return True if this is the file of a submap database; False if it cannot be read."""
-    try:
-        return is_submap_database(first_bytes(path))
-    except OSError:
-        return False
-
-
 def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> MessageSource:
     if not head:
         raise LogTruncated(f"{path}: empty file", hint="was the recording interrupted?")
@@ -291,7 +272,7 @@ def _open_file(path: Path, head: bytes, config: ReadConfig, recover: bool) -> Me
         raise NotALog(
             f"{path}: a submap database, not a recording", hint=f"`pc2grid info {path}` shows what is in it"
         )
-    if head.startswith(_SQLITE):
+    if head.startswith(SQLITE):
         return RosbagsFile(path, config, is_bag=False)
     name, advice = _looks_like(head)
     raise NotALog(f"{path}: not a recording; looks like {name}", hint=advice)

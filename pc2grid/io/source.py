@@ -23,6 +23,10 @@ from pc2grid.model import ReadReport, SensorKind
 
 GAP_NS = 5_000_000_000
 """A longer time without messages, and clocks that differ by more, are reported; chosen by hand."""
+SQLITE = b"SQLite format 3\0"
+"""How an SQLite file begins."""
+SUBMAPS_ID = b"pcsm"
+"""The application id in the header of a submap database."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,6 +179,25 @@ RECOVER_HINT = "--recover reads what is whole"
 LFS_HINT = "`git lfs pull` in its repository fetches the file itself"
 
 T = TypeVar("T")
+
+
+def first_bytes(path: Path) -> bytes:
+    """Return the first 100 bytes of a file, which identify its format. Raises OSError."""
+    with path.open("rb") as file:
+        return file.read(100)
+
+
+def is_submap_database(head: bytes) -> bool:
+    """Return True if a file is a submap database, by its first 100 bytes."""
+    return head.startswith(SQLITE) and head[68:72] == SUBMAPS_ID
+
+
+def is_submap_file(path: Path) -> bool:
+    """Return True if this is the file of a submap database; False if it cannot be read."""
+    try:
+        return is_submap_database(first_bytes(path))
+    except OSError:
+        return False
 
 
 def is_lfs_pointer(head: bytes) -> bool:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
-from pc2grid.io.recording import is_submap_file
+from pc2grid.io.source import is_submap_file
 from signature.database import SubmapDatabase, engine_of, open_database, refuse_existing
 from signature.database.document import DatabaseDamage, StoredSession, clean, stored_session
 from signature.database.postgres import is_url, location

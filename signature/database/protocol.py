@@ -20,7 +20,7 @@ import numpy as np
 from pc2grid.display import short
 from pc2grid.errors import DatabaseError, DatabaseVersion
 from pc2grid.geometry import F64, SE2
-from pc2grid.io.recording import SUBMAPS_ID
+from pc2grid.io.source import SUBMAPS_ID
 from pc2grid.model import Consistency, OdometryCheck, Precision, ReadReport, SessionMap
 from signature.config import Config
 

@@ -16,8 +16,8 @@ from mcap.writer import Writer
 from numpy.typing import ArrayLike
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from pc2grid.io import open_log
 from pc2grid.io.export import LogWriter
+from pc2grid.io.recording import open_log
 from pc2grid.model import ReadReport, Scan
 from pc2grid.settings import ReadConfig
 

@@ -11,7 +11,7 @@ import pytest
 
 from pc2grid.errors import NoScans, TrackingLost
 from pc2grid.geometry import SE2, invert_pose
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.part_maps import check_followed, lost_warnings
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, Trajectory

@@ -11,9 +11,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.errors import LogNotFound
-from pc2grid.io import open_log
 from pc2grid.io.export import write_cloud
 from pc2grid.io.maps import save_map
+from pc2grid.io.recording import open_log
 from pc2grid_cli.info import describe
 from pc2grid_cli.main import app
 from signature.database.maintenance import store

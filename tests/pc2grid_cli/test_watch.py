@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from pc2grid.io import open_log
 from pc2grid.io.maps import save_map
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.documents import schema

@@ -19,7 +19,7 @@ from click.testing import Result
 from typer.testing import CliRunner
 
 from pc2grid.geometry import SE2
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.documents import schema

@@ -15,12 +15,7 @@ from pc2grid import libraries
 from pc2grid.display import plain
 from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.geometry import invert_pose, transform_points
-from pc2grid.io import open_log
-from pc2grid.io.building_file import is_building_file
-from pc2grid.io.maps import is_map_file
-from pc2grid.io.recording import is_submap_file
-from pc2grid.io.robots import Namespaces, camera_info_topic
-from pc2grid.io.source import Choice, LogInfo
+from pc2grid.io.source import Choice, LogInfo, is_submap_file
 from pc2grid.model import SENSOR_MODELS
 from pc2grid_cli import console, options, output
 
@@ -55,6 +50,9 @@ def run(given: options.ShowInfo, terminal: console.Console) -> int | None:
 
         db.info(options.DbInfo(database=log, json=given.json), terminal)
         return None
+    from pc2grid.io.building_file import is_building_file
+    from pc2grid.io.maps import is_map_file
+
     if is_map_file(path) or is_building_file(path):
         of_map = describe_map(path, given.assignments)
         console.print_result(plain(of_map) if given.json else one_line(_map_as_text(of_map)))
@@ -120,6 +118,8 @@ def describe(
     Reads the log's summary, a few messages and the first scans only, unless it has no summary.
     Raises LogError if the file cannot be opened.
     """
+    from pc2grid.io.recording import open_log
+
     config = options.Reading(topic=topic, assignments=assignments).settings()
     with open_log(path, config.read, recover=recover) as log:
         choice: ChosenTopics | None = None
@@ -138,6 +138,8 @@ def describe(
 
 def _chosen(choice: Choice, log: LogInfo) -> ChosenTopics:
     """Return what would be used, with the topic of the camera's calibration if depth images are."""
+    from pc2grid.io.robots import camera_info_topic
+
     images = [
         topic for topic in log.topics if topic.topic == choice.topic and SENSOR_MODELS[choice.sensor].image
     ]
@@ -154,6 +156,8 @@ def _show(info: Info) -> None:
     from rich import markup
     from rich.console import Console
     from rich.table import Table
+
+    from pc2grid.io.robots import Namespaces
 
     def escape(text: str) -> str:
         # Names come from the log, and may hold control sequences for a terminal.

@@ -13,8 +13,8 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.display import probability
 from pc2grid.errors import ConfigError, one_line
 from pc2grid.geometry import SE2
-from pc2grid.io import Log, open_log
 from pc2grid.io.map_pose import read_pose
+from pc2grid.io.recording import Log, open_log
 from pc2grid.model import Health, RegisteredScan
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console, options

@@ -20,10 +20,10 @@ from pc2grid import libraries
 from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, LogError, NotALog, one_line
 from pc2grid.geometry import F64
-from pc2grid.io import open_log
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.map_pose import write_initialpose
 from pc2grid.io.maps import is_map_file
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import stamp_text, write_trajectory
 from pc2grid.mapping.drawn import is_drawn_map
 from pc2grid.mapping.quality import PRECISION

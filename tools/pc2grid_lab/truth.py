@@ -34,7 +34,7 @@ from scipy.spatial import cKDTree
 from pc2grid.clouds.cloud import VoxelCloud, random_subset
 from pc2grid.errors import TrajectoryFileError
 from pc2grid.geometry import F64, I64, SE2, interpolate_pose, invert_pose, transform_points, wrap_angle
-from pc2grid.io import Log
+from pc2grid.io.recording import Log
 from pc2grid.model import SENSOR_MODELS, Health, Trajectory
 from pc2grid.open3d_core import o3d
 

@@ -17,7 +17,7 @@ from pc2grid.estimation.scan_matching import MatchedScan, MatchSelector, ScanMat
 from pc2grid.estimation.smoother import PLANAR, PoseWithCovariance
 from pc2grid.estimation.spatial import Beginning, begin
 from pc2grid.geometry import F64, SE2, pose_from_rotation_vector
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.model import Health, Scan
 from pc2grid.pipeline import follow
 from pc2grid.settings import Config, RegistrationConfig

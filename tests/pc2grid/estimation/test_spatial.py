@@ -17,7 +17,7 @@ from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.estimation.spatial import SPATIAL_PARAMETERS, SpaceMap, begin, first_pose
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import F64, SE2, invert_pose, motion_size, pose_from_rotation_vector
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.loops import EXACT_TRACKING, LoopCloser, LoopParameters
 from pc2grid.mapping.occupancy import GridBuilder

@@ -15,7 +15,7 @@ from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.spatial import begin
 from pc2grid.estimation.tracker import Disagreement, Standstill, Tracker, check_odometry
 from pc2grid.geometry import SE2, invert_pose, motion_size, transform_points, wrap_angle
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, OdometryCheck, OdometryOutlier, Scan
 from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig

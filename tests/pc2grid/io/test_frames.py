@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from pc2grid.errors import FrameError, LogCorrupt, PointCloudError, TopicError
 from pc2grid.geometry import F64, invert_pose, motion_size, pose_from_rotation_vector, quat_xyzw_from_pose
-from pc2grid.io import open_log
 from pc2grid.io.frames import Attitude, FrameTree, PoseTrack
 from pc2grid.io.messages.types import Header, Imu, Transform
+from pc2grid.io.recording import open_log
 from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Dialect, Message, read, ros, write_mcap
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import FrameError, NoScans, Pc2GridError, TopicError
-from pc2grid.io import open_log
 from pc2grid.io.map_pose import MapPose
+from pc2grid.io.recording import open_log
 from tests.helpers.recordings import STEP, T0, Message, ros, write_bag, write_mcap
 
 RANGES = np.full(300, 2.0)

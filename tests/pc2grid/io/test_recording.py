@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pc2grid.errors import FrameError, TopicError
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Message, check_drive, drive, read, ros, write_mcap
 

@@ -29,11 +29,11 @@ from pc2grid.errors import (
     TrajectoryFileError,
     UnsupportedSchema,
 )
-from pc2grid.io import open_log
 from pc2grid.io.maps import load_map
 from pc2grid.io.messages import clouds, foxglove
 from pc2grid.io.messages.ros import decoder_for
 from pc2grid.io.messages.types import Header, LaserScan
+from pc2grid.io.recording import open_log
 from pc2grid.io.sensors import decode
 from pc2grid.io.sensors.depth import MAGIC
 from pc2grid.io.source import TopicInfo

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import LogError, NoScans, TopicError
-from pc2grid.io import open_log
 from pc2grid.io.live.live_log import open_live
+from pc2grid.io.recording import open_log
 from pc2grid.io.source import Choice
 from pc2grid.model import Scan
 from pc2grid.settings import ReadConfig

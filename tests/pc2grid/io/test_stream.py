@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import FrameError, NoScans, TopicError
-from pc2grid.io import open_log, stream
+from pc2grid.io import stream
 from pc2grid.io.live.live_log import open_live
+from pc2grid.io.recording import open_log
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.settings import ReadConfig
 from tests.helpers import foxglove_messages as foxglove

@@ -109,7 +109,7 @@ def test_point_map_keeps_one_point_a_voxel_within_a_millimetre() -> None:
 
 
 def test_a_recording_keeps_its_points_by_default(tmp_path_factory: pytest.TempPathFactory) -> None:
-    from pc2grid.io import open_log
+    from pc2grid.io.recording import open_log
 
     log_file = tmp_path_factory.mktemp("points") / "lidar.mcap"
     drive = SimulationConfig.model_validate(

@@ -27,9 +27,9 @@ import pytest
 from typer.testing import CliRunner
 
 from pc2grid.errors import LogNotFound, MapFileError, NotADatabase, OutputError
-from pc2grid.io import open_log
 from pc2grid.io.export import LogWriter
 from pc2grid.io.maps import load_map, save_map
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import write_kitti, write_tum
 from pc2grid.model import Trajectory
 from pc2grid.simulate import SimulationConfig, simulate_session

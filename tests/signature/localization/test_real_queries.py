@@ -13,8 +13,8 @@ import pytest
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
-from pc2grid.io import open_log
 from pc2grid.io.maps import load_map
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import RegisteredScan, Scan, Trajectory

@@ -35,8 +35,8 @@ import typer
 
 from pc2grid.errors import Pc2GridError
 from pc2grid.geometry import F32, F64, SE2, BoolGrid
-from pc2grid.io import open_log
 from pc2grid.io.maps import load_map
+from pc2grid.io.recording import open_log
 from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.observer import TimeSpan
 from pc2grid.pipeline import follow

@@ -34,10 +34,10 @@ import numpy as np
 
 from pc2grid.errors import ConfigError, LogNotFound, Pc2GridError
 from pc2grid.geometry import F64, SE2, transform_points
-from pc2grid.io import Log, open_log
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.building_file import is_building_file
 from pc2grid.io.maps import load_map, save_map
+from pc2grid.io.recording import Log, open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import SENSOR_MODELS, RegisteredScan, Scan, SensorKind

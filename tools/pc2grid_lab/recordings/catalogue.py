@@ -23,7 +23,7 @@ import numpy as np
 
 from pc2grid import simulate
 from pc2grid.errors import ConfigError, MapFileError, Pc2GridError
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.model import SensorKind
 from pc2grid.observer import TimeSpan
 from pc2grid.simulate import Building, SimulationConfig, load_building, simulate_session

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from pc2grid.geometry import F64, SE2, invert_pose, leveling
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.observer import TimeSpan

@@ -33,8 +33,8 @@ from rosbags.typesys import Stores, get_typestore
 from pc2grid.errors import Pc2GridError
 from pc2grid.estimation.registration import BareKissIcp
 from pc2grid.geometry import SE2, pose_from_xyz_quat
-from pc2grid.io import open_log
 from pc2grid.io.atomic import replace_file
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Scan, Trajectory
 from pc2grid.observer import TimeSpan

@@ -16,7 +16,7 @@ import pytest
 import yaml
 
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogNotFound, LogTruncated, NotALog
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.settings import ReadConfig
 from tests.helpers.field import DATA
 from tests.helpers.memory import bounded_memory

@@ -19,7 +19,7 @@ from pc2grid.errors import (
     TrajectoryFileError,
     UnsupportedSchema,
 )
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import write_tum
 from pc2grid.model import Trajectory
 from pc2grid.settings import ReadConfig

@@ -15,8 +15,8 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, IndexType
 
 from pc2grid.errors import FrameError, LimitExceeded, LogCorrupt, LogError, LogTruncated
-from pc2grid.io import open_log
 from pc2grid.io.containers.mcap import BoundedFile
+from pc2grid.io.recording import open_log
 from pc2grid.settings import ReadConfig
 from tests.helpers.memory import peak_memory
 from tests.helpers.recordings import STEP, T0, Message, check_drive, drive, read, ros, write_mcap

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pc2grid.errors import PointCloudError, TopicError, UnsupportedSchema
-from pc2grid.io import open_log
+from pc2grid.io.recording import open_log
 from pc2grid.settings import ReadConfig
 from tests.helpers.foxglove_messages import IDENTITY, Content, cloud, descriptors, edge, stamped, write
 from tests.helpers.recordings import STEP, T0, raw_log, read
