@@ -200,21 +200,26 @@ class ColumnMap:
             self._low = low
         slack = np.array([size // 10, size // 10, p.layers // 10])
         if (np.abs(low - self._low) > slack).any():
-            self._forget(low)
+            clear(self._evidence, self._sums, self._low, low)
+            self._low = low
             self._floor_m = math.nan  # states are made again
-
-    def _forget(self, low: I64) -> None:
-        """Forget the cells that leave the window when its lowest indices (3,) become `low`."""
-        for axis, size in enumerate(self._evidence.shape):
-            cells = np.arange(low[axis], low[axis] + size)
-            leaves = cells[np.abs(cells - self._low[axis] - 0.5 * (size - 1)) > 0.5 * size] % size
-            np.moveaxis(self._evidence, axis, 0)[leaves] = 0
-            if axis < 2:
-                np.moveaxis(self._sums, axis, 0)[leaves] = 0.0
-        self._low = low
 
 
 # --- compiled functions -------------------------------------------------------------------------------
+
+
+@compiled()
+def clear(evidence: NDArray[np.int8], sums: F32, low: I64, new: I64) -> None:
+    """Forget the cells that leave the window when its lowest indices (3,) change from `low` to `new`."""
+    size, layers = evidence.shape[0], evidence.shape[2]
+    for i in range(new[0], new[0] + size):
+        for j in range(new[1], new[1] + size):
+            if not (low[0] <= i < low[0] + size and low[1] <= j < low[1] + size):
+                evidence[i % size, j % size] = 0
+                sums[i % size, j % size] = 0.0
+    for k in range(new[2], new[2] + layers):
+        if not low[2] <= k < low[2] + layers:
+            evidence[:, :, k % layers] = 0
 
 
 @compiled()
@@ -399,7 +404,7 @@ def view(
     passed = np.zeros((size, size), np.uint8)
     found = 0
     lows = np.empty((size * size, 2))
-    count = len(lows) - size * size  # 0; for a literal, `_first_wall` would be compiled once more
+    count = 0
     for bearing in range(bearings):
         angle = turn + bearing * (2.0 * math.pi / bearings)
         along = (math.cos(angle), math.sin(angle))
