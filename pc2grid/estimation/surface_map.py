@@ -317,7 +317,7 @@ class SurfaceMap:
             information,
             found / max(len(points_m), 1),
             distance_m / max(found, 1.0),
-            weakest(information) > p.least_points * unit,
+            weakest(information, 3) > p.least_points * unit,
         )
 
 
@@ -341,31 +341,6 @@ def _displacement(points_m: F64) -> F64:
     displaced[:, 1, 3], displaced[:, 2, 3], displaced[:, 2, 4] = -z, y, -x
     mean: F64 = np.einsum("nai,naj->ij", displaced, displaced) / len(points_m)
     return mean + 1e-9 * np.eye(6)
-
-
-_MATRIX = np.array([4, 5, 6, 5, 7, 8, 6, 8, 9])
-"""Columns of the second moments, as a symmetric matrix (3, 3) row by row."""
-
-
-def fit_shapes(
-    codes: I64, moments: F64, shapes: F64, rows: I64, edge: float, least: float, noise: float
-) -> None:
-    """Write mean and information (V, 9) of the voxels in `rows`; zero where there are too few points.
-
-    The information is the constraint of a point in each direction, 0..1: s^2 / (v + s^2) for a variance v of
-    the points along it and a noise s, less that of the widest direction. So a plane constrains along its
-    normal, an edge across its line, and a ball not at all.
-    """
-    code, count = codes[rows, None] >> np.array([2 * AXIS_BITS, AXIS_BITS, 0]), moments[rows, :1]
-    mean = moments[rows, 1:4] / count
-    shapes[rows, :3] = mean + ((code & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
-    shapes[rows, 3:] = 0.0
-    some = count[:, 0] >= least
-    C = (moments[rows[some]][:, _MATRIX] / count[some]).reshape(-1, 3, 3)
-    variances, axes = np.linalg.eigh(C - mean[some, :, None] * mean[some, None])
-    held = noise**2 / (np.maximum(variances, 0.0) + noise**2)
-    information = (axes * (held - held[:, 2:])[:, None]) @ axes.swapaxes(1, 2)
-    shapes[rows[some], 3:] = information.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
 
 
 @compiled(inline="always")
@@ -438,6 +413,46 @@ def add(
         m[9] += z * z
         touched[n] = row
     return used
+
+
+@compiled()
+def fit_shapes(
+    codes: I64, moments: F64, shapes: F64, rows: I64, edge: float, least: float, noise: float
+) -> None:
+    """Write mean and information (V, 9) of the voxels in `rows`; zero where there are too few points.
+
+    The information is the constraint of a point in each direction, 0..1: s^2 / (v + s^2) for a variance v of
+    the points along it and a noise s, less that of the widest direction. So a plane constrains along its
+    normal, an edge across its line, and a ball not at all.
+    """
+    C = np.empty((3, 3))
+    for row in rows:
+        m, shape = moments[row], shapes[row]
+        n, code = m[0], codes[row]
+        x, y, z = m[1] / n, m[2] / n, m[3] / n
+        shape[0] = x + (((code >> (2 * AXIS_BITS)) & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
+        shape[1] = y + (((code >> AXIS_BITS) & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
+        shape[2] = z + ((code & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
+        shape[3:] = 0.0
+        if n < least:
+            continue
+        C[0, 0] = m[4] / n - x * x
+        C[0, 1] = C[1, 0] = m[5] / n - x * y
+        C[0, 2] = C[2, 0] = m[6] / n - x * z
+        C[1, 1] = m[7] / n - y * y
+        C[1, 2] = C[2, 1] = m[8] / n - y * z
+        C[2, 2] = m[9] / n - z * z
+        values, axes = np.linalg.eigh(C)
+        widest = noise * noise / (max(values[2], 0.0) + noise * noise)
+        for axis in range(2):
+            held = noise * noise / (max(values[axis], 0.0) + noise * noise) - widest
+            u, v, w = axes[0, axis], axes[1, axis], axes[2, axis]
+            shape[3] += held * u * u
+            shape[4] += held * u * v
+            shape[5] += held * u * w
+            shape[6] += held * v * v
+            shape[7] += held * v * w
+            shape[8] += held * w * w
 
 
 @compiled()

@@ -205,13 +205,8 @@ def test_normal_equations_are_those_of_their_definition(radius: int) -> None:
     grid, points, normals = corner(np.random.default_rng(radius))
     pose = np.array([0.05, -0.03, 0.02])
     arguments = (grid._index, grid._moments, points, normals, pose, grid.cell_m, radius, 0.05 * radius)
-    (upper, g, found), (plain_H, plain_g, plain_found) = (
-        normal_equations(*arguments[:4], tuple(pose), *arguments[5:]),
-        normal_equations_plain(*arguments),
-    )
-    assert found == plain_found
-    assert upper == pytest.approx(plain_H[np.triu_indices(3)], rel=1e-6, abs=1e-9)
-    assert g == pytest.approx(plain_g, rel=1e-6, abs=1e-9)
+    for found, expected in zip(normal_equations(*arguments), normal_equations_plain(*arguments), strict=True):
+        assert found == pytest.approx(expected, rel=1e-6, abs=1e-9)
 
 
 @pytest.mark.parametrize("sigma", [0.01, 0.3, np.inf])
@@ -225,14 +220,8 @@ def test_a_match_is_that_of_its_definition(sigma: float, turns: int) -> None:
         *(grid._index, grid._moments, points, normals, guess, prior, information, grid.cell_m),
         *(np.array([3, 2, 1, 1, 1, 1]), 0.05, 2.0, 1e-4),
     )
-    upper = np.triu_indices(3)
-    *poses, found_information, found = aligned(
-        *arguments[:4], tuple(guess), tuple(prior), tuple(information[upper]), *arguments[7:]
-    )
-    *plain, plain_information, plain_found = aligned_plain(*arguments)
-    assert found == plain_found
-    assert found_information == pytest.approx(plain_information[upper], rel=1e-9, abs=1e-9)
-    assert np.array(poses) == pytest.approx(np.array(plain), rel=1e-9, abs=1e-9)
+    for found, expected in zip(aligned(*arguments), aligned_plain(*arguments), strict=True):
+        assert found == pytest.approx(expected, rel=1e-9, abs=1e-9)
 
 
 def test_likelihood_falls_with_the_distance_from_the_points() -> None:

@@ -81,7 +81,7 @@ def test_what_only_seems_to_be_held_is_not() -> None:
         surfaces, weights = seen(first), np.ones(len(middle))
         placed = surfaces.match(middle, weights, np.eye(4), held(np.eye(4), 1.0))
         truly = surfaces.observable(middle, weights, placed)
-        left = weakest(truly.information) / weakest(placed.information)
+        left = weakest(truly.information, 3) / weakest(placed.information, 3)
         return placed.measured, truly.measured, left
 
     assert after((0, 2)) == (True, False, pytest.approx(0.0, abs=1e-6))
