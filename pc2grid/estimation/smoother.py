@@ -1,21 +1,26 @@
-"""A fixed-lag smoother over the last poses of the base.
+"""A fixed-lag smoother over the last poses of the base and over the readings that odometry should report.
 
-A pose lies near the match of its scan with the local map, and it moves from the pose before by the motion
-that odometry reports, or registration; where nothing measures the motion, it moves on as before. A reading
-that comes late or twice makes two motions that do not fit the matches; they count little.
+The state of each of the last scans is the pose of the base in the session frame, and the pose that odometry
+without noise would report. Between two scans both move alike, but for the drift of the odometry; a reading
+differs from the second by noise. A reading that comes late or twice is then an outlier of that noise, a
+driver that starts again is an outlier of the drift, and in both cases later readings count again. The
+difference of the two poses is the pose of the odometry frame in the session frame (`map -> odom` of REP-105).
 
 Further unknowns are the systematic errors of odometry, which are the same in every step: of the distance, of
 its direction, of the turn on each metre, and of a turn, as in Censi et al., "Simultaneous calibration of
-odometry and sensor parameters for mobile robots" (2013). They are needed along corridors: without them the
-map of killian (first 500 s) is 0.49 instead of 0.34 m off, and the track of intel 0.175 instead of 0.119 m.
+odometry and sensor parameters for mobile robots" (2013).
 
 All measurements are factors with Cauchy weights (Suenderhauf and Protzel, "Switchable constraints", 2012;
 Agarwal et al., 2013); the oldest scan is marginalised (Sibley, Matthies and Sukhatme, "Sliding window filter
 with application to planetary landing", 2010). On wheels three of six degrees of freedom are free.
+
+The window of factors, its states and the marginalised prior are tuples of arrays, which compiled code takes
+directly.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -25,8 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv, dpotrs
 
-from pc2grid.estimation.line_map import inverse_adjoint, moved, steps
-from pc2grid.geometry import F64, wrap_angle
+from pc2grid.estimation.line_map import compiled_steps, inverse_adjoint, moved, steps
+from pc2grid.geometry import F64, BoolGrid, invert_pose
+from pc2grid.libraries import compiled
 
 PLANAR: tuple[int, ...] = (0, 1, 5)
 """The free directions of a base on wheels: x, y, and the turn about z, in the base frame."""
@@ -38,8 +44,8 @@ ERRORS = 4
 """Systematic errors of odometry that are estimated."""
 LEAST_S = 1e-3
 """Scans follow each other no faster."""
-_STILL = np.eye(4)[None]
-_ORIGIN = 1e-4  # standard deviation, m and rad, of the first pose, which defines the session frame
+_LEAST_DRIFT = 1e-3  # standard deviation of odometry that reports no motion
+_DAMPING = 1e-9  # so that unknowns without evidence can be solved for
 
 
 class SmootherParameters(NamedTuple):
@@ -82,11 +88,11 @@ class SmootherParameters(NamedTuple):
 
 SMOOTHER = SmootherParameters()
 IN_THE_HAND = SmootherParameters(
-    reading_m=7e-4, reading_rad=7e-4, drift=0.005, drift_turn_m=0.005, unsteady=0.9, growth=0.5,
+    reading_m=0.002, reading_rad=0.001, drift=0.005, drift_turn_m=0.005, unsteady=0.9, growth=0.5,
     scale=1e-6, direction_rad=1e-6, yaw_rad_per_m=1e-6, turn=1e-6,
 )  # fmt: skip
-"""For odometry in six degrees of freedom, which is visual and inertial: it is exact to a millimetre from
-image to image, drifts by a percent, and has no wheels whose errors are always the same. Chosen by hand."""
+"""For odometry in six degrees of freedom, which is visual and inertial: it is exact to millimetres from image
+to image, drifts by a percent, and has no wheels whose errors are always the same. Chosen by hand."""
 
 
 @dataclass(frozen=True)
@@ -134,51 +140,80 @@ class PoseWithCovariance:
 class ScanFactors:
     """The measurements of one scan.
 
-    seconds : since the scan before. reported : (4, 4) T_last_now by odometry; None if it does not say.
-    match : the pose (4, 4) of the scan on the local map with its information (D, D); None if it fits nowhere.
-    motion : (4, 4) T_last_now by registration, with its information (D, D), where odometry does not say.
+    seconds : since the scan before. T_odom_base : (4, 4) the reading of odometry, None if there is none.
+    continues : True if that reading continues the one before. match : the pose (4, 4) of the scan on the
+    local map with its information (D, D); None if it fits nowhere. motion : (4, 4) T_last_now by
+    registration, with its information (D, D); None if it is not measured.
     """
 
     seconds: float
-    reported: F64 | None = None
+    T_odom_base: F64 | None = None
+    continues: bool = True
     match: tuple[F64, F64] | None = None
     motion: tuple[F64, F64] | None = None
 
 
-class Window(NamedTuple):
-    """The last N scans: their poses, and two measurements of each.
+class FactorWindow(NamedTuple):
+    """The measurements of the last N scans. A missing one has infinite standard deviations, or no
+    information.
 
-    poses : (N, 4, 4) T_session_base. match : (N, 4, 4) the pose by the local map. step : (N, 6) from the scan
-    before, as odometry or registration measure it. information : (N, 2, D, D) of the match and of the step; 0
-    where there is none. by_odometry : (N,) 1 if odometry reports the step, else 0. steady : (N,) of a step
-    that nothing measures, its share of the step before at constant velocity; 0 for others. seconds : (N,)
-    since the scan before.
+    seconds : (N,) since the scan before. jumps : (N,) True if the reading does not continue the one before.
+    read : (N, 4, 4) T_odom_base, with read_sigma (N, D). match : (N, 4, 4) T_session_base, with
+    match_information (N, D, D). motion : (N, 6) step from the scan before, with motion_information (N, D, D).
+    """
+
+    seconds: F64
+    jumps: BoolGrid
+    read: F64
+    read_sigma: F64
+    match: F64
+    match_information: F64
+    motion: F64
+    motion_information: F64
+
+    def part(self, begin: int, end: int) -> FactorWindow:
+        """Return the rows of the scans from `begin` to before `end`."""
+        return FactorWindow._make(rows[begin:end] for rows in self)
+
+    def then(self, more: FactorWindow) -> FactorWindow:
+        """Return the window with further scans."""
+        return FactorWindow._make(map(np.concatenate, zip(self, more, strict=True)))
+
+
+class WindowState(NamedTuple):
+    """The estimates of the last N scans.
+
+    poses : (N, 4, 4) T_session_base. readings : (N, 4, 4) T_odom_base as odometry without noise would report
+    it.
+    errors : (4,) systematic errors of odometry: scale, direction, yaw per metre, turn.
     """
 
     poses: F64
-    match: F64
-    step: F64
-    information: F64
-    by_odometry: F64
-    steady: F64
-    seconds: F64
+    readings: F64
+    errors: F64
 
-    def part(self, begin: int, end: int | None = None) -> Window:
-        """Return the scans from `begin` to before `end`."""
-        return Window._make(rows[begin:end] for rows in self)
+    def changed(self, errors: F64, changes: F64) -> WindowState:
+        """Return the state after changes of the errors (4,), and (2, N, 6) of poses and readings."""
+        of_poses, of_readings = changes
+        return WindowState(
+            moved(self.poses, of_poses), moved(self.readings, of_readings), self.errors + errors
+        )
+
+    def part(self, begin: int, end: int) -> WindowState:
+        """Return the state of the scans from `begin` to before `end`."""
+        return WindowState(self.poses[begin:end], self.readings[begin:end], self.errors)
 
 
 class MarginalPrior(NamedTuple):
-    """The marginalised scans: gradient (P,) and information (P, P) at errors (4,) and poses (M, 4, 4)."""
+    """The marginalised scans as a Gaussian on the first unknowns: those of `about`, less `shift` (P,)."""
 
-    poses: F64
-    errors: F64
-    gradient: F64
+    about: WindowState
+    shift: F64
     information: F64
 
 
 class Smoother:
-    """Adds scans one by one, and estimates the poses of the last ones.
+    """Adds scans one by one, and estimates the states of the last ones.
 
     free : directions that can change, `PLANAR` or `SPATIAL`: D of them.
     """
@@ -189,34 +224,37 @@ class Smoother:
 
     # ------------------------------------------------------------------------------------------ prediction
 
-    def start(self, T_session_base: F64, speed: F64 | None = None) -> None:
-        """Begin with a pose (4, 4), which defines the session frame.
+    def start(self, T_session_base: F64, T_odom_base: F64 | None, speed: F64 | None = None) -> None:
+        """Begin with a pose (4, 4), which defines the session frame, and a reading of odometry.
 
         speed : (6,) velocity at the beginning, per second; None: the sensor stands.
         """
-        p, d = self._parameters, len(self._free)
         self._begins_at = np.zeros(6) if speed is None else speed
-        self._errors = np.zeros(ERRORS)
-        self._overconfidence = 1.0  # of odometry: the variance of its last steps over the one that it states
-        nothing = ScanFactors(seconds=0.0)
-        self._window = self._row(T_session_base, nothing, np.eye(4), np.zeros((d, d)), 0.0)
+        p, d = self._parameters, len(self._free)
+        reading = T_session_base if T_odom_base is None else T_odom_base
+        self._state = WindowState(T_session_base[None].copy(), reading[None].copy(), np.zeros(ERRORS))
+        self._window = self._row(ScanFactors(seconds=0.0), T_session_base, reading)
+        self._begins = True  # no scan has been added since
         errors = np.array([p.scale, p.direction_rad, p.yaw_rad_per_m, p.turn])
-        information = np.diag(np.concatenate((errors, np.full(d, _ORIGIN))) ** -2)
-        self._prior = MarginalPrior(T_session_base[None], self._errors, np.zeros(ERRORS + d), information)
-        self._covariance = np.diag(np.full(d, _ORIGIN**2))
+        own = np.concatenate((np.full(d, 1e-4), self._noise(p.reading_m, p.reading_rad)))
+        information = np.diag(np.concatenate((errors, own)) ** -2)
+        self._prior = MarginalPrior(self._state, np.zeros(len(information)), information)
+        self._covariance = np.diag(own[:d] ** 2)
+        self._drift_scale = 1.0  # of the drift that the last steps show, in its standard deviations
 
     @property
     def belief(self) -> PoseWithCovariance:
         """Return the pose of the last scan."""
-        return PoseWithCovariance(self._window.poses[-1], self._covariance, self._free)
+        return PoseWithCovariance(self._state.poses[-1], self._covariance, self._free)
 
-    def by_odometry(self, reported: F64) -> tuple[F64, F64]:
-        """Predict the next motion (4, 4) by the one that odometry reports; returns it with standard
-        deviations (D,).
-        """
-        step = steps(_STILL, reported[None]).step
-        right, _ = corrected(step, self._errors)
-        return moved(_STILL, right)[0], self._drift(step[0])
+    def by_odometry(self, T_odom_base: F64) -> PoseWithCovariance:
+        """Predict the next pose from a reading (4, 4) of odometry."""
+        p = self._parameters
+        (reported,), _, _ = steps(self._state.readings[-1:], T_odom_base[None])
+        motion, _, _ = corrected(reported, self._state.errors)
+        drift = drift_variance(reported, p.drift, p.drift_turn_m)[self._free]
+        variance = drift + 2.0 * self._noise(p.reading_m, p.reading_rad) ** 2
+        return self.after(moved(np.eye(4)[None], motion[None])[0], np.sqrt(variance))
 
     def constant_velocity(self, seconds: float, turn: F64 | None = None) -> tuple[F64, F64]:
         """Predict the next motion (4, 4) over a time by constant velocity; returns it with standard
@@ -227,8 +265,7 @@ class Smoother:
         p = self._parameters
         step, over_s = self._latest()
         share = min(seconds / over_s, 1.0)
-        motion = moved(_STILL, share * step[None])[0]
-        sigmas = np.full(len(self._free), p.unsteady * max(seconds, LEAST_S) ** (1.0 + p.growth))
+        motion, sigmas = moved(np.eye(4)[None], share * step[None])[0], self._change_sigmas(seconds)
         if turn is not None:
             motion[:3, :3] = turn[:3, :3]
             sigmas = np.where(self._free < 3, sigmas, p.gyroscope_radps * seconds)
@@ -240,8 +277,7 @@ class Smoother:
         back = min(int(np.searchsorted(spans_s, self._parameters.steady_s)), len(spans_s) - 1)
         if not back:
             return self._begins_at, 1.0
-        poses = self._window.poses
-        step, _, _ = steps(poses[-1 - back :][:1], poses[-1:])
+        step, _, _ = steps(self._state.poses[-1 - back :][:1], self._state.poses[-1:])
         return step[0], max(float(spans_s[back]), LEAST_S)
 
     @property
@@ -254,7 +290,7 @@ class Smoother:
         """Return the last pose after a motion (4, 4) with standard deviations (D,) of its own."""
         F = inverse_adjoint(motion)[np.ix_(self._free, self._free)]
         return PoseWithCovariance(
-            self._window.poses[-1] @ motion, F @ self._covariance @ F.T + np.diag(sigmas**2), self._free
+            self._state.poses[-1] @ motion, F @ self._covariance @ F.T + np.diag(sigmas**2), self._free
         )
 
     # ---------------------------------------------------------------------------------------------- update
@@ -263,149 +299,362 @@ class Smoother:
         """Add a scan, and estimate its pose and again those of the scans before it.
 
         guess : (4, 4) initial T_session_base, for example the match with the local map.
+
+        Without odometry, the first motion is taken to be that of `start`.
         """
-        window, steady = self._window, 0.0
-        if evidence.reported is not None:
-            motion = evidence.reported
-            _, sigmas = self.by_odometry(motion)
-            information = np.diag(sigmas**-2)
-        elif evidence.motion is not None:
-            motion, information = evidence.motion
-        else:
+        before, read = self._state, evidence.T_odom_base
+        reading = before.readings[-1] @ invert_pose(before.poses[-1]) @ guess
+        if read is not None and not evidence.continues:
+            reading = read
+        if self._begins and read is None and evidence.motion is None:
             motion, sigmas = self.constant_velocity(evidence.seconds)
-            information = np.diag(sigmas**-2)
-            if len(window.poses) > 1:  # both steps are estimated together
-                before_s = max(float(window.seconds[-1]), LEAST_S)
-                steady = min(evidence.seconds, max(before_s, self._parameters.steady_s)) / before_s
-                motion = np.eye(4)
-        row = self._row(guess, evidence, motion, information, steady)
-        self._window = Window._make(map(np.concatenate, zip(window, row, strict=True)))
-        self._solve()
-        if len(self._window.poses) > self._parameters.lag:
+            evidence = dataclasses.replace(evidence, motion=(motion, np.diag(sigmas**-2)))
+        self._begins = False
+        self._window = self._window.then(self._row(evidence, guess, reading))
+        state = WindowState(
+            np.concatenate((before.poses, guess[None])),
+            np.concatenate((before.readings, reading[None])),
+            before.errors,
+        )
+        self._state, factor = self._solved(state)
+        self._covariance = self._last_covariance(factor)
+        if len(self._state.poses) > self._parameters.lag:
             self._marginalise()
         return self.belief
 
-    def _row(self, pose: F64, evidence: ScanFactors, motion: F64, information: F64, steady: float) -> Window:
-        """Return the row of one scan."""
-        match, of_match = evidence.match or (pose, np.zeros_like(information))
-        step = steps(_STILL, motion[None]).step[0]
-        odometry = evidence.reported is not None
-        row = pose, match, step, (of_match, information), odometry, steady, evidence.seconds
-        return Window._make(np.array(value, np.float64)[None] for value in row)
-
-    def _solve(self) -> None:
-        """Solve by Gauss-Newton for the errors, the poses, and the covariance of the last one."""
+    def _row(self, evidence: ScanFactors, pose: F64, reading: F64) -> FactorWindow:
+        """Return the row of one scan; a pose (4, 4) and a reading take the place of missing measurements."""
         p, d = self._parameters, len(self._free)
+        nothing, read = np.zeros((d, d)), (reading, np.full(d, np.inf))
+        if evidence.T_odom_base is not None:
+            read = evidence.T_odom_base, self._noise(p.reading_m, p.reading_rad)
+        motion, information = evidence.motion or (np.eye(4), nothing)
+        step, _, _ = steps(np.eye(4)[None], motion[None])
+        match = evidence.match or (pose, nothing)
+        row = (evidence.seconds, not evidence.continues, *read, *match, step[0], information)
+        return FactorWindow(*(np.array(value)[None] for value in row))
+
+    def _solved(self, state: WindowState) -> tuple[WindowState, F64]:
+        """Solve by Gauss-Newton; returns the state and the Cholesky factor of the information on its
+        unknowns.
+        """
+        p, n = self._parameters, len(state.poses)
         for _ in range(p.iterations):
-            H, g = self._equations(self._window)
+            H, g, self._drift_scale = normal_equations(
+                state, self._window, self._prior, self._free, p, self._drift_scale, n
+            )
+            H[np.diag_indices(len(g))] += _DAMPING
             factor, delta, failed = dposv(H, -g)
             if failed:
                 raise np.linalg.LinAlgError("the information of the smoother is not positive definite")
-            changes = np.zeros((len(self._window.poses), 6))
-            changes[:, self._free] = delta[ERRORS:].reshape(-1, d)
-            self._errors = self._errors + delta[:ERRORS]
-            self._window = self._window._replace(poses=moved(self._window.poses, changes))
+            changes = np.zeros((2, n, 6))
+            changes[:, :, self._free] = delta[ERRORS:].reshape(n, 2, -1).swapaxes(0, 1)
+            state = state.changed(delta[:ERRORS], changes)
             if np.abs(delta).max() < p.converged:
                 break
-        self._covariance = dpotrs(factor, np.eye(len(g))[:, -d:])[0][-d:]
+        return state, factor
 
-    def _equations(self, window: Window) -> tuple[F64, F64]:
-        """Return the matrix (U, U) and the gradient (U,) of all factors of scans, and of the prior.
-
-        Unknowns are the errors, and D changes of each pose. A pose lies near its match. It moves from the one
-        before by the measured step, in which the errors of odometry are corrected; without measurement it
-        moves on as before.
-        """
-        poses, d, n = window.poses, len(self._free), len(window.poses)
-        count, unknowns, across = (
-            ERRORS + 3 * d,
-            ERRORS + d * n,
-            np.ix_(np.arange(2 * n - 1), self._free, self._free),
-        )
-        found = steps(np.concatenate((window.match, poses[:-1])), np.concatenate((poses, poses[1:])))
-        by_first, by_second = found.by_first[across], found.by_second[across]
-        by_odometry, steady = window.by_odometry[1:, None, None], window.steady[2:, None, None]
-        expected, by_errors = corrected(window.step[1:], self._errors)
-        expected = np.where(by_odometry[..., 0], expected, window.step[1:])
-        expected[1:] += steady[..., 0] * found.step[n:-1]
-        away = found.step.copy()
-        away[n:] -= expected
-        away[:, 5] = wrap_angle(away[:, 5])
-        # Of each scan the match and the step; columns are the errors, and the last three poses.
-        error, jacobian = np.zeros((n, 2, d)), np.zeros((n, 2, d, count))
-        error[:, 0], error[1:, 1] = away[:n, self._free], away[n:, self._free]
-        jacobian[:, 0, :, -d:] = by_second[:n]
-        jacobian[1:, 1, :, -d:] = by_second[n:]
-        jacobian[1:, 1, :, -2 * d : -d] = by_first[n:]
-        jacobian[2:, 1, :, -2 * d : -d] -= steady * by_second[n:-1]
-        jacobian[2:, 1, :, -3 * d : -2 * d] = -steady * by_first[n:-1]
-        jacobian[1:, 1, :, :ERRORS] = -by_odometry * by_errors[:, self._free]
-        chi2 = np.einsum("nfa,nfab,nfb->nf", error, window.information, error)
-        if n > 3:  # not of the few that are marginalised
-            of_odometry = float(window.by_odometry @ chi2[:, 1])
-            self._overconfidence = max(of_odometry / (d * max(float(window.by_odometry.sum()), 1.0)), 1.0)
-        variance = np.ones_like(chi2)
-        variance[window.by_odometry > 0.0, 1] = self._overconfidence
-        weight = 1.0 / (variance + chi2 / self._parameters.kernel**2)
-        weight[window.steady > 0.0, 1] = 1.0  # a change of the motion is no outlier
-        weighed = (weight[..., None, None] * window.information @ jacobian).reshape(n, 2 * d, count)
-        blocks = jacobian.reshape(n, 2 * d, count).swapaxes(1, 2) @ weighed
-        gradients = (error.reshape(n, 1, 2 * d) @ weighed)[:, 0]
-        at = np.arange(count) + d * np.arange(-2, n - 2)[:, None]
-        at[:, :ERRORS] = np.arange(ERRORS)
-        at = np.maximum(at, 0)  # nothing is before the first scan: zeros are added
-        cells = (unknowns * at[:, :, None] + at[:, None]).ravel()
-        H: F64 = (
-            np.bincount(cells, blocks.ravel(), unknowns**2).astype(np.float64).reshape(unknowns, unknowns)
-        )
-        g: F64 = np.bincount(at.ravel(), gradients.ravel(), unknowns).astype(np.float64)
-        prior = self._prior
-        m, known = len(prior.poses), len(prior.gradient)
-        off_poses = steps(prior.poses, poses[:m]).step[:, self._free]
-        off = np.concatenate((self._errors - prior.errors, off_poses.ravel()))
-        H[:known, :known] += prior.information
-        g[:known] += prior.gradient + prior.information @ off
-        return H, g
+    def _last_covariance(self, factor: F64) -> F64:
+        """Return the covariance (D, D) of the last pose from the Cholesky factor of all information."""
+        count, d = len(factor), len(self._free)
+        last = np.zeros((count, d))
+        last[count - 2 * d : count - d] = np.eye(d)
+        solved, _ = dpotrs(factor, last)
+        covariance: F64 = solved[count - 2 * d : count - d]
+        return covariance
 
     def _marginalise(self) -> None:
-        """Replace the first scan by a prior on the next two: the Schur complement of its pose."""
-        first, known = self._window.part(0, 3), ERRORS + len(self._free)
-        information = first.information.copy()
-        information[1:, 0] = 0.0  # the first pose has no part in these
-        if not first.steady[2]:
-            information[2, 1] = 0.0
-        H, g = self._equations(first._replace(information=information))
-        old, rest = np.s_[ERRORS:known], np.r_[:ERRORS, known : len(g)]
-        solved = np.linalg.solve(H[old, old], np.column_stack((H[old][:, rest], g[old])))
-        reduced = H[np.ix_(rest, rest)] - H[rest, old] @ solved[:, :-1]
-        gradient = g[rest] - H[rest, old] @ solved[:, -1]
-        self._prior = MarginalPrior(first.poses[1:], self._errors, gradient, 0.5 * (reduced + reduced.T))
-        self._window = self._window.part(1)
-        if first.steady[2]:
-            self._window.information[1, 1] = 0.0  # it is in the prior
+        """Marginalise the first scan: replace it by a prior on the next two."""
+        few = self._state.part(0, 3)
+        H, g, _ = normal_equations(
+            few, self._window.part(0, 3), self._prior, self._free, self._parameters, self._drift_scale, 1
+        )
+        information, gradient = _without(H, g, 2 * len(self._free))
+        shift = np.asarray(
+            np.linalg.solve(information + _DAMPING * np.eye(len(gradient)), gradient), np.float64
+        )
+        self._prior = MarginalPrior(few.part(1, 3), shift, information)
+        self._state = self._state.part(1, len(self._state.poses))
+        self._window = self._window.part(1, len(self._window.seconds))
 
-    def _drift(self, reported: F64) -> F64:
-        """Return the standard deviations (D,) of a step (6,) that odometry reports."""
+    # --------------------------------------------------------------------------------------------- odometry
+
+    def _noise(self, sigma_m: float, sigma_rad: float) -> F64:
+        """Return the standard deviations (D,) of the free directions."""
+        return np.where(self._free < 3, sigma_m, sigma_rad)
+
+    def _change_sigmas(self, seconds: float) -> F64:
+        """Return the standard deviations (D,) of the change of the motion from one scan to the next."""
         p = self._parameters
-        distance_m, turn_rad = np.linalg.norm(reported[:3]), np.linalg.norm(reported[3:])
-        position = p.drift**2 * distance_m + p.drift_turn_m**2 * turn_rad + 2.0 * p.reading_m**2
-        turn = p.drift**2 * (distance_m + turn_rad) + 2.0 * p.reading_rad**2
-        return np.sqrt(np.where(self._free < 3, position, turn))
+        return np.full(len(self._free), change_sigma(seconds, p.unsteady, p.growth))
 
 
-def corrected(reported: F64, errors: F64) -> tuple[F64, F64]:
-    """Remove the systematic errors (4,) from steps (N, 6) that odometry reports.
+def _without(H: F64, g: F64, first: int) -> tuple[F64, F64]:
+    """Marginalise the `first` unknowns after the errors of odometry by the Schur complement.
 
-    Returns the steps with their derivatives (N, 6, 4) with respect to the errors.
+    Returns the information and the gradient on the other unknowns.
     """
-    way, direction_rad = 1.0 + errors[0], errors[1]
-    step, by_errors = reported.copy(), np.zeros((len(reported), 6, ERRORS))
-    c, s = math.cos(direction_rad), math.sin(direction_rad)
-    ahead = reported[:, :2] @ np.array([[c, s], [-s, c]])
-    distance_m = np.hypot(reported[:, 0], reported[:, 1])
-    step[:, :2] = way * ahead
-    step[:, 5] = (1.0 + errors[3]) * reported[:, 5] + errors[2] * distance_m
-    by_errors[:, :2, 0] = ahead
-    by_errors[:, 0, 1], by_errors[:, 1, 1] = -step[:, 1], step[:, 0]
-    by_errors[:, 5, 2], by_errors[:, 5, 3] = distance_m, reported[:, 5]
-    return step, by_errors
+    old, rest = np.s_[ERRORS : ERRORS + first], np.delete(np.arange(len(H)), np.s_[ERRORS : ERRORS + first])
+    A, B = H[old, old] + _DAMPING * np.eye(first), H[rest, old]
+    solved = np.linalg.solve(A, np.column_stack((B.T, g[old])))
+    reduced = H[rest][:, rest] - B @ solved[:, :-1]
+    return 0.5 * (reduced + reduced.T), g[rest] - B @ solved[:, -1]
+
+
+# --- compiled functions: the factors and their normal equations ---------------------------------------
+
+
+@compiled()
+def normal_equations(
+    state: WindowState,
+    window: FactorWindow,
+    prior: MarginalPrior,
+    free: NDArray[np.intp],
+    parameters: SmootherParameters,
+    drift_scale: float,
+    few: int,
+) -> tuple[F64, F64, float]:
+    """Return the matrix (U, U) and the gradient (U,) of all factors of N scans at a state.
+
+    free : (D,) directions. drift_scale : of the drift that the last steps show, in its standard deviations.
+    few : only factors that begin with one of this many first scans are added.
+
+    The third value is the scale of the drift, estimated again if there are more than three scans.
+    """
+    d, n, kernel = len(free), len(state.poses), parameters.kernel
+    unknowns = ERRORS + 2 * d * n
+    H, g, error = np.zeros((unknowns, unknowns)), np.zeros(unknowns), np.empty(d)
+    _add_prior(state, prior, free, H, g)
+    # A reading of odometry lies near what it should be, and a pose near where the scan fits the local map.
+    off_reading, _, of_reading = compiled_steps(window.read, state.readings)
+    off_pose, _, of_pose = compiled_steps(window.match, state.poses)
+    for k in range(few):
+        of_match, of_read, read = np.zeros((d, d)), np.zeros((d, d)), np.zeros((d, d))
+        _put(of_pose[k], 1.0, free, 0, of_match)
+        _put(of_reading[k], 1.0, free, 0, of_read)
+        for a in range(d):
+            error[a] = off_pose[k, free[a]]
+        at = ERRORS + 2 * d * k
+        _add(at, error, of_match, window.match_information[k], kernel, H, g, d)
+        for a in range(d):
+            error[a], read[a, a] = off_reading[k, free[a]], window.read_sigma[k, a] ** -2.0
+        _add(at + d, error, of_read, read, kernel, H, g, d)
+    moves = compiled_steps(state.poses[:-1], state.poses[1:])
+    drift_scale = _add_drifts(moves, state, window, free, parameters, drift_scale, few, H, g)
+    # A pose follows the one before by the motion that registration measured.
+    step, by_first, by_second = moves
+    for k in range(min(few, n - 1)):
+        of_motion = np.zeros((d, 3 * d))
+        _put(by_first[k], 1.0, free, 0, of_motion)
+        _put(by_second[k], 1.0, free, 2 * d, of_motion)
+        for a in range(d):
+            error[a] = _difference(step[k], 1.0, window.motion[k + 1], free[a])
+        information = window.motion_information[k + 1]
+        _add(ERRORS + 2 * d * k, error, of_motion, information, kernel, H, g, 3 * d)
+    _add_constant_velocity(moves, window, free, parameters, few, H, g)
+    return H, g, drift_scale
+
+
+@compiled()
+def _add_prior(state: WindowState, prior: MarginalPrior, free: NDArray[np.intp], H: F64, g: F64) -> None:
+    """Add the marginalised prior on the errors and the first states."""
+    d, m = len(free), len(prior.about.poses)
+    off_pose, _, _ = compiled_steps(prior.about.poses, state.poses[:m])
+    off_reading, _, _ = compiled_steps(prior.about.readings, state.readings[:m])
+    off = np.empty(len(prior.shift))
+    for a in range(len(off)):
+        off[a] = prior.shift[a]
+    for a in range(ERRORS):
+        off[a] += state.errors[a] - prior.about.errors[a]
+    for k in range(m):
+        for a in range(d):
+            off[ERRORS + 2 * d * k + a] += off_pose[k, free[a]]
+            off[ERRORS + 2 * d * k + d + a] += off_reading[k, free[a]]
+    for a in range(len(off)):
+        for b in range(len(off)):
+            H[a, b] += prior.information[a, b]
+            g[a] += prior.information[a, b] * off[b]
+
+
+@compiled()
+def _add_drifts(
+    moves: tuple[F64, F64, F64],
+    state: WindowState,
+    window: FactorWindow,
+    free: NDArray[np.intp],
+    p: SmootherParameters,
+    drift_scale: float,
+    few: int,
+    H: F64,
+    g: F64,
+) -> float:
+    """Add the drift factors: a pose moves like the readings, but for systematic errors and drift. Return its
+    scale.
+    """
+    (step, by_first, by_second), d, n = moves, len(free), len(state.poses)
+    reports, read_first, read_second = compiled_steps(state.readings[:-1], state.readings[1:])
+    errors, variances, chi2, all_chi2 = np.empty((n - 1, d)), np.empty((n - 1, d)), np.zeros(n - 1), 0.0
+    for k in range(n - 1):
+        expected, _, _ = corrected(reports[k], state.errors)
+        variance = drift_variance(reports[k], p.drift, p.drift_turn_m)
+        for a in range(d):
+            errors[k, a], variances[k, a] = _difference(step[k], 1.0, expected, free[a]), variance[free[a]]
+            if not window.jumps[k + 1]:
+                chi2[k] += errors[k, a] ** 2 / variance[free[a]]
+        all_chi2 += chi2[k]
+    if n > 3:  # not of the few that are marginalised
+        drift_scale = math.sqrt(max(all_chi2 / ((n - 1) * d), 1.0))
+    for k in range(min(few, n - 1)):
+        if window.jumps[k + 1]:
+            continue
+        _, by_report, by_errors = corrected(reports[k], state.errors)
+        # Slips and late readings are no evidence of errors that are the same in every step.
+        weight = 1.0 / (1.0 + chi2[k] / (drift_scale * p.kernel) ** 2)
+        jacobian, information = np.zeros((d, 4 * d + ERRORS)), np.zeros((d, d))
+        _put(by_first[k], 1.0, free, 0, jacobian)
+        _put(_product(by_report, read_first[k]), -1.0, free, d, jacobian)
+        _put(by_second[k], 1.0, free, 2 * d, jacobian)
+        _put(_product(by_report, read_second[k]), -1.0, free, 3 * d, jacobian)
+        for a in range(d):
+            information[a, a] = 1.0 / (drift_scale**2 * variances[k, a])
+            for b in range(ERRORS):
+                jacobian[a, 4 * d + b] = -weight * by_errors[free[a], b]
+        _add(ERRORS + 2 * d * k, errors[k], jacobian, information, p.kernel, H, g, 4 * d)
+    return drift_scale
+
+
+@compiled()
+def _add_constant_velocity(
+    moves: tuple[F64, F64, F64],
+    window: FactorWindow,
+    free: NDArray[np.intp],
+    p: SmootherParameters,
+    few: int,
+    H: F64,
+    g: F64,
+) -> None:
+    """Add factors of constant velocity for the steps that nothing else measures.
+
+    These are the steps without registration, and without odometry that continues or that jumps together with
+    a match.
+    """
+    (step, by_first, by_second), d = moves, len(free)
+    error, information = np.empty(d), np.zeros((d, d))
+    for k in range(min(few, len(step) - 1)):
+        matched, measured = 0.0, 0.0
+        for a in range(d):
+            matched += window.match_information[k + 2, a, a]
+            measured += window.motion_information[k + 2, a, a]
+        read = math.isfinite(window.read_sigma[k + 2, 0]) and (matched > 0.0 or not window.jumps[k + 2])
+        if read or measured > 0.0:
+            continue
+        before_s, seconds = max(window.seconds[k + 1], LEAST_S), max(window.seconds[k + 2], LEAST_S)
+        ratio = min(seconds, max(before_s, p.steady_s)) / before_s
+        jacobian = np.zeros((d, 5 * d))
+        _put(by_first[k], -ratio, free, 0, jacobian)
+        _put(by_second[k], -ratio, free, 2 * d, jacobian)
+        _put(by_first[k + 1], 1.0, free, 2 * d, jacobian)
+        _put(by_second[k + 1], 1.0, free, 4 * d, jacobian)
+        for a in range(d):
+            error[a] = _difference(step[k + 1], ratio, step[k], free[a])
+            information[a, a] = change_sigma(seconds, p.unsteady, p.growth) ** -2.0
+        _add(ERRORS + 2 * d * k, error, jacobian, information, np.inf, H, g, 5 * d)
+
+
+@compiled()
+def corrected(reported: F64, errors: F64) -> tuple[F64, F64, F64]:
+    """Remove the systematic errors (4,) from a step (6,) that odometry reports.
+
+    Returns the step with its Jacobians with respect to the report, (6, 6), and to the errors, (6, 4).
+    """
+    way, distance_m = 1.0 + errors[0], math.hypot(reported[0], reported[1])
+    c, s = way * math.cos(errors[1]), way * math.sin(errors[1])
+    step, by_report, by_errors = np.empty(6), np.zeros((6, 6)), np.zeros((6, ERRORS))
+    for a in range(6):
+        step[a], by_report[a, a] = reported[a], 1.0
+    x, y = c * reported[0] - s * reported[1], s * reported[0] + c * reported[1]
+    step[0], step[1] = x, y
+    step[5] = (1.0 + errors[3]) * reported[5] + errors[2] * distance_m
+    by_report[0, 0], by_report[0, 1], by_report[1, 0], by_report[1, 1] = c, -s, s, c
+    by_report[5, 5] = 1.0 + errors[3]
+    by_errors[0, 0], by_errors[1, 0], by_errors[0, 1], by_errors[1, 1] = x / way, y / way, -y, x
+    by_errors[5, 2], by_errors[5, 3] = distance_m, reported[5]
+    return step, by_report, by_errors
+
+
+@compiled()
+def drift_variance(reported: F64, drift: float, drift_turn_m: float) -> F64:
+    """Return the variances (6,) of the drift over a step (6,)."""
+    x, y, z, roll, pitch, yaw = reported[0], reported[1], reported[2], reported[3], reported[4], reported[5]
+    distance_m = math.sqrt(x * x + y * y + z * z)
+    turn_rad = math.sqrt(roll * roll + pitch * pitch + yaw * yaw)
+    variance = np.empty(6)
+    for a in range(6):
+        of_turn = drift_turn_m**2 * turn_rad if a < 3 else drift**2 * turn_rad
+        variance[a] = drift**2 * distance_m + of_turn + _LEAST_DRIFT**2
+    return variance
+
+
+@compiled()
+def change_sigma(seconds: float, unsteady: float, growth: float) -> float:
+    """Return the standard deviation, m and rad, of the change of the motion from one scan to the next."""
+    sigma: float = unsteady * seconds ** (1.0 + growth)
+    return sigma
+
+
+@compiled()
+def _put(block: F64, factor: float, free: NDArray[np.intp], column: int, jacobian: F64) -> None:
+    """Add a block (6, 6), times a factor, to a Jacobian (D, K) at a column."""
+    for a in range(len(free)):
+        for b in range(len(free)):
+            jacobian[a, column + b] += factor * block[free[a], free[b]]
+
+
+@compiled()
+def _add(
+    first: int, error: F64, jacobian: F64, information: F64, kernel: float, H: F64, g: F64, own: int
+) -> None:
+    """Add a factor to the normal equations H and g.
+
+    It depends on `own` unknowns from `first` on; the remaining columns are errors of odometry. error : (D,).
+    jacobian : (D, K). information : (D, D). kernel : scale of the Cauchy weight, standard deviations;
+    infinite: the weight is 1.
+    """
+    d, count = jacobian.shape
+    Le, LJ, chi2 = np.zeros(d), np.zeros((d, count)), 0.0
+    for a in range(d):
+        for b in range(d):
+            Le[a] += information[a, b] * error[b]
+            for k in range(count):
+                LJ[a, k] += information[a, b] * jacobian[b, k]
+        chi2 += error[a] * Le[a]
+    weight = 1.0 / (1.0 + chi2 / kernel**2)
+    for j in range(count):
+        row = first + j if j < own else j - own
+        for a in range(d):
+            left = weight * jacobian[a, j]
+            if left == 0.0:
+                continue
+            g[row] += left * Le[a]
+            for k in range(count):
+                H[row, first + k if k < own else k - own] += left * LJ[a, k]
+
+
+@compiled()
+def _product(A: F64, B: F64) -> F64:
+    """Multiply two matrices (6, 6)."""
+    result = np.zeros((6, 6))
+    for i in range(6):
+        for j in range(6):
+            for k in range(6):
+                result[i, k] += A[i, j] * B[j, k]
+    return result
+
+
+@compiled()
+def _difference(step: F64, factor: float, other: F64, direction: int) -> float:
+    """Return a component of a step (6,) minus a multiple of another step; a turn about z within half a
+    turn."""
+    difference: float = step[direction] - factor * other[direction]
+    turns = math.floor(difference / (2.0 * math.pi) + 0.5) if direction == 5 else 0.0
+    return difference - 2.0 * math.pi * turns

@@ -91,7 +91,7 @@ class Tracker:
         self._odometer = Odometer(scan.stamp_ns, self._parameters)
         points = self._deskewed(scan, np.eye(4), 1.0)
         pose = self._sensor.start(scan, points)
-        self._smoother.start(self._flat(pose))
+        self._smoother.start(self._flat(pose), self._reading(scan))
         return self._finish(scan, points, pose, Health.FINE)
 
     def track(self, scan: Scan) -> Tracked:
@@ -99,23 +99,23 @@ class Tracker:
         if self._last is None:
             return self.start(scan)
         seconds = (scan.stamp_ns - self._last.stamp_ns) * 1e-9
-        reported, continues = self._reported(scan), self._odometer.continues(scan, seconds)
+        reading, reported = self._reading(scan), self._odometer.reported(scan)
+        continues = self._odometer.continues(scan, seconds)
         # 1. Predict: by odometry, or by constant velocity. An implausible prediction comes last.
         steady = self._smoother.constant_velocity(seconds, turn := self._turn(scan))
         expected = [self._smoother.after(*steady)]
-        if reported is not None:
-            by_odometry = self._smoother.after(*self._smoother.by_odometry(reported))
-            expected.insert(0 if continues else 1, by_odometry)
+        if reading is not None and reported is not None:
+            expected.insert(0 if continues else 1, self._smoother.by_odometry(reading))
         # 2. Undo the motion within the scan.
         motion = invert_pose(self._smoother.belief.pose) @ expected[0].pose
         points = self._deskewed(scan, motion, seconds)
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
         placed = MatchSelector(self._sensor, self._parameters).place(scan, points, expected)
         between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
-        evidence = ScanFactors(seconds, reported if continues else None, placed.alone, between)
+        evidence = ScanFactors(seconds, reading, continues, placed.alone, between)
         estimate = self._estimated(placed, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
-        health = self._judged(scan, placed, estimate, evidence)
+        health = self._judged(placed, estimate, evidence)
         sure = placed.sure and not placed.first
         if self._standstill.left(scan, sure=sure) and self._sensor.fits_last(expected[0]):
             self._walls_changed, health = True, self._health.give_up()
@@ -131,15 +131,14 @@ class Tracker:
         """
         if not placed.first:
             return self._smoother.add(placed.pose, evidence)
-        self._smoother.start(self._flat(placed.pose), self._smoother.speed)
+        self._smoother.start(self._flat(placed.pose), evidence.T_odom_base, self._smoother.speed)
         return self._smoother.belief
 
-    def _judged(
-        self, scan: Scan, placed: MatchedScan, estimate: PoseWithCovariance, evidence: ScanFactors
-    ) -> Health:
+    def _judged(self, placed: MatchedScan, estimate: PoseWithCovariance, evidence: ScanFactors) -> Health:
         """Judge the pose of a scan."""
-        bridged = placed.motion is not None or evidence.reported is not None
-        unaided = estimate if self._in_hand and scan.T_odom_base is None else None
+        read = evidence.T_odom_base is not None
+        bridged = placed.motion is not None or (read and evidence.continues)
+        unaided = estimate if self._in_hand and not read else None
         return self._health.judge(placed, unaided, bridged=bridged)
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
@@ -187,12 +186,9 @@ class Tracker:
         """Return a pose (4, 4) in the free directions: on wheels those of the plane."""
         return pose if self._in_hand else SE2.from_matrix(pose).lift()
 
-    def _reported(self, scan: Scan) -> F64 | None:
-        """Return the motion (4, 4) since the last scan by odometry; None if one of the two has no reading."""
-        last = None if self._last is None else self._last.T_odom_base
-        if last is None or scan.T_odom_base is None:
-            return None
-        return invert_pose(self._flat(last)) @ self._flat(scan.T_odom_base)
+    def _reading(self, scan: Scan) -> F64 | None:
+        """Return the reading (4, 4) of odometry at a scan, or None."""
+        return None if scan.T_odom_base is None else self._flat(scan.T_odom_base)
 
     def _turn(self, scan: Scan) -> F64 | None:
         """Return the turn (4, 4) of a sensor in the hand since the last scan, by its IMU.

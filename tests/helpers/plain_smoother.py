@@ -7,43 +7,48 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pc2grid.estimation.line_map import moved, steps
-from pc2grid.estimation.smoother import ERRORS, Smoother
+from pc2grid.estimation.line_map import steps
+from pc2grid.estimation.smoother import Smoother, WindowState
 from pc2grid.geometry import F64, wrap_angle
 
 
 class Factor(NamedTuple):
-    """error : (M,). information : (M, M). kernel : of its Cauchy weight. gradient : (M,) beside it.
-    variance : over the one that is stated."""
+    """error : (M,). information : (M, M). kernel : of its Cauchy weight. learned : how much the errors of
+    odometry follow from it, 0..1."""
 
     error: F64
     information: F64
     kernel: float
-    gradient: F64 | float = 0.0
-    variance: float = 1.0
+    learned: float = 1.0
 
 
-def plain_equations(smoother: Smoother) -> tuple[F64, F64]:
-    """The matrix and the gradient of all factors, at the smoother's own state."""
-    poses, d = smoother._window.poses, len(smoother._free)
-    unknowns, step = ERRORS + d * len(poses), 1e-5
-
-    def after(change: F64) -> list[Factor]:
-        changes = np.zeros((len(poses), 6))
-        changes[:, smoother._free] = change[ERRORS:].reshape(-1, d)
-        return factors(smoother, moved(poses, changes), smoother._errors + change[:ERRORS])
-
-    ahead, behind = ([after(way * row) for row in np.eye(unknowns)] for way in (step, -step))
+def plain_equations(smoother: Smoother, few: int) -> tuple[F64, F64]:
+    """The matrix and the gradient of the factors that begin with one of the first `few` scans."""
+    state = smoother._state
+    here, step = factors(smoother, state, few), 1e-5
+    unknowns = 4 + 2 * len(smoother._free) * len(state.poses)
+    ahead, behind = (
+        [factors(smoother, changed(smoother, state, way * np.eye(unknowns)[u]), few) for u in range(unknowns)]
+        for way in (step, -step)
+    )
     H, g = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
-    for number, f in enumerate(after(np.zeros(unknowns))):
+    for number, f in enumerate(here):
         columns = [
             (a[number].error - b[number].error) / (2 * step) for a, b in zip(ahead, behind, strict=True)
         ]
         J = np.stack(columns, axis=1)
-        weight = 1.0 / (f.variance + f.error @ f.information @ f.error / f.kernel**2)
+        J[:, :4] *= f.learned
+        weight = 1.0 / (1.0 + f.error @ f.information @ f.error / f.kernel**2)
         H += weight * J.T @ f.information @ J
-        g += weight * J.T @ (f.information @ f.error + f.gradient)
+        g += weight * J.T @ f.information @ f.error
     return H, g
+
+
+def changed(smoother: Smoother, state: WindowState, by: F64) -> WindowState:
+    """The state after a change (U,) of its unknowns."""
+    changes = np.zeros((2, len(state.poses), 6))
+    changes[:, :, smoother._free] = by[4:].reshape(len(state.poses), 2, -1).swapaxes(0, 1)
+    return state.changed(by[:4], changes)
 
 
 def between(first: F64, second: F64) -> F64:
@@ -51,26 +56,45 @@ def between(first: F64, second: F64) -> F64:
     return steps(first[None], second[None]).step[0]
 
 
-def factors(smoother: Smoother, poses: F64, errors: F64) -> list[Factor]:
-    """All factors at poses (N, 4, 4) and errors (4,)."""
+def factors(smoother: Smoother, state: WindowState, few: int) -> list[Factor]:
+    """All factors at a state."""
     p, free, w, prior = smoother._parameters, smoother._free, smoother._window, smoother._prior
-    off = [between(old, new)[free] for old, new in zip(prior.poses, poses, strict=False)]
-    state = np.concatenate((errors - prior.errors, *off))
-    found = [Factor(state, prior.information, np.inf, prior.gradient)]
-    for k, pose in enumerate(poses):
-        found.append(Factor(between(w.match[k], pose)[free], w.information[k, 0], p.kernel))
-    moves = [between(*poses[k : k + 2]) for k in range(len(poses) - 1)]
-    for k, move in enumerate(moves, start=1):
-        x, y, *tilt, turn = expected = w.step[k]
-        if w.by_odometry[k]:
-            c, s = math.cos(errors[1]), math.sin(errors[1])
-            ahead = (1.0 + errors[0]) * np.array([[c, -s], [s, c]]) @ (x, y)
-            expected = np.array([*ahead, *tilt, (1.0 + errors[3]) * turn + errors[2] * math.hypot(x, y)])
-        elif w.steady[k]:
-            expected = w.steady[k] * moves[k - 2]
-        away = move - expected
-        error = np.array([*away[:5], wrap_angle(float(away[5]))])[free]
-        variance = smoother._overconfidence if w.by_odometry[k] else 1.0
-        kernel = np.inf if w.steady[k] else p.kernel
-        found.append(Factor(error, w.information[k, 1], kernel, variance=variance))
+    found, n, about = [], len(state.poses), smoother._prior.about
+    pairs = [(about.poses, state.poses), (about.readings, state.readings)]
+    off = [between(old[k], new[k])[free] for k in range(len(about.poses)) for old, new in pairs]
+    off_errors = state.errors - about.errors
+    found.append(Factor(np.concatenate((off_errors, *off)) + prior.shift, prior.information, np.inf))
+    for k in range(few):
+        read = between(w.read[k], state.readings[k])[free]
+        found.append(Factor(read, np.diag(w.read_sigma[k] ** -2.0), p.kernel))
+        found.append(Factor(between(w.match[k], state.poses[k])[free], w.match_information[k], p.kernel))
+    moves = [between(*state.poses[k : k + 2]) for k in range(n - 1)]
+    for k in range(min(few, n - 1)):
+        report = between(*state.readings[k : k + 2])
+        way, turn = math.hypot(*report[:2]), 1.0 + state.errors[3]
+        c, s = math.cos(state.errors[1]), math.sin(state.errors[1])
+        x, y = (1.0 + state.errors[0]) * np.array([[c, -s], [s, c]]) @ report[:2]
+        right = np.array([x, y, *report[2:5], turn * report[5] + state.errors[2] * way])
+        length, angle = np.linalg.norm(report[:3]), np.linalg.norm(report[3:])
+        of_position = p.drift**2 * length + p.drift_turn_m**2 * angle
+        variance = np.where(free < 3, of_position, p.drift**2 * (length + angle)) + 1e-6
+        error, scale = wrapped(moves[k] - right)[free], smoother._drift_scale
+        if not w.jumps[k + 1]:
+            slips = (error**2 / variance).sum() / (scale * p.kernel) ** 2
+            found.append(Factor(error, np.diag(1.0 / (scale**2 * variance)), p.kernel, 1.0 / (1.0 + slips)))
+        measured = wrapped(moves[k] - w.motion[k + 1])[free]
+        found.append(Factor(measured, w.motion_information[k + 1], p.kernel))
+    for k in range(min(few, n - 2)):
+        follows = not w.jumps[k + 2] or w.match_information[k + 2].any()
+        if w.motion_information[k + 2].any() or (np.isfinite(w.read_sigma[k + 2, 0]) and follows):
+            continue
+        ratio = min(w.seconds[k + 2], max(w.seconds[k + 1], p.steady_s)) / w.seconds[k + 1]
+        sigma = p.unsteady * w.seconds[k + 2] ** (1.0 + p.growth)
+        error = wrapped(moves[k + 1] - ratio * moves[k])[free]
+        found.append(Factor(error, np.eye(len(free)) / sigma**2, np.inf))
     return found
+
+
+def wrapped(step: F64) -> F64:
+    """A difference (6,) of steps, the turn about z within half a turn."""
+    return np.array([*step[:5], wrap_angle(float(step[5]))])
