@@ -51,7 +51,7 @@ SLICE_BORDERS_M = (0.6, 1.1)
 tables and worktops between, and only what is tall is above. Chosen by hand."""
 SLICES = len(SLICE_BORDERS_M) + 1
 """Number of slices. A byte of heights has bit k set if slice k was observed to be occupied somewhere, and bit
-k + SLICES if it was observed to be free and nowhere occupied: rays have passed there."""
+k + SLICES if it was observed to be free and nowhere occupied."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -214,8 +214,7 @@ class OccupancyGrid:
     origin_m : (x, y) in the map frame of the lower-left corner of cell (0, 0).
     height_m : of the one plane that was observed, above the base; None: of all heights, or not known.
     heights : (H, W) uint8, the slices in which an occupied cell or a low obstacle was observed to be occupied
-        and to be free, and those that rays have passed over a free cell (`SLICES`); 0 where that is not
-        known. None if it is known of no cell.
+        and to be free (`SLICES`); 0 where that is not known. None if it is known of no cell.
 
     >>> import numpy as np
     >>> grid = OccupancyGrid(cells=np.array([[0, 100], [-1, 0]]), resolution_m=0.5, origin_m=(-1.0, 2.0))

@@ -140,12 +140,11 @@ class ColumnMap:
                 stamp_ns=stamp_ns, hits_m=nothing, origin_m=origin, free_m=np.zeros(BEARINGS, np.float32)
             )
         edge_m = self._config.resolution_m
-        passed_m = np.zeros((SLICES, 2, BEARINGS), np.float32)
         free_m, sums, low_m = view(
-            self._columns[0], self._columns[1], self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m,
-            edge_m, p.gap_m, (p.depth_m, 4.0 * self._noise_per_m2), BEARINGS, passed_m,
+            self._columns[0], self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m, edge_m, p.gap_m,
+            (p.depth_m, 4.0 * self._noise_per_m2), BEARINGS,
         )  # fmt: skip
-        walls_m = mean_per_cell(sums, edge_m)[0] if len(sums) else low_m[:0]
+        walls_m = mean_per_cell(sums, edge_m) if len(sums) else low_m[:0]
         hits: F32 = to_base.apply(walls_m).astype(np.float32)
         return PlanarScan(
             stamp_ns=stamp_ns,
@@ -155,7 +154,6 @@ class ColumnMap:
             free_m=free_m.astype(np.float32),
             low_m=to_base.apply(low_m).astype(np.float32),
             heights=self._heights_at(np.concatenate((walls_m, low_m))),
-            passed_m=passed_m,
         )
 
     def agreement(self, points_m: F64) -> tuple[float, float]:
@@ -319,7 +317,8 @@ def classify(
     least: int,
     over: int,
 ) -> None:
-    """Write the state (W, W) of the columns with a stamp (0: of all), and their heights (W, W).
+    """Write the state (W, W) of the columns with a stamp (0: of all), and the heights (W, W) of those with an
+    obstacle.
 
     ground, band : first layer, and the layer behind the last one, of the floor and of obstacles.
     borders : first layer of each slice but the lowest, see `pc2grid.model.SLICES`. A wall is occupied in at
@@ -371,13 +370,12 @@ def _column(
         return WALL if is_wall else LOW, filled | (empty & ~filled) << SLICES
     for k in range(ground[0], ground[1]):
         free += evidence[k % layers] > 0
-    return FREE if free else UNKNOWN, empty << SLICES
+    return FREE if free else UNKNOWN, 0
 
 
 @compiled()
 def view(
     state: NDArray[np.uint8],
-    heights: NDArray[np.uint8],
     sums: F32,
     low: I64,
     origin: F64,
@@ -387,13 +385,11 @@ def view(
     gap: float,
     depth: tuple[float, float],
     bearings: int,
-    passed_m: F32,
 ) -> tuple[F64, F64, F64]:
     """Cast a ray along each bearing from a place (2,): find the first wall and the floor before it.
 
     turn : direction of the first bearing, radians. gap : unknown ground wider than this ends what is free.
-    depth : (d, q), walls behind the first one are part of it up to d + q * range^2. passed_m : zeros (SLICES,
-    2, bearings), set to the ranges between which each slice was passed.
+    depth : (d, q), walls behind the first one are part of it up to d + q * range^2.
 
     Returns the free range of each bearing (0: none), for each wall the sums of x, y and 1 of its points (S,
     3), by increasing bearing, and the middles (K, 2) of the low columns that were passed, each once.
@@ -408,10 +404,7 @@ def view(
     for bearing in range(bearings):
         angle = turn + bearing * (2.0 * math.pi / bearings)
         along = (math.cos(angle), math.sin(angle))
-        free, first, count = _first_wall(
-            state, heights, low, origin, along, reach, edge, gap, passed, lows, count,
-            passed_m[:, :, bearing],
-        )  # fmt: skip
+        free, first, count = _first_wall(state, low, origin, along, reach, edge, gap, passed, lows, count)
         if first >= 0.0:
             if first - free <= gap:
                 free = max(first - 0.5 * edge, free)
@@ -426,7 +419,6 @@ def view(
 @compiled()
 def _first_wall(
     state: NDArray[np.uint8],
-    heights: NDArray[np.uint8],
     low: I64,
     origin: F64,
     along: tuple[float, float],
@@ -436,13 +428,11 @@ def _first_wall(
     passed: NDArray[np.uint8],
     lows: F64,
     count: int,
-    passed_m: F32,
 ) -> tuple[float, float, int]:
     """Return the free range of a bearing, the range of its first wall (-1: none), and the count of low
     columns.
 
     passed : (W, W), 1 for low columns that were passed before. lows : gets the middles of the others.
-    passed_m : (SLICES, 2), widened to the ranges at which each slice was passed.
     """
     size = state.shape[0]
     free, known = 0.0, False
@@ -464,10 +454,6 @@ def _first_wall(
                 break
             continue
         known, free = True, r
-        for k in range(SLICES):
-            if heights[a, b] >> (SLICES + k) & 1:
-                passed_m[k, 0] = min(passed_m[k, 0], r) if passed_m[k, 1] > 0.0 else r
-                passed_m[k, 1] = max(passed_m[k, 1], r + edge)
         if state[a, b] == LOW and not passed[a, b]:
             passed[a, b] = 1
             lows[count, 0], lows[count, 1] = (i + 0.5) * edge, (j + 0.5) * edge

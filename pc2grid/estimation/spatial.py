@@ -439,13 +439,8 @@ class SpaceMap:
         """Return the planar scan of a scan at its pose (4, 4), in the levelled base frame."""
         planar = self._columns.cut(SE2.from_matrix(pose), (pose @ scan.T_base_sensor)[:3, 3], scan.stamp_ns)
         # Without a floor, heights above it are not known.
-        told = slice(0 if self._floor.z_m is None else None)
-        return replace(
-            planar,
-            heights=planar.heights[told],
-            passed_m=planar.passed_m[told],
-            above_floor_m=self._above_floor_m,
-        )
+        heights = planar.heights[:0] if self._floor.z_m is None else planar.heights
+        return replace(planar, heights=heights, above_floor_m=self._above_floor_m)
 
     def _floor_m(self, sensor_m: F64) -> float:
         """Return z of the floor below a sensor at (3,)."""

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import LimitExceeded
-from pc2grid.geometry import I64, SE2, SUBPIXEL_BITS, U8, polygon_corners
-from pc2grid.model import FREE, FREE_BELOW, OCCUPIED, SLICES, THING, UNKNOWN, OccupancyGrid
+from pc2grid.geometry import I64, SE2, SUBPIXEL_BITS, polygon_corners
+from pc2grid.model import FREE, OCCUPIED, THING, UNKNOWN, OccupancyGrid
 from pc2grid.settings import ProjectionConfig
 
 
@@ -59,7 +59,7 @@ class GridBuilder:
         self._config = config
         self._parameters = parameters
         self._tiles: defaultdict[tuple[int, int], _Tile] = defaultdict(_Tile)
-        self._things_seen = False
+        self._things_seen = self._heights_seen = False
         self._planes_m: tuple[float, float] | None = None  # lowest and highest plane; NaN: not of planes
 
     def add(self, planar_scan: PlanarScan, T_grid_base: SE2) -> None:
@@ -78,9 +78,9 @@ class GridBuilder:
             standing[things[:, 1], things[:, 0]] = self._parameters.hit
             standing[walls > 0] = self._parameters.miss
         if len(planar_scan.heights):
+            self._heights_seen = True
             columns, rows = np.concatenate((hits, things)).T
             np.bitwise_or.at(heights, (rows, columns), planar_scan.heights)
-        passed = self._passed(planar_scan, T_grid_base, low, walls)
         for number, of_tile, of_window in _under(low, walls.shape):
             touched = walls[of_window] != 0
             if touched.any():
@@ -89,8 +89,8 @@ class GridBuilder:
                 self._sum(tile.walls[of_tile], walls[of_window])
                 if self._things_seen:
                     self._sum(tile.things[of_tile], standing[of_window])
-                tile.heights[of_tile] |= heights[of_window]
-                tile.passed[of_tile] |= passed[of_window]
+                if self._heights_seen:
+                    tile.heights[of_tile] |= heights[of_window]
         self._check_size(len(self._tiles) * _TILE * _TILE)
 
     def _drawn(self, planar_scan: PlanarScan, T_grid_base: SE2) -> tuple[NDArray[np.int16], I64, I64, I64]:
@@ -124,20 +124,6 @@ class GridBuilder:
         cv2.circle(update, (here - low).tolist(), round(p.body_m / resolution), 2 * p.miss, -1)
         return update, hits, things, low
 
-    def _passed(self, planar_scan: PlanarScan, T_grid_base: SE2, low: I64, update: NDArray[np.int16]) -> U8:
-        """Return the slices (h, w) in which rays of a planar scan pass over what it makes free (`SLICES`).
-
-        update : (h, w), of the window at `low`, see `_drawn`.
-        """
-        passed = np.zeros(update.shape, np.uint8)
-        for k, (near_m, far_m) in enumerate(planar_scan.passed_m):
-            inside = np.zeros_like(passed)
-            for ranges_m, value in ((far_m, 1 << k + SLICES), (near_m, 0)):
-                outline = T_grid_base.apply(planar_scan.outline(ranges_m)) / self._config.resolution_m
-                cv2.fillPoly(inside, [polygon_corners(outline - low)], value, shift=SUBPIXEL_BITS)
-            passed |= inside
-        return passed * (update < 0)
-
     def _sum(self, evidence: NDArray[np.int16], more: NDArray[np.int16]) -> None:
         """Add log-odds in place, within the limit."""
         limit = self._parameters.limit
@@ -163,9 +149,7 @@ class GridBuilder:
             percent = np.rint(_percent(tile.walls.astype(np.float32))).astype(np.int8)
             known = np.where(tile.observed, percent, UNKNOWN)
             known[(tile.things > 0) & (tile.things >= tile.walls)] = THING
-            free = (known >= FREE) & (known < FREE_BELOW)
-            cells[here], walls[here] = known, tile.walls
-            heights[here] = np.where(free, tile.passed, tile.heights)
+            cells[here], walls[here], heights[here] = known, tile.walls, tile.heights
         self._erase_lone_hits(cells, walls)
         known_rows, known_columns = (np.flatnonzero((cells >= FREE).any(axis=axis)) for axis in (1, 0))
         r0, c0 = int(known_rows[0]), int(known_columns[0])
@@ -173,7 +157,7 @@ class GridBuilder:
         y, x = (first * _TILE + (r0, c0)).tolist()
         return OccupancyGrid(
             cells=cells[kept].copy(),
-            heights=heights[kept].copy() if heights.any() else None,
+            heights=heights[kept].copy() if self._heights_seen else None,
             resolution_m=resolution,
             origin_m=(x * resolution, y * resolution),
             height_m=self._height_m,
@@ -210,7 +194,7 @@ class _Tile:
     """A square of cells: evidence for walls and for low obstacles, log-odds in hundredths, and heights
     (`SLICES`).
 
-    observed : cells with any observation. passed : slices that rays have passed over what they made free.
+    observed : cells with any observation.
     """
 
     def __init__(self) -> None:
@@ -218,7 +202,6 @@ class _Tile:
         self.things = np.zeros((_TILE, _TILE), np.int16)
         self.observed = np.zeros((_TILE, _TILE), np.bool_)
         self.heights = np.zeros((_TILE, _TILE), np.uint8)
-        self.passed = np.zeros((_TILE, _TILE), np.uint8)
 
 
 def _under(low: I64, shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, int], Slices, Slices]]:

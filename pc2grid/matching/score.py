@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -88,13 +87,13 @@ class Fit:
 def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) -> Fit:
     """Score the query at a pose on the map `target`."""
     mine, theirs, T_query_map = query.facing(target), target.facing(query), T_map_query.inverse()
-    seen, likelihood, behind = _sums(mine, theirs, T_map_query).tolist()
-    looked_at, returned, _ = _sums(theirs, mine, T_query_map).tolist()
-    weight = sum(walls.weight for walls in mine)
+    seen, likelihood, behind = _sums(mine, target.field, T_map_query).tolist()
+    looked_at, returned, _ = _sums(theirs, query.field, T_query_map).tolist()
+    weight = mine.weight
     forward = (likelihood + LIKELIHOOD.neutral * (weight - seen)) / weight if weight else 0.0
     backward = scored = returned / looked_at if looked_at else 0.0
-    if theirs[0].only_explain:
-        observed = float(_sums((replace(theirs[0], only_explain=False),), mine, T_query_map)[0])
+    if theirs.only_explain:
+        observed = float(_sums(replace(theirs, only_explain=False), query.field, T_query_map)[0])
         scored = (returned + LIKELIHOOD.neutral * (observed - looked_at)) / observed if observed else 0.0
     return Fit(
         T_map_query=T_map_query,
@@ -108,14 +107,12 @@ def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) ->
     )
 
 
-def _sums(facing: Sequence[Walls], others: Sequence[Walls], T_other_walls: SE2) -> F64:
-    """Return `known_sums` (3,) of walls on the fields of the other side, of all slices together."""
-    pose, sums = (T_other_walls.x, T_other_walls.y, T_other_walls.yaw), np.zeros(3)
-    for walls, other in zip(facing, others, strict=True):
-        least = LIKELIHOOD.neutral_value + 1 if walls.only_explain else 0
-        on = other.field.values, other.field.known, other.field.resolution_m, other.field.origin_m
-        sums += known_sums(*on, walls.points_m, walls.before_m, walls.weights, pose, least)
-    return sums
+def _sums(walls: Walls, field: LikelihoodField, T_field_walls: SE2) -> F64:
+    """Return `known_sums` (3,) of walls on a field."""
+    least = LIKELIHOOD.neutral_value + 1 if walls.only_explain else 0
+    pose = T_field_walls.x, T_field_walls.y, T_field_walls.yaw
+    on = field.values, field.known, field.resolution_m, field.origin_m
+    return np.array(known_sums(*on, walls.points_m, walls.before_m, walls.weights, pose, least))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -258,27 +255,23 @@ def agreement(target: Walls, query: Walls, T_map_query: SE2) -> Agreement:
     unknown ground: it then supports the pose, otherwise it contradicts it. With the usual numbers a point
     fits if a wall of the map lies within 0.14 m.
     """
-    mine, theirs = query.facing(target), target.facing(query)
-    fits, known = _fits(mine, theirs, T_map_query)
+    query, target = query.facing(target), target.facing(query)
+    fits, known = _fits(query, target, T_map_query)
     support = np.where(known, np.where(fits, Support.FITS, Support.CONTRADICTED), Support.UNKNOWN)
-    met, looked_at = _fits(theirs, mine, T_map_query.inverse())
+    met, looked_at = _fits(target, query, T_map_query.inverse())
     return Agreement(
-        points_m=np.concatenate([walls.points_m for walls in mine]),
+        points_m=query.points_m,
         support=support.astype(np.uint8),
-        weights=np.concatenate([walls.weights for walls in mine]),
-        missed_m=np.concatenate([walls.points_m for walls in theirs])[looked_at & ~met],
+        weights=query.weights,
+        missed_m=target.points_m[looked_at & ~met],
     )
 
 
-def _fits(
-    facing: Sequence[Walls], others: Sequence[Walls], T_other_walls: SE2
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return a mask (N,) of the wall points of all slices near a wall of the other side, and one (N,) of
-    those on ground known to it.
+def _fits(walls: Walls, other: Walls, T_other_walls: SE2) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return a mask (N,) of the wall points near a wall of the other side, and one (N,) of those on ground
+    known to it.
     """
-    pairs = zip(facing, others, strict=True)
-    at = [b.field.at(T_other_walls.apply(a.points_m), above=a.only_explain) for a, b in pairs]
-    likelihood, known = map(np.concatenate, zip(*at, strict=True))
+    likelihood, known = other.field.at(T_other_walls.apply(walls.points_m), above=walls.only_explain)
     return likelihood >= LIKELIHOOD.neutral, known
 
 

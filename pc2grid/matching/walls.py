@@ -1,13 +1,9 @@
 """A grid prepared for matching: its likelihood field, and wall points with a weight for their permanence.
 
-A point scores by its distance to the nearest occupied cell, exp(-d^2 / 2 sigma^2) (Thrun, Burgard and Fox,
-"Probabilistic Robotics", section 6.4), so no correspondences are needed. The points are what the other side
-must have observed if the pose is right.
-
-Two sides with heights are compared slice by slice (`pc2grid.model.SLICES`): an obstacle in a slice is
-explained by what may stand in the same one on the other side, and contradicted only where rays of the other
-side have passed in it; elsewhere the ground is unknown. A laser observes a single plane, and is compared in
-its slice (`Walls.facing`).
+The field is of obstacles at any height; a point scores by its distance to the nearest occupied cell, exp(-d^2
+/ 2 sigma^2) (Thrun, Burgard and Fox, "Probabilistic Robotics", section 6.4), so no correspondences are
+needed. The points are what the other side must have observed if the pose is right; they depend on the heights
+that it observes (`Walls.facing`).
 
 Small objects that stand alone may have been moved between two visits, walls stay: the weight of a wall point
 grows with the size of its connected object.
@@ -19,7 +15,6 @@ the ground in front of them, on the side from which they were observed (`seen_fr
 
 from __future__ import annotations
 
-import bisect
 import math
 from dataclasses import dataclass, replace
 
@@ -27,8 +22,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F32, F64, I64, U8, BoolGrid, cells_of
-from pc2grid.model import SLICE_BORDERS_M, SLICES, UNKNOWN, OccupancyGrid
+from pc2grid.geometry import F32, I64, U8, BoolGrid, cells_of
+from pc2grid.model import SLICES, UNKNOWN, OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,6 +62,17 @@ class LikelihoodField:
     known: BoolGrid
     resolution_m: float
     origin_m: tuple[float, float]
+
+    @staticmethod
+    def of(
+        grid: OccupancyGrid, parameters: LikelihoodParameters = LIKELIHOOD, *, margin_m: float = 0.0
+    ) -> LikelihoodField:
+        """Return the field of a grid, with `margin_m` of unknown cells added on each side."""
+        padded = padded_grid(grid, margin_m)
+        occupied = padded.occupied
+        return LikelihoodField.around(
+            occupied, occupied | padded.free, padded.resolution_m, padded.origin_m, parameters
+        )
 
     @staticmethod
     def around(
@@ -140,8 +146,6 @@ class WallParameters:
 
 
 WALLS = WallParameters()
-ALL_SLICES = (1 << SLICES) - 1
-"""The bits of all slices."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,8 +159,7 @@ class Walls:
         ground; `points_m` themselves if it does not matter from which side a wall was observed.
     weights : (K,) float32, 0..1, the permanence of each point, see `permanence`.
     height_m : see `OccupancyGrid.height_m`.
-    slices : the same walls in each slice of heights, and then for a laser of unknown height: points of what
-        no ray has passed, and the free ground over which rays have passed in all slices. Empty for a grid
+    at_all_heights : the same walls, with only those points that block every observed height; None for a grid
         without heights.
     only_explain : True if the other side need not have observed these points wherever it observes free space.
     """
@@ -166,7 +169,7 @@ class Walls:
     before_m: F32
     weights: F32
     height_m: float | None = None
-    slices: tuple[Walls, ...] = ()
+    at_all_heights: Walls | None = None
     only_explain: bool = False
 
     @staticmethod
@@ -185,46 +188,27 @@ class Walls:
         grid = padded_grid(grid, margin_m)
         if grid.heights is None:
             stands = _seen(grid) if drawn else grid.occupied
-            return Walls._of(grid, stands, stands, grid.free, parameters)
+            return Walls._of(grid, stands, stands, parameters)
         stands = grid.occupied | _things(grid, parameters)
-        filled, passed = grid.heights & ALL_SLICES, grid.heights >> SLICES
-        if not passed[grid.free].any():  # a map without the heights of free ground
-            passed = np.where(grid.free, np.uint8(ALL_SLICES), passed)
-        shown = np.where(filled, filled, ALL_SLICES & ~passed)
-        share = 1.0 / np.maximum(sum(shown >> k & 1 for k in range(SLICES)), 1)
-
-        def walls(stands: BoolGrid, shown: BoolGrid, free: BoolGrid, share: F64 | None = None) -> Walls:
-            return Walls._of(grid, stands, _edges(shown), free, parameters, share)
-
-        slices = [
-            walls(stands & ~empty, stands & (shown & bit > 0), (grid.free | stands) & empty, share)
-            for bit in 1 << np.arange(SLICES)
-            for empty in [passed & ~filled & bit > 0]
-        ]
-        slices.append(walls(stands, stands & (passed == 0), grid.free & (passed == ALL_SLICES)))
-        return replace(walls(stands, stands, grid.free), slices=tuple(slices))
+        never_passed = stands & (grid.heights < 1 << SLICES)
+        return replace(
+            Walls._of(grid, stands, _edges(stands), parameters),
+            at_all_heights=Walls._of(grid, stands, _edges(never_passed), parameters),
+        )
 
     @staticmethod
-    def _of(
-        grid: OccupancyGrid,
-        stands: BoolGrid,
-        shown: BoolGrid,
-        free: BoolGrid,
-        parameters: WallParameters,
-        share: F64 | None = None,
-    ) -> Walls:
-        """Prepare a grid with `stands` (H, W) as the cells of the field, `shown` as those of the points,
-        `free` as known free ground, and the `share` of a wall that its points in one slice are.
+    def _of(grid: OccupancyGrid, stands: BoolGrid, shown: BoolGrid, parameters: WallParameters) -> Walls:
+        """Prepare a grid with `stands` (H, W) as the cells of the field, and `shown` (H, W) as those of the
+        points.
         """
         cells = cells_of(shown)
         cells = cells[thin_evenly(grid.to_point(cells), parameters.spacing_m)]
         points_m = grid.to_point(cells).astype(np.float32)
         weights = permanence(shown, cells, grid.resolution_m, parameters)
         weights[grid.things[cells[:, 0], cells[:, 1]]] *= parameters.movable
-        weights *= 1.0 if share is None else share[cells[:, 0], cells[:, 1]].astype(np.float32)
         return Walls(
             field=LikelihoodField.around(
-                stands, stands | grid.occupied | free, grid.resolution_m, grid.origin_m
+                stands, stands | grid.occupied | grid.free, grid.resolution_m, grid.origin_m
             ),
             points_m=points_m,
             before_m=points_m,
@@ -232,26 +216,18 @@ class Walls:
             height_m=grid.height_m,
         )
 
-    def facing(self, other: Walls) -> tuple[Walls, ...]:
-        """Return the walls as they are compared with the other side, each with the one of the same place in
-        `other.facing(self)`.
+    def facing(self, other: Walls) -> Walls:
+        """Return the walls as they are compared with the other side.
 
-        Two sides with heights are compared slice by slice. A side without heights may be a laser, which
-        observes a single plane: the other side is compared in the slice of it. Its height is not known if tf
-        does not lift it above its base: then it must have observed obstacles that block all heights, and of a
-        table nothing. If the plane of the other one of two lasers is known to be clearly above the one of
-        these walls, it need not have observed any of them.
+        A side with heights has observed all of them, and must have observed all obstacles. One without
+        heights may be a laser, which observes a single plane: it must have observed obstacles that block all
+        heights, and of a table nothing. If that plane is known to be clearly above the one of these walls, it
+        need not have observed any of them. The height is not known for a laser that tf does not lift above
+        its base.
         """
-        if self.slices:
-            number = bisect.bisect(SLICE_BORDERS_M, other.height_m) if other.height_m else SLICES
-            return self.slices[:SLICES] if other.slices else (self.slices[number],)
+        walls = self.at_all_heights if other.at_all_heights is None else self
         above_m = (other.height_m or math.nan) - (self.height_m or math.nan)
-        return (replace(self, only_explain=above_m > WALLS.plane_m),)
-
-    def at_once(self, other: Walls) -> Walls:
-        """Return the walls as they are laid onto the other side: all slices that are compared, together."""
-        facing = self.facing(other)
-        return facing[0] if len(facing) == 1 else self
+        return replace(walls or self, only_explain=above_m > WALLS.plane_m)
 
     def seen_from(self, free: F32) -> Walls:
         """Return the walls with the ground in front of them, on the side from which they were observed.
@@ -268,8 +244,8 @@ class Walls:
         )
         length = np.maximum(np.hypot(*gradient.T), np.finfo(np.float32).tiny)
         away_m = 2.0 * LIKELIHOOD.sigma_m * gradient / length[:, None]
-        slices = tuple(walls.seen_from(free) for walls in self.slices)
-        return replace(self, before_m=(self.points_m + away_m).astype(np.float32), slices=slices)
+        part = self.at_all_heights and self.at_all_heights.seen_from(free)
+        return replace(self, before_m=(self.points_m + away_m).astype(np.float32), at_all_heights=part)
 
     @property
     def weight(self) -> float:

@@ -97,7 +97,7 @@ def align(
             target = maps[session]
             poses = search_windows(
                 target,
-                coarse_points(query.walls.at_once(target.walls).points_m, query.center_m),
+                coarse_points(query.walls.facing(target.walls).points_m, query.center_m),
                 np.insert(squares_m, 2, 0.0, axis=1),
                 half_t_m=0.5 * SQUARE_M,
                 half_a_rad=math.pi,
@@ -125,7 +125,7 @@ def best_around(query: QueryMap, h: Hypothesis, target: SearchMap) -> Hypothesis
     at = _at(query, h)
     poses = search_windows(
         target,
-        coarse_points(query.walls.at_once(target.walls).points_m, center_m),
+        coarse_points(query.walls.facing(target.walls).points_m, center_m),
         np.array([[at.x, at.y, at.yaw]]),
         half_t_m=p.around_m,
         half_a_rad=p.around_rad,
@@ -152,7 +152,7 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
     The walls of the query are brought onto those of the map. Of two planes at different heights it is the
     walls of the higher one, since things near a wall in the lower one would be drawn onto it.
     """
-    walls = query.walls.at_once(target.walls)
+    walls = query.walls.facing(target.walls)
     if not walls.only_explain:
         return refine(target.field, walls.points_m, T_map_query, query.center_m)
     center_m = T_map_query.apply(np.array([query.center_m]))[0]

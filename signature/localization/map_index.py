@@ -256,7 +256,7 @@ class MapIndex:
         unknown."""
 
         def facing(i: int) -> SearchMap:
-            below = query.walls.at_once(self.maps[i].walls).only_explain
+            below = query.walls.facing(self.maps[i].walls).only_explain
             return (self._from_above if below else self.maps)[i]
 
         return LazySequence(facing, len(self.maps), 0)

@@ -48,7 +48,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import compress
 
 import numpy as np
@@ -364,14 +364,13 @@ def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[flo
 
     step_m : travel after which scans are new evidence.
     """
-    hits = replace(query.walls, slices=())  # it is not known in which slices a single hit was seen
-    (mine,), (theirs,) = hits.facing(walls), walls.facing(hits)
+    above = query.walls.facing(walls).only_explain
     likelihood = points = 0.0
     told = []
     # Before the first scan there was nothing to slip from.
     for count, keyframe in enumerate(reversed(query.keyframes[1:]), start=1):
         hits_m = (fit.T_map_query @ keyframe.T_odom_base).apply(keyframe.planar_scan.hits_m)
-        values, known = theirs.field.at(hits_m, above=mine.only_explain)
+        values, known = walls.field.at(hits_m, above=above)
         likelihood += float(values[known].sum())
         points += float(np.count_nonzero(known))
         mean = likelihood / points if points else 0.0

@@ -225,7 +225,7 @@ def join_maps(
 
     labelled : labels say that both are of one floor of one building.
     """
-    points_m = source.walls.at_once(target.walls).points_m
+    points_m = source.walls.facing(target.walls).points_m
     prior = parameters.labelled if labelled else 1.0
     candidates = _candidates(target, points_m, source.pieces)
     join = _best(target, source, candidates, (), prior, parameters)
@@ -523,7 +523,7 @@ def align_pieces(
             nearest = np.argmin(np.hypot(*(centers_m[trusted] - centers_m[number]).T))
             start = fits[trusted[int(nearest)]].T_map_query
         piece = pieces[number]
-        points_m = piece.walls.at_once(target.walls).points_m
+        points_m = piece.walls.facing(target.walls).points_m
         pose, covariance = refine(target.field, points_m, start, piece.center_m)
         fits[number] = fit = score_fit(target.walls, piece.walls, pose, covariance)
         if fit.known_agreement_both_ways >= JOIN.follows:

@@ -153,17 +153,3 @@ def test_each_hit_and_thing_tells_the_heights_that_it_was_seen_at(planar_scan: P
     inside = np.abs(planar_scan.low_m - (3.5, 2.0)).max(axis=1) < 0.4
     assert np.mean((things[inside] & 0b111) == 0b010) > 0.95  # occupied in the middle only
     assert np.mean((things[inside] & 0b100_000) > 0) > 0.95  # rays have passed over it
-
-
-def test_a_camera_that_looks_level_has_not_passed_the_lowest_slice_before_it() -> None:
-    """At 1.5 m it sees 24 degrees down: below 0.6 m from 2 m on. Level and down, it has seen it all the way
-    from where the floor is seen."""
-    level, both = ColumnMap(6.0, "depth", CONFIG), ColumnMap(6.0, "depth", CONFIG)
-    scene = Scene(box((0.0, 0.0, 0.0), (5.0, 4.0, 2.5)))
-    for columns, pitches in ((level, (0.0,)), (both, (0.0, 40.0))):
-        for points in looks(scene, pitches, (-20.0, 0.0, 20.0)):
-            columns.add(points, points, EYE, 0.0)
-    (low, _, high), (seen, *_) = (columns.cut(SE2(), EYE, 0).passed_m[..., 0] for columns in (level, both))
-    assert 1.9 < low[0] < 3.0 and low[1] == pytest.approx(4.0, abs=0.2)
-    assert high[1] == pytest.approx(4.0, abs=0.2)
-    assert seen[0] < 1.0 and seen[1] == pytest.approx(4.0, abs=0.2)

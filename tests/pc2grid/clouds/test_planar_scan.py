@@ -14,12 +14,14 @@ from pc2grid.clouds.planar_scan import (
     BEARINGS,
     DepthLimit,
     PlanarScan,
+    heights_seen,
     planar_normals,
     project_to_plane,
     scan_bearings,
 )
+from pc2grid.clouds.planar_scan import _compiled_heights as compiled
 from pc2grid.estimation.tracker import Tracker
-from pc2grid.geometry import F32, F64
+from pc2grid.geometry import F32, F64, U8
 from pc2grid.model import SLICE_BORDERS_M, SLICES, Scan, SensorKind
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
 
@@ -97,16 +99,9 @@ def table(x_m: float) -> F32:
     return np.column_stack([np.full(y.size, x_m), y.ravel(), z.ravel()]).astype(np.float32)
 
 
-def projected(ground: Ground | None, points_m: NDArray[np.floating]) -> PlanarScan:
-    return project_to_plane(points_m, stamp_ns=0, sensor_m=SENSOR_M, ground=ground, config=ProjectionConfig())
-
-
 def seen(at_m: list[tuple[float, float]], points_m: F32) -> list[int]:
-    """The heights of the hits nearest to some places."""
-    planar_scan = projected(Ground(FLOOR[:3], 0.0), points_m)
-    off_m = np.linalg.norm(planar_scan.hits_m[None] - np.array(at_m)[:, None], axis=2)
-    assert off_m.min(axis=1).max() < 0.05
-    return planar_scan.heights[off_m.argmin(axis=1)].tolist()
+    at = np.array(at_m, np.float32)
+    return heights_seen(at, points_m, SENSOR_M, FLOOR, BAND_M, DEPTHS).tolist()
 
 
 def test_of_a_table_the_top_is_seen_and_the_wall_behind_it_below_and_above() -> None:
@@ -118,10 +113,62 @@ def test_before_nothing_no_ray_is_known_to_pass() -> None:
     assert seen([(2.0, 0.0)], table(2.0)) == [TOP_ONLY & 0b000_111]
 
 
+def test_where_the_scan_shows_nothing_no_height_is_known() -> None:
+    assert seen([(-2.0, 0.0), (6.0, 0.0)], np.concatenate((table(2.0), wall(4.0)))) == [0, 0]
+
+
 def test_rays_to_the_floor_and_to_the_ceiling_pass_too() -> None:
     # Through 2 m: to the floor at 4 m at 0.45 m, to a ceiling of 2.5 m at 4 m at 1.7 m.
-    rays = np.array([(4.0, y, z) for y in np.linspace(-0.2, 0.2, 41) for z in (0.0, 2.5)], np.float32)
+    rays = np.array([(4.0, 0.0, 0.0), (4.0, 0.0, 2.5)], np.float32)
     assert seen([(2.0, 0.0)], np.concatenate((table(2.0), rays))) == [TOP_ONLY]
+
+
+def heights_seen_plain(
+    at_m: F32,
+    points_m: F32,
+    sensor_m: F64,
+    plane: F64,
+    band_m: tuple[float, float],
+    depths: tuple[float, float],
+    borders_m: F64,
+) -> U8:
+    """The definition of the compiled form, in plain numpy."""
+    away_m = points_m[:, :2].astype(np.float64) - sensor_m[:2]
+    ranges_m = np.hypot(away_m[:, 0], away_m[:, 1])
+    height_m = points_m.astype(np.float64) @ plane[:3] + plane[3]
+    sensor_height_m = float(sensor_m @ plane[:3] + plane[3])
+    heights = np.zeros(len(at_m), np.uint8)
+    for k, (x, y) in enumerate(at_m.astype(np.float64) - sensor_m[:2]):
+        r = math.hypot(x, y)
+        aside_m = np.abs(away_m @ (-y, x)) / np.maximum(ranges_m, 1e-9)
+        ahead, deep_m = away_m @ (x, y) > 0.0, depths[0] + depths[1] * r * r
+        returned = ahead & (aside_m <= 0.5 * depths[0]) & (np.abs(ranges_m - r) <= deep_m)
+        passed = ahead & (aside_m <= 0.25 * depths[0]) & (ranges_m > r + deep_m)
+        passing_m = sensor_height_m + (height_m - sensor_height_m) * r / np.maximum(ranges_m, 1e-9)
+        filled, empty = (
+            np.bitwise_or.reduce(1 << np.searchsorted(borders_m, inside, side="right"))
+            for some in (height_m[returned], passing_m[passed])
+            for inside in [some[(some >= band_m[0]) & (some <= band_m[1])]]
+        )
+        heights[k] = filled | (empty & ~filled) << SLICES
+    return heights
+
+
+def test_the_compiled_form_is_the_plain_one() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform((-4.0, -4.0, -0.2), (4.0, 4.0, 2.5), (2000, 3)).astype(np.float32)
+    at = rng.uniform(-3.0, 3.0, (200, 2)).astype(np.float32)
+    tilted = np.array([0.02, 0.0, 0.9998, 0.05])
+    sensor_m, borders = np.array([0.1, 0.2, 0.6]), np.array(SLICE_BORDERS_M)
+    expected = heights_seen_plain(at, points, sensor_m, tilted, BAND_M, (0.05, 0.01), borders)
+    for bearings in (90, 720):  # how the points are sorted does not matter
+        found: U8 = compiled(at, points, sensor_m, tilted, BAND_M, (0.05, 0.01), borders, bearings)
+        assert np.array_equal(found, expected)
+    assert len(np.unique(expected)) > 20
+
+
+def projected(ground: Ground | None, points_m: NDArray[np.floating]) -> PlanarScan:
+    return project_to_plane(points_m, stamp_ns=0, sensor_m=SENSOR_M, ground=ground, config=ProjectionConfig())
 
 
 def test_hits_of_a_lidar_tell_heights_and_those_of_a_laser_its_own() -> None:
@@ -136,19 +183,6 @@ def test_hits_of_a_lidar_tell_heights_and_those_of_a_laser_its_own() -> None:
     laser = projected(None, room)
     assert laser.height_m == SENSOR_M[2]
     assert not len(laser.heights)
-    assert not len(laser.passed_m)
-
-
-def test_a_ray_passes_slices_one_after_the_other() -> None:
-    """To the floor 4 m ahead from 0.9 m: it leaves the slice of the sensor at 0.6 m, the lowest at the band's
-    end. To what hangs at 1.8 m, 3 m to the left: it enters the highest slice at 1.1 m."""
-    rays = np.array([(4.0, 0.0, 0.0), (0.0, 3.0, 1.8)], np.float32)
-    passed_m = projected(Ground(FLOOR[:3], 0.0), rays).passed_m
-    assert passed_m.shape == (SLICES, 2, BEARINGS)
-    ahead = np.array([(4 / 3, 4.0 * (0.9 - ProjectionConfig().band_min_m) / 0.9), (0, 4 / 3), (0, 0)])
-    assert passed_m[..., bearing(0)] == pytest.approx(ahead, abs=1e-5)
-    assert passed_m[..., bearing(90)] == pytest.approx(np.array([(0, 0), (0, 2 / 3), (2 / 3, 3)]), abs=1e-5)
-    assert np.count_nonzero(passed_m.any(axis=(0, 1))) == 2
 
 
 # --- Hits near the far limit of a depth camera are too short; hits of a scene that ends before are kept ---
@@ -257,23 +291,21 @@ def scan_bearings_plain(
     points: F32,
     sensor: F64,
     plane: F64,
-    edges: F64,
+    band: tuple[float, float],
     limit: float,
     depths: tuple[float, float],
     bearings: int,
-) -> tuple[F64, F64, F64, F64]:
+) -> tuple[F64, F64, F64]:
     """Sort points (N, 3) by bearing, in plain numpy.
 
-    sensor : (3,). plane : (4,) with height = plane[:3] . p + plane[3]. edges : of the slices, from the lowest
-    to the highest height of an obstacle. limit : farthest range of an obstacle point. depths : (d, q),
-    obstacle points of one bearing belong to one surface up to a range difference of d + q * range**2.
+    sensor : (3,). plane : (4,) with height = plane[:3] . p + plane[3]. band : lowest and highest height of
+    an obstacle. limit : farthest range of an obstacle point. depths : (d, q), obstacle points of one
+    bearing belong to one surface up to a range difference of d + q * range**2.
 
     Returns for each bearing the range of the nearest obstacle (inf: none) and how far floor and ceiling
-    show it to be free (0: not at all), for each surface (S, 3 + SLICES) the sums of x and y of its points,
-    their number, and that in each slice, by increasing bearing and range, and between which ranges
-    (SLICES, 2, bearings) rays pass each slice.
+    show it to be free (0: not at all), and for each surface (S, 3) the sums of x and y of its points and
+    their number, by increasing bearing and range.
     """
-    band = edges[[0, -1]]
     away = points[:, :2].astype(np.float64) - sensor[:2]
     ranges = np.hypot(away[:, 0], away[:, 1])
     bearing = np.rint(np.arctan2(away[:, 1], away[:, 0]) * (bearings / (2.0 * np.pi))).astype(int) % bearings
@@ -294,18 +326,9 @@ def scan_bearings_plain(
     for k in kept:
         if bearing[k] != last or ranges[k] - first_m > depths[0] + depths[1] * ranges[k] ** 2:
             last, first_m = bearing[k], ranges[k]
-            surfaces.append(np.zeros(3 + SLICES))
-        surfaces[-1][:3] += points[k, 0], points[k, 1], 1.0
-        surfaces[-1][3 + np.searchsorted(edges[1:-1], height[k], side="right")] += 1.0
-    passed = np.zeros((SLICES, 2, bearings))
-    for n in range(SLICES):
-        with np.errstate(divide="ignore", invalid="ignore"):
-            ends = np.sort((edges[n : n + 2, None] - sensor_height) / (height - sensor_height), axis=0)
-        first, last = ranges * ends.clip(0.0, 1.0)
-        for k in np.flatnonzero(first < last):
-            inside = passed[n, :, bearing[k]]
-            inside[:] = min(inside[0], first[k]) if inside[1] else first[k], max(inside[1], last[k])
-    return nearest, reach, np.array(surfaces).reshape(-1, 3 + SLICES), passed
+            surfaces.append(np.zeros(3))
+        surfaces[-1] += points[k, 0], points[k, 1], 1.0
+    return nearest, reach, np.array(surfaces).reshape(-1, 3)
 
 
 @pytest.mark.parametrize("count", [3, 4, 9])
@@ -354,8 +377,8 @@ def test_bearings_are_sorted_as_by_their_definition(ground: bool) -> None:
     points = rng.uniform((-6, -6, -0.5), (6, 6, 3.0), (3000, 3)).astype(np.float32)
     sensor = np.array([0.1, 0.2, 0.7])
     plane = np.array([0.01, -0.02, 1.0, 0.05]) if ground else np.zeros(4)
-    edges = np.array([0.2, *SLICE_BORDERS_M, 1.8] if ground else [-math.inf, *SLICE_BORDERS_M, math.inf])
+    band = (0.2, 1.8) if ground else (-math.inf, math.inf)
     for depths in ((0.05, 0.0), (0.05, 0.006)):
-        arguments = (points, sensor, plane, edges, 5.0, depths, 360)
+        arguments = (points, sensor, plane, band, 5.0, depths, 360)
         for found, expected in zip(scan_bearings(*arguments), scan_bearings_plain(*arguments), strict=True):
-            assert found == pytest.approx(expected, rel=1e-5, abs=1e-5)
+            assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)

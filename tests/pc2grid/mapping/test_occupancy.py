@@ -99,24 +99,6 @@ def test_a_grid_tells_the_heights_of_what_stands_there() -> None:
     assert unknown.grid().heights is None
 
 
-def test_free_ground_tells_the_slices_that_rays_have_passed_there() -> None:
-    """The lowest slice is passed from 1 m on, the next one up to 0.5 m, the highest nowhere."""
-    builder = GridBuilder(ProjectionConfig())
-    passed_m = np.zeros((3, 2, BEARINGS), np.float32)
-    passed_m[0], passed_m[1] = [[1.0], [3.0]], [[0.0], [0.5]]
-    wall = np.array([[1.52, 0.02]], np.float32)
-    seen = dataclasses.replace(disc(2.0), hits_m=wall, normal_rad=np.zeros(1, np.float32), passed_m=passed_m)
-    for _ in range(2):
-        builder.add(dataclasses.replace(seen, heights=np.array([0b000_100], np.uint8)), SE2())
-    grid = builder.grid()
-    assert grid.heights is not None
-    at_m = np.array([(0.32, 0.02), (0.72, 0.02), (1.22, 0.02), (1.52, 0.02), (0.02, -1.92)])
-    row, column = grid.to_cell(at_m).T
-    assert grid.heights[row, column].tolist() == [0b010_000, 0, 0b001_000, 0b000_100, 0b001_000]
-    free_m = np.hypot(*grid.to_point(np.argwhere((grid.heights >> 3) & 1)).T)
-    assert free_m.min() > 0.9 and free_m.max() < 2.1
-
-
 def test_a_map_past_the_limit_is_refused() -> None:
     builder = GridBuilder(ProjectionConfig(max_cells=600_000))
     builder.add(disc(2.0), SE2())
