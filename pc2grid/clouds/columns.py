@@ -281,20 +281,23 @@ def observe_rays(
     """
     size, layers = evidence.shape[0], evidence.shape[2]
     edge, height = cell
+    x, y, z = sensor[0] / edge - low[0], sensor[1] / edge - low[1], sensor[2] / height - low[2]
+    first_a, first_b, first_c = low[0] % size, low[1] % size, low[2] % layers
     for n in range(len(rays)):
         dx, dy, dz = rays[n, 0] - sensor[0], rays[n, 1] - sensor[1], rays[n, 2] - sensor[2]
         away = math.sqrt(dx * dx + dy * dy + dz * dz)
         steps = int((away - margin[0] - margin[1] * away * away) / edge)
-        dx, dy, dz = dx / away * edge, dy / away * edge, dz / away * edge
+        dx, dy, dz = dx / away, dy / away, dz / away * edge / height
         for step in range(steps):
-            i = math.floor((sensor[0] + step * dx) / edge)
-            j = math.floor((sensor[1] + step * dy) / edge)
-            k = math.floor((sensor[2] + step * dz) / height)
-            if not _within(low, size, i, j):
+            i, j, k = math.floor(x + step * dx), math.floor(y + step * dy), math.floor(z + step * dz)
+            if not (0 <= i < size and 0 <= j < size):
                 break
-            if not low[2] <= k < low[2] + layers:
+            if not 0 <= k < layers:
                 continue
-            a, b, c = i % size, j % size, k % layers
+            a, b, c = first_a + i, first_b + j, first_c + k
+            a -= size * (a >= size)
+            b -= size * (b >= size)
+            c -= layers * (c >= layers)
             if seen[a, b, c] != stamp:
                 seen[a, b, c] = stamp
                 evidence[a, b, c] = max(evidence[a, b, c] - miss, least)
@@ -435,18 +438,20 @@ def _first_wall(
     passed : (W, W), 1 for low columns that were passed before. lows : gets the middles of the others.
     """
     size = state.shape[0]
+    x, y = origin[0] / edge - low[0], origin[1] / edge - low[1]
+    dx, dy = along[0] / edge, along[1] / edge
     free, known = 0.0, False
-    last_a, last_b = -1, -1
+    last_i, last_j = -1, -1
     r = 0.0
     while r < reach:
         r += 0.5 * edge
-        i, j = math.floor((origin[0] + r * along[0]) / edge), math.floor((origin[1] + r * along[1]) / edge)
-        if not _within(low, size, i, j):
-            break
-        a, b = i % size, j % size
-        if a == last_a and b == last_b:
+        i, j = math.floor(x + r * dx), math.floor(y + r * dy)
+        if i == last_i and j == last_j:
             continue
-        last_a, last_b = a, b
+        last_i, last_j = i, j
+        if not (0 <= i < size and 0 <= j < size):
+            break
+        a, b = (i + low[0]) % size, (j + low[1]) % size
         if state[a, b] == WALL:
             return free, r, count
         if state[a, b] == UNKNOWN:
@@ -456,7 +461,7 @@ def _first_wall(
         known, free = True, r
         if state[a, b] == LOW and not passed[a, b]:
             passed[a, b] = 1
-            lows[count, 0], lows[count, 1] = (i + 0.5) * edge, (j + 0.5) * edge
+            lows[count, 0], lows[count, 1] = (low[0] + i + 0.5) * edge, (low[1] + j + 0.5) * edge
             count += 1
     return free, -1.0, count
 
