@@ -43,8 +43,10 @@ if TYPE_CHECKING:
 
 
 _MOST_FIELDS = 1000
-"""Fields of a message, of a cloud and numbers of distortion that no real message reaches. The known types
-flatten to some tens of fields; the limit bounds the time for a crafted text to half a second."""
+"""Fields of a message and of a cloud that no real message reaches. The known types flatten to some tens of
+fields; the limit bounds the time for a crafted text to half a second."""
+_MOST_DISTORTION = 100
+"""Numbers of distortion that no real camera reaches."""
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
@@ -138,7 +140,7 @@ def _compressed_image(m: Any) -> CompressedImage:
 
 
 def _camera_info(m: Any) -> CameraInfo:
-    if len(m.d) > _MOST_FIELDS:
+    if len(m.d) > _MOST_DISTORTION:
         raise PointCloudError(f"a CameraInfo with {len(m.d)} numbers of distortion")
     d, k, p = (tuple(values.tolist()) for values in (m.d, m.k, m.p))
     return CameraInfo(_header(m.header), m.height, m.width, m.distortion_model, d, k, p)
