@@ -87,18 +87,7 @@ class Masses:
                     places.append((replace(beside.pop(k), mass=away.mass + mass),))
                     break
             else:
-                places.append(
-                    tuple(
-                        OffMap(
-                            hypothesis=h,
-                            mass=mass,
-                            seen_m=query.path_m,
-                            T_odom_seen=query.T_odom_base,
-                            seen=h.fit.covariance,
-                        )
-                        for h in place
-                    )
-                )
+                places.append(tuple(_seen(h, mass, query) for h in place))
         places += [(away,) for away in beside]
         return Masses(
             part=query.part, path_m=query.path_m, T_odom_base=query.T_odom_base, places=tuple(places)
@@ -134,6 +123,13 @@ class Masses:
         shown = place[0].fit.overlap >= POSTERIOR.shown
         found = (known for known in self.places if shown or more_exact(place[0], known[0].hypothesis))
         return 1.0 + replace(self, places=tuple(found)).mass(place)
+
+
+def _seen(h: Hypothesis, mass: float, query: QueryMap) -> OffMap:
+    """Return a place that the map shows now."""
+    return OffMap(
+        hypothesis=h, mass=mass, seen_m=query.path_m, T_odom_seen=query.T_odom_base, seen=h.fit.covariance
+    )
 
 
 def _carried(place: OffMap, now: QueryMap | Masses, odds: float) -> OffMap:

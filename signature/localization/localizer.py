@@ -3,7 +3,7 @@
 Hypotheses are carried along the query's travel: after every metre the old ones are refined on what has been
 seen since, and the database is searched again, so that a wrong first hypothesis is replaced. What was seen
 before the last metres is in the masses of the belief (`signature.localization.belief`). An answer rests on
-both, is refined, and is checked in space where query and map have points (`answer_query`).
+both, is refined, and is checked in space where query and map have points (`Localizer.search`).
 
 A search takes up to seconds in a large building, and a robot sends 40 scans a second. So `Follower` searches
 in a thread while tracking goes on; the most expensive parts are compiled and run beside Python.
@@ -192,8 +192,9 @@ class Localizer:
         prior_of: PriorOf | None = None,
         index: MapIndex | None = None,
     ) -> tuple[Query, Answer]:
-        """Where a query is, and the query that this is about: if it is more likely than not that the robot
-        was carried away or tracking slipped, the scans since. Nothing of it is kept.
+        """Return the query that the answer is about, and the answer: where it is. That is the given query or,
+        if the robot was more likely than not carried away or tracking slipped, its scans since. Nothing of it
+        is kept.
 
         known : hypotheses to be compared, too. prior_of : of each place; None: by the searches before the
         last metres. index : where to look, if not where the localizer does. Raises NoScans if no scan could
@@ -260,9 +261,11 @@ def _with_prior(
 
 def _elsewhere(query: Query, alone: Answer, place: Hypothesis) -> float:
     """Return the mass of all that a query can be but one place, as a multiple of the mass of "nowhere"."""
+    first = sum(alone.masses[:1])
+    if not first:
+        return 1.0
     here = Masses.of(query.map(), alone).mass([place])
-    odds = alone.masses[0] and math.exp(alone.evidence.log_odds()) / alone.masses[0] if alone.masses else 0.0
-    return 1.0 + odds * (sum(alone.masses) - here)
+    return 1.0 + math.exp(alone.evidence.log_odds()) / first * (sum(alone.masses) - here)
 
 
 def _in_map(verdict: Verdict, session_index: int | None) -> Verdict:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pc2grid.errors import DatabaseCorrupt
+from pc2grid.geometry import I64
 from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.icp_in_space import MapSurface
 from pc2grid.matching.search import SearchMap
@@ -189,7 +190,7 @@ class MapIndex:
 
         number : of the look. All that is prepared is shared. If there is only one part, it is this index.
         """
-        if len(self.places.table) <= 11 * FIRST_PLACES:
+        if len(_parts(len(self.places.table))) <= 2:
             return self
         limited = copy.copy(self)
         limited.look = number
@@ -222,7 +223,7 @@ class MapIndex:
         maps = self.maps_for(query)
         found = self._worth_keeping(query, self._fitted(query, known))
         rows, mass = self.places.order(query.views, query.center_m, self.config)
-        parts = np.split(np.arange(len(rows)), range(FIRST_PLACES, len(rows), 10 * FIRST_PLACES))
+        parts = _parts(len(rows))
         if self.look is not None and len(parts) > 1:
             parts = [parts[0], parts[1 + self.look % (len(parts) - 1)]]
         batches = [self.places.areas(rows[part]) for part in parts]
@@ -286,3 +287,9 @@ class MapIndex:
         if frame is None or other is None or frame.name != other.name:
             return None
         return frame, other
+
+
+def _parts(count: int) -> list[I64]:
+    """Return the numbers of so many places, likeliest first, in the parts that are searched one after the
+    other."""
+    return np.split(np.arange(count), range(FIRST_PLACES, count, 10 * FIRST_PLACES))

@@ -45,6 +45,8 @@ class RecognitionParameters:
 
 
 RECOGNITION = RecognitionParameters()
+_LEAST_LOG_ODDS = math.log(LEFT / (1.0 - LEFT))
+"""What is less likely than what a search leaves out is not reported."""
 
 
 class SessionRecognizer:
@@ -80,15 +82,16 @@ class SessionRecognizer:
         rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
         maps = LazySequence(self._map, len(self._stored), most=0)
         found = distinct(query, next(align(query, [places.areas(rows)], places, maps, self._config)))
+        odds = [evidence.log_odds() for evidence in evidence_of([h.fit for h in found], query)]
         return [
             Recognition(
                 older=h.session_index,
                 newer=len(self._stored),
                 T_older_newer=best_around(query, h, maps[h.session_index]).fit.T_map_query,
-                log_odds=evidence.log_odds(),
+                log_odds=log_odds,
             )
-            for h, evidence in zip(found, evidence_of([h.fit for h in found], query), strict=True)
-            if evidence.log_odds() > math.log(LEFT / (1.0 - LEFT))
+            for h, log_odds in zip(found, odds, strict=True)
+            if log_odds > _LEAST_LOG_ODDS
         ]
 
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:

@@ -359,8 +359,9 @@ def masses(
 
 
 def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[float, int]:
-    """Mass of "it lay here until it was carried away or tracking slipped" as a multiple of the mass of a
-    place, with A = 1; and how many scans there are since the likeliest slip, 0 if none contradict the place.
+    """Return the mass of "it lay here until it was carried away or tracking slipped", as a multiple of that
+    of the place, with A = 1; and the number of scans since the likeliest slip, 0 if none contradict the
+    place.
 
     step_m : travel after which scans are new evidence.
     """
