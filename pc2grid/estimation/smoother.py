@@ -14,8 +14,7 @@ All measurements are factors with Cauchy weights (Suenderhauf and Protzel, "Swit
 Agarwal et al., 2013); the oldest scan is marginalised (Sibley, Matthies and Sukhatme, "Sliding window filter
 with application to planetary landing", 2010). On wheels three of six degrees of freedom are free.
 
-The window of factors, its states and the marginalised prior are tuples of arrays, which compiled code takes
-directly.
+The window of factors, its states and the marginalised prior are tuples of arrays.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv, dpotrs
 
-from pc2grid.estimation.line_map import compiled_steps, inverse_adjoint, moved, steps
+from pc2grid.estimation.line_map import inverse_adjoint, moved, steps
 from pc2grid.geometry import F64, BoolGrid, invert_pose
 from pc2grid.libraries import compiled
 
@@ -160,6 +159,8 @@ class FactorWindow(NamedTuple):
     seconds : (N,) since the scan before. jumps : (N,) True if the reading does not continue the one before.
     read : (N, 4, 4) T_odom_base, with read_sigma (N, D). match : (N, 4, 4) T_session_base, with
     match_information (N, D, D). motion : (N, 6) step from the scan before, with motion_information (N, D, D).
+    ratio : (N,) of the step at constant velocity to the step before. steadiness : (N,) information of that in
+    each direction, 0 where something else measures the step.
     """
 
     seconds: F64
@@ -170,6 +171,8 @@ class FactorWindow(NamedTuple):
     match_information: F64
     motion: F64
     motion_information: F64
+    ratio: F64
+    steadiness: F64
 
     def part(self, begin: int, end: int) -> FactorWindow:
         """Return the rows of the scans from `begin` to before `end`."""
@@ -233,7 +236,7 @@ class Smoother:
         p, d = self._parameters, len(self._free)
         reading = T_session_base if T_odom_base is None else T_odom_base
         self._state = WindowState(T_session_base[None].copy(), reading[None].copy(), np.zeros(ERRORS))
-        self._window = self._row(ScanFactors(seconds=0.0), T_session_base, reading)
+        self._window = self._row(ScanFactors(seconds=0.0), T_session_base, reading, 0.0)
         self._begins = True  # no scan has been added since
         errors = np.array([p.scale, p.direction_rad, p.yaw_rad_per_m, p.turn])
         own = np.concatenate((np.full(d, 1e-4), self._noise(p.reading_m, p.reading_rad)))
@@ -251,10 +254,10 @@ class Smoother:
         """Predict the next pose from a reading (4, 4) of odometry."""
         p = self._parameters
         (reported,), _, _ = steps(self._state.readings[-1:], T_odom_base[None])
-        motion, _, _ = corrected(reported, self._state.errors)
-        drift = drift_variance(reported, p.drift, p.drift_turn_m)[self._free]
-        variance = drift + 2.0 * self._noise(p.reading_m, p.reading_rad) ** 2
-        return self.after(moved(np.eye(4)[None], motion[None])[0], np.sqrt(variance))
+        x, y, yaw, *drift = corrected(reported, self._state.errors, p.drift, p.drift_turn_m)
+        motion = np.array([[x, y, *reported[2:5], yaw]])
+        variance = self._noise(*drift) + 2.0 * self._noise(p.reading_m, p.reading_rad) ** 2
+        return self.after(moved(np.eye(4)[None], motion)[0], np.sqrt(variance))
 
     def constant_velocity(self, seconds: float, turn: F64 | None = None) -> tuple[F64, F64]:
         """Predict the next motion (4, 4) over a time by constant velocity; returns it with standard
@@ -265,7 +268,8 @@ class Smoother:
         p = self._parameters
         step, over_s = self._latest()
         share = min(seconds / over_s, 1.0)
-        motion, sigmas = moved(np.eye(4)[None], share * step[None])[0], self._change_sigmas(seconds)
+        motion = moved(np.eye(4)[None], share * step[None])[0]
+        sigmas = np.full(len(self._free), self._change_sigma(seconds))
         if turn is not None:
             motion[:3, :3] = turn[:3, :3]
             sigmas = np.where(self._free < 3, sigmas, p.gyroscope_radps * seconds)
@@ -310,7 +314,7 @@ class Smoother:
             motion, sigmas = self.constant_velocity(evidence.seconds)
             evidence = dataclasses.replace(evidence, motion=(motion, np.diag(sigmas**-2)))
         self._begins = False
-        self._window = self._window.then(self._row(evidence, guess, reading))
+        self._window = self._window.then(self._row(evidence, guess, reading, self._window.seconds[-1]))
         state = WindowState(
             np.concatenate((before.poses, guess[None])),
             np.concatenate((before.readings, reading[None])),
@@ -322,8 +326,11 @@ class Smoother:
             self._marginalise()
         return self.belief
 
-    def _row(self, evidence: ScanFactors, pose: F64, reading: F64) -> FactorWindow:
-        """Return the row of one scan; a pose (4, 4) and a reading take the place of missing measurements."""
+    def _row(self, evidence: ScanFactors, pose: F64, reading: F64, before_s: float) -> FactorWindow:
+        """Return the row of one scan; a pose (4, 4) and a reading take the place of missing measurements.
+
+        before_s : duration of the step before.
+        """
         p, d = self._parameters, len(self._free)
         nothing, read = np.zeros((d, d)), (reading, np.full(d, np.inf))
         if evidence.T_odom_base is not None:
@@ -331,7 +338,21 @@ class Smoother:
         motion, information = evidence.motion or (np.eye(4), nothing)
         step, _, _ = steps(np.eye(4)[None], motion[None])
         match = evidence.match or (pose, nothing)
-        row = (evidence.seconds, not evidence.continues, *read, *match, step[0], information)
+        seconds, before_s = max(evidence.seconds, LEAST_S), max(before_s, LEAST_S)
+        ratio = min(seconds, max(before_s, p.steady_s)) / before_s
+        # Odometry that jumps measures a step only together with a match.
+        follows = evidence.T_odom_base is not None and (evidence.continues or match[1].trace() > 0.0)
+        steadiness = 0.0 if follows or information.trace() > 0.0 else self._change_sigma(seconds) ** -2.0
+        row = (
+            evidence.seconds,
+            not evidence.continues,
+            *read,
+            *match,
+            step[0],
+            information,
+            ratio,
+            steadiness,
+        )
         return FactorWindow(*(np.array(value)[None] for value in row))
 
     def _solved(self, state: WindowState) -> tuple[WindowState, F64]:
@@ -383,10 +404,9 @@ class Smoother:
         """Return the standard deviations (D,) of the free directions."""
         return np.where(self._free < 3, sigma_m, sigma_rad)
 
-    def _change_sigmas(self, seconds: float) -> F64:
-        """Return the standard deviations (D,) of the change of the motion from one scan to the next."""
-        p = self._parameters
-        return np.full(len(self._free), change_sigma(seconds, p.unsteady, p.growth))
+    def _change_sigma(self, seconds: float) -> float:
+        """Return the standard deviation, m and rad, of the change of the motion from one scan to the next."""
+        return self._parameters.unsteady * float(seconds ** (1.0 + self._parameters.growth))
 
 
 def _without(H: F64, g: F64, first: int) -> tuple[F64, F64]:
@@ -401,10 +421,6 @@ def _without(H: F64, g: F64, first: int) -> tuple[F64, F64]:
     return 0.5 * (reduced + reduced.T), g[rest] - B @ solved[:, -1]
 
 
-# --- compiled functions: the factors and their normal equations ---------------------------------------
-
-
-@compiled()
 def normal_equations(
     state: WindowState,
     window: FactorWindow,
@@ -421,240 +437,202 @@ def normal_equations(
 
     The third value is the scale of the drift, estimated again if there are more than three scans.
     """
-    d, n, kernel = len(free), len(state.poses), parameters.kernel
-    unknowns = ERRORS + 2 * d * n
-    H, g, error = np.zeros((unknowns, unknowns)), np.zeros(unknowns), np.empty(d)
-    _add_prior(state, prior, free, H, g)
-    # A reading of odometry lies near what it should be, and a pose near where the scan fits the local map.
-    off_reading, _, of_reading = compiled_steps(window.read, state.readings)
-    off_pose, _, of_pose = compiled_steps(window.match, state.poses)
-    for k in range(few):
-        of_match, of_read, read = np.zeros((d, d)), np.zeros((d, d)), np.zeros((d, d))
-        _put(of_pose[k], 1.0, free, 0, of_match)
-        _put(of_reading[k], 1.0, free, 0, of_read)
-        for a in range(d):
-            error[a] = off_pose[k, free[a]]
-        at = ERRORS + 2 * d * k
-        _add(at, error, of_match, window.match_information[k], kernel, H, g, d)
-        for a in range(d):
-            error[a], read[a, a] = off_reading[k, free[a]], window.read_sigma[k, a] ** -2.0
-        _add(at + d, error, of_read, read, kernel, H, g, d)
-    moves = compiled_steps(state.poses[:-1], state.poses[1:])
-    drift_scale = _add_drifts(moves, state, window, free, parameters, drift_scale, few, H, g)
-    # A pose follows the one before by the motion that registration measured.
-    step, by_first, by_second = moves
-    for k in range(min(few, n - 1)):
-        of_motion = np.zeros((d, 3 * d))
-        _put(by_first[k], 1.0, free, 0, of_motion)
-        _put(by_second[k], 1.0, free, 2 * d, of_motion)
-        for a in range(d):
-            error[a] = _difference(step[k], 1.0, window.motion[k + 1], free[a])
-        information = window.motion_information[k + 1]
-        _add(ERRORS + 2 * d * k, error, of_motion, information, kernel, H, g, 3 * d)
-    _add_constant_velocity(moves, window, free, parameters, few, H, g)
+    p, about, (poses, readings, errors) = parameters, prior.about, state
+    d, n, m = len(free), len(poses), len(about.poses)
+    linear = steps(
+        np.concatenate((window.match, window.read, poses[:-1], readings[:-1], about.poses, about.readings)),
+        np.concatenate((poses, readings, poses[1:], readings[1:], poses[:m], readings[:m])),
+    )
+    unknowns, own = ERRORS + 2 * d * n, len(prior.shift)
+    H, g = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    off = prior.shift.copy()
+    off[:ERRORS] += errors - about.errors
+    off[ERRORS:] += linear.step[4 * n - 2 :, free].reshape(2, m, d).swapaxes(0, 1).reshape(-1)
+    H[:own, :own] = prior.information
+    error, information, jacobian = np.empty((n + 1, 6)), np.empty((6, 6)), np.empty((2, 6, 5 * 6 + ERRORS))
+    drift_scale = _add_factors(
+        *linear, errors, window.jumps, window.read_sigma, window.match_information, window.motion,
+        window.motion_information, window.ratio, window.steadiness, free, p.drift, p.drift_turn_m, p.kernel,
+        drift_scale, few, off, error, information, jacobian, H, g,
+    )  # fmt: skip
     return H, g, drift_scale
 
 
-@compiled()
-def _add_prior(state: WindowState, prior: MarginalPrior, free: NDArray[np.intp], H: F64, g: F64) -> None:
-    """Add the marginalised prior on the errors and the first states."""
-    d, m = len(free), len(prior.about.poses)
-    off_pose, _, _ = compiled_steps(prior.about.poses, state.poses[:m])
-    off_reading, _, _ = compiled_steps(prior.about.readings, state.readings[:m])
-    off = np.empty(len(prior.shift))
-    for a in range(len(off)):
-        off[a] = prior.shift[a]
-    for a in range(ERRORS):
-        off[a] += state.errors[a] - prior.about.errors[a]
-    for k in range(m):
-        for a in range(d):
-            off[ERRORS + 2 * d * k + a] += off_pose[k, free[a]]
-            off[ERRORS + 2 * d * k + d + a] += off_reading[k, free[a]]
-    for a in range(len(off)):
-        for b in range(len(off)):
-            H[a, b] += prior.information[a, b]
-            g[a] += prior.information[a, b] * off[b]
+# --- compiled functions: the factors and their normal equations ---------------------------------------
+
+_MATCH, _READ, _DRIFT, _MOTION, _VELOCITY = range(5)
+"""Kinds of factors."""
 
 
-@compiled()
-def _add_drifts(
-    moves: tuple[F64, F64, F64],
-    state: WindowState,
-    window: FactorWindow,
+@compiled(error_model="numpy")
+def _add_factors(
+    step: F64,
+    by_first: F64,
+    by_second: F64,
+    errors: F64,
+    jumps: BoolGrid,
+    read_sigma: F64,
+    match_information: F64,
+    motion: F64,
+    motion_information: F64,
+    ratios: F64,
+    steadiness: F64,
     free: NDArray[np.intp],
-    p: SmootherParameters,
+    drift: float,
+    drift_turn_m: float,
+    kernel: float,
     drift_scale: float,
     few: int,
+    off: F64,
+    error: F64,
+    information: F64,
+    jacobian: F64,
     H: F64,
     g: F64,
 ) -> float:
-    """Add the drift factors: a pose moves like the readings, but for systematic errors and drift. Return its
-    scale.
+    """Add the factors to the normal equations H and g; return the scale of the drift.
+
+    step, by_first, by_second : as of `steps`, N from matches to poses and N from readings to what they should
+    be, then N - 1 from pose to pose and N - 1 from reading to reading. jumps .. steadiness : as of
+    `FactorWindow`. H holds the information of the prior, off : (P,) its error. error (N + 1, 6), information
+    (6, 6), jacobian (2, 6, 34) : room to work in. The others as for `normal_equations`.
+
+    All is done in scalars: arrays made and cut out here, and functions called, took 5 s to compile.
     """
-    (step, by_first, by_second), d, n = moves, len(free), len(state.poses)
-    reports, read_first, read_second = compiled_steps(state.readings[:-1], state.readings[1:])
-    errors, variances, chi2, all_chi2 = np.empty((n - 1, d)), np.empty((n - 1, d)), np.zeros(n - 1), 0.0
+    d, n = len(free), len(jumps)
+    moves, reports = 2 * n, 3 * n - 1
+    for a in range(len(off)):
+        for b in range(len(off)):
+            g[a] += H[a, b] * off[b]
+    c, s = (1.0 + errors[0]) * math.cos(errors[1]), (1.0 + errors[0]) * math.sin(errors[1])
+    all_chi2 = 0.0
     for k in range(n - 1):
-        expected, _, _ = corrected(reports[k], state.errors)
-        variance = drift_variance(reports[k], p.drift, p.drift_turn_m)
+        report, chi2 = step[reports + k], 0.0
+        x, y, yaw, of_position, of_turn = corrected(report, errors, drift, drift_turn_m)
         for a in range(d):
-            errors[k, a], variances[k, a] = _difference(step[k], 1.0, expected, free[a]), variance[free[a]]
-            if not window.jumps[k + 1]:
-                chi2[k] += errors[k, a] ** 2 / variance[free[a]]
-        all_chi2 += chi2[k]
+            to = free[a]
+            expected = x if to == 0 else y if to == 1 else yaw if to == 5 else report[to]
+            error[k, a] = step[moves + k, to] - expected
+            if to == 5:
+                error[k, a] -= 2.0 * math.pi * math.floor(error[k, a] / (2.0 * math.pi) + 0.5)
+            if not jumps[k + 1]:
+                chi2 += error[k, a] ** 2 / (of_position if to < 3 else of_turn)
+        all_chi2 += chi2
     if n > 3:  # not of the few that are marginalised
         drift_scale = math.sqrt(max(all_chi2 / ((n - 1) * d), 1.0))
-    for k in range(min(few, n - 1)):
-        if window.jumps[k + 1]:
-            continue
-        _, by_report, by_errors = corrected(reports[k], state.errors)
-        # Slips and late readings are no evidence of errors that are the same in every step.
-        weight = 1.0 / (1.0 + chi2[k] / (drift_scale * p.kernel) ** 2)
-        jacobian, information = np.zeros((d, 4 * d + ERRORS)), np.zeros((d, d))
-        _put(by_first[k], 1.0, free, 0, jacobian)
-        _put(_product(by_report, read_first[k]), -1.0, free, d, jacobian)
-        _put(by_second[k], 1.0, free, 2 * d, jacobian)
-        _put(_product(by_report, read_second[k]), -1.0, free, 3 * d, jacobian)
-        for a in range(d):
-            information[a, a] = 1.0 / (drift_scale**2 * variances[k, a])
-            for b in range(ERRORS):
-                jacobian[a, 4 * d + b] = -weight * by_errors[free[a], b]
-        _add(ERRORS + 2 * d * k, errors[k], jacobian, information, p.kernel, H, g, 4 * d)
+    for kind in range(_VELOCITY + 1):
+        for k in range(min(few, n - (kind >= _DRIFT) - (kind == _VELOCITY))):
+            # A reading of odometry lies near what it should be, and a pose near where the scan fits the local
+            # map. A pose moves like the readings, but for systematic errors and drift; it follows the one
+            # before by the motion that registration measured, or else at constant velocity.
+            if kind == _DRIFT and jumps[k + 1]:
+                continue
+            if kind == _VELOCITY and not steadiness[k + 2]:
+                continue
+            at, own, cauchy, ratio, of_position, of_turn = moves + k, 3 * d, kernel, 1.0, 0.0, 0.0
+            if kind < _DRIFT:
+                at, own = n * kind + k, d
+            elif kind == _DRIFT:
+                own, report = 4 * d, step[reports + k]
+                x, y, yaw, of_position, of_turn = corrected(report, errors, drift, drift_turn_m)
+            elif kind == _VELOCITY:
+                own, cauchy, ratio = 5 * d, math.inf, -ratios[k + 2]
+            after, first, count = at + (kind == _VELOCITY), ERRORS + d * (2 * k + (kind == _READ)), own
+            e, Le, J, LJ, chi2 = error[n - 1], error[n], jacobian[0], jacobian[1], 0.0
+            for a in range(d):
+                to = free[a]
+                e[a] = step[after, to]
+                if kind == _DRIFT:
+                    e[a] = error[k, a]
+                elif kind == _MOTION:
+                    e[a] -= motion[k + 1, to]
+                elif kind == _VELOCITY:
+                    e[a] += ratio * step[at, to]
+                if to == 5:
+                    e[a] -= 2.0 * math.pi * math.floor(e[a] / (2.0 * math.pi) + 0.5)
+                for b in range(d):
+                    by, information[a, b] = free[b], 0.0
+                    J[a, b], J[a, 2 * d + b] = ratio * by_first[at, to, by], ratio * by_second[at, to, by]
+                    J[a, d + b] = J[a, 3 * d + b] = J[a, 4 * d + b] = 0.0
+                    if kind == _MATCH:
+                        information[a, b] = match_information[k, a, b]
+                    elif kind == _MOTION:
+                        information[a, b] = motion_information[k + 1, a, b]
+                    if kind < _DRIFT:
+                        J[a, b] = by_second[at, to, by]
+                    elif kind == _DRIFT:
+                        u, v = by_first[reports + k, to, by], by_second[reports + k, to, by]
+                        if to == 0:
+                            u = c * u - s * by_first[reports + k, 1, by]
+                            v = c * v - s * by_second[reports + k, 1, by]
+                        elif to == 1:
+                            u = s * by_first[reports + k, 0, by] + c * u
+                            v = s * by_second[reports + k, 0, by] + c * v
+                        elif to == 5:
+                            u, v = (1.0 + errors[3]) * u, (1.0 + errors[3]) * v
+                        J[a, d + b], J[a, 3 * d + b] = -u, -v
+                    elif kind == _VELOCITY:
+                        J[a, 2 * d + b] += by_first[after, to, by]
+                        J[a, 4 * d + b] = by_second[after, to, by]
+                if kind == _READ:
+                    information[a, a] = read_sigma[k, a] ** -2.0
+                elif kind == _DRIFT:
+                    variance = of_position if to < 3 else of_turn
+                    information[a, a] = 1.0 / (drift_scale**2 * variance)
+                    chi2 += e[a] ** 2 / variance
+                elif kind == _VELOCITY:
+                    information[a, a] = steadiness[k + 2]
+            if kind == _DRIFT:
+                # Slips and late readings are no evidence of errors that are the same in every step.
+                learned, count = -1.0 / (1.0 + chi2 / (drift_scale * kernel) ** 2), own + ERRORS
+                for a in range(d):
+                    to = free[a]
+                    for b in range(ERRORS):
+                        J[a, own + b] = 0.0
+                    if to == 0:
+                        J[a, own], J[a, own + 1] = learned * (x / (1.0 + errors[0])), -learned * y
+                    elif to == 1:
+                        J[a, own], J[a, own + 1] = learned * (y / (1.0 + errors[0])), learned * x
+                    elif to == 5:
+                        J[a, own + 2] = learned * math.hypot(report[0], report[1])
+                        J[a, own + 3] = learned * report[5]
+            chi2 = 0.0
+            for a in range(d):
+                Le[a] = 0.0
+                for j in range(count):
+                    LJ[a, j] = 0.0
+                for b in range(d):
+                    Le[a] += information[a, b] * e[b]
+                    for j in range(count):
+                        LJ[a, j] += information[a, b] * J[b, j]
+                chi2 += e[a] * Le[a]
+            weight = 1.0 / (1.0 + chi2 / cauchy**2)
+            for j in range(count):
+                row = first + j if j < own else j - own
+                for a in range(d):
+                    left = weight * J[a, j]
+                    if left == 0.0:
+                        continue
+                    g[row] += left * Le[a]
+                    for i in range(count):
+                        H[row, first + i if i < own else i - own] += left * LJ[a, i]
     return drift_scale
 
 
 @compiled()
-def _add_constant_velocity(
-    moves: tuple[F64, F64, F64],
-    window: FactorWindow,
-    free: NDArray[np.intp],
-    p: SmootherParameters,
-    few: int,
-    H: F64,
-    g: F64,
-) -> None:
-    """Add factors of constant velocity for the steps that nothing else measures.
-
-    These are the steps without registration, and without odometry that continues or that jumps together with
-    a match.
-    """
-    (step, by_first, by_second), d = moves, len(free)
-    error, information = np.empty(d), np.zeros((d, d))
-    for k in range(min(few, len(step) - 1)):
-        matched, measured = 0.0, 0.0
-        for a in range(d):
-            matched += window.match_information[k + 2, a, a]
-            measured += window.motion_information[k + 2, a, a]
-        read = math.isfinite(window.read_sigma[k + 2, 0]) and (matched > 0.0 or not window.jumps[k + 2])
-        if read or measured > 0.0:
-            continue
-        before_s, seconds = max(window.seconds[k + 1], LEAST_S), max(window.seconds[k + 2], LEAST_S)
-        ratio = min(seconds, max(before_s, p.steady_s)) / before_s
-        jacobian = np.zeros((d, 5 * d))
-        _put(by_first[k], -ratio, free, 0, jacobian)
-        _put(by_second[k], -ratio, free, 2 * d, jacobian)
-        _put(by_first[k + 1], 1.0, free, 2 * d, jacobian)
-        _put(by_second[k + 1], 1.0, free, 4 * d, jacobian)
-        for a in range(d):
-            error[a] = _difference(step[k + 1], ratio, step[k], free[a])
-            information[a, a] = change_sigma(seconds, p.unsteady, p.growth) ** -2.0
-        _add(ERRORS + 2 * d * k, error, jacobian, information, np.inf, H, g, 5 * d)
-
-
-@compiled()
-def corrected(reported: F64, errors: F64) -> tuple[F64, F64, F64]:
+def corrected(
+    reported: F64, errors: F64, drift: float, drift_turn_m: float
+) -> tuple[float, float, float, float, float]:
     """Remove the systematic errors (4,) from a step (6,) that odometry reports.
 
-    Returns the step with its Jacobians with respect to the report, (6, 6), and to the errors, (6, 4).
+    Returns its x, y and turn about z, and the variances of the drift over it: of positions and of turns.
     """
-    way, distance_m = 1.0 + errors[0], math.hypot(reported[0], reported[1])
-    c, s = way * math.cos(errors[1]), way * math.sin(errors[1])
-    step, by_report, by_errors = np.empty(6), np.zeros((6, 6)), np.zeros((6, ERRORS))
-    for a in range(6):
-        step[a], by_report[a, a] = reported[a], 1.0
-    x, y = c * reported[0] - s * reported[1], s * reported[0] + c * reported[1]
-    step[0], step[1] = x, y
-    step[5] = (1.0 + errors[3]) * reported[5] + errors[2] * distance_m
-    by_report[0, 0], by_report[0, 1], by_report[1, 0], by_report[1, 1] = c, -s, s, c
-    by_report[5, 5] = 1.0 + errors[3]
-    by_errors[0, 0], by_errors[1, 0], by_errors[0, 1], by_errors[1, 1] = x / way, y / way, -y, x
-    by_errors[5, 2], by_errors[5, 3] = distance_m, reported[5]
-    return step, by_report, by_errors
-
-
-@compiled()
-def drift_variance(reported: F64, drift: float, drift_turn_m: float) -> F64:
-    """Return the variances (6,) of the drift over a step (6,)."""
+    c, s = (1.0 + errors[0]) * math.cos(errors[1]), (1.0 + errors[0]) * math.sin(errors[1])
     x, y, z, roll, pitch, yaw = reported[0], reported[1], reported[2], reported[3], reported[4], reported[5]
     distance_m = math.sqrt(x * x + y * y + z * z)
     turn_rad = math.sqrt(roll * roll + pitch * pitch + yaw * yaw)
-    variance = np.empty(6)
-    for a in range(6):
-        of_turn = drift_turn_m**2 * turn_rad if a < 3 else drift**2 * turn_rad
-        variance[a] = drift**2 * distance_m + of_turn + _LEAST_DRIFT**2
-    return variance
-
-
-@compiled()
-def change_sigma(seconds: float, unsteady: float, growth: float) -> float:
-    """Return the standard deviation, m and rad, of the change of the motion from one scan to the next."""
-    sigma: float = unsteady * seconds ** (1.0 + growth)
-    return sigma
-
-
-@compiled()
-def _put(block: F64, factor: float, free: NDArray[np.intp], column: int, jacobian: F64) -> None:
-    """Add a block (6, 6), times a factor, to a Jacobian (D, K) at a column."""
-    for a in range(len(free)):
-        for b in range(len(free)):
-            jacobian[a, column + b] += factor * block[free[a], free[b]]
-
-
-@compiled()
-def _add(
-    first: int, error: F64, jacobian: F64, information: F64, kernel: float, H: F64, g: F64, own: int
-) -> None:
-    """Add a factor to the normal equations H and g.
-
-    It depends on `own` unknowns from `first` on; the remaining columns are errors of odometry. error : (D,).
-    jacobian : (D, K). information : (D, D). kernel : scale of the Cauchy weight, standard deviations;
-    infinite: the weight is 1.
-    """
-    d, count = jacobian.shape
-    Le, LJ, chi2 = np.zeros(d), np.zeros((d, count)), 0.0
-    for a in range(d):
-        for b in range(d):
-            Le[a] += information[a, b] * error[b]
-            for k in range(count):
-                LJ[a, k] += information[a, b] * jacobian[b, k]
-        chi2 += error[a] * Le[a]
-    weight = 1.0 / (1.0 + chi2 / kernel**2)
-    for j in range(count):
-        row = first + j if j < own else j - own
-        for a in range(d):
-            left = weight * jacobian[a, j]
-            if left == 0.0:
-                continue
-            g[row] += left * Le[a]
-            for k in range(count):
-                H[row, first + k if k < own else k - own] += left * LJ[a, k]
-
-
-@compiled()
-def _product(A: F64, B: F64) -> F64:
-    """Multiply two matrices (6, 6)."""
-    result = np.zeros((6, 6))
-    for i in range(6):
-        for j in range(6):
-            for k in range(6):
-                result[i, k] += A[i, j] * B[j, k]
-    return result
-
-
-@compiled()
-def _difference(step: F64, factor: float, other: F64, direction: int) -> float:
-    """Return a component of a step (6,) minus a multiple of another step; a turn about z within half a
-    turn."""
-    difference: float = step[direction] - factor * other[direction]
-    turns = math.floor(difference / (2.0 * math.pi) + 0.5) if direction == 5 else 0.0
-    return difference - 2.0 * math.pi * turns
+    of_way = drift**2 * distance_m
+    of_position = of_way + drift_turn_m**2 * turn_rad + _LEAST_DRIFT**2
+    of_turn = of_way + drift**2 * turn_rad + _LEAST_DRIFT**2
+    turned = (1.0 + errors[3]) * yaw + errors[2] * math.hypot(x, y)
+    return c * x - s * y, s * x + c * y, turned, of_position, of_turn
