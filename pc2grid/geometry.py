@@ -77,10 +77,10 @@ class SE2:
 
     def lift(self) -> F64:
         """Return the same motion in space, (4, 4), at z = 0 and level."""
-        matrix = np.eye(4)
-        matrix[:2, :2] = self.matrix()[:2, :2]
-        matrix[:2, 3] = self.x, self.y
-        return matrix
+        c, s = math.cos(self.yaw), math.sin(self.yaw)
+        return np.array(
+            [[c, -s, 0.0, self.x], [s, c, 0.0, self.y], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+        )
 
     @staticmethod
     def fit(source_m: ArrayLike, target_m: ArrayLike) -> SE2:
@@ -111,9 +111,9 @@ def transform_points(T_target_source: F64, points_m: NDArray[np.floating]) -> F6
 
 def invert_pose(T_target_source: F64) -> F64:
     """Return the inverse of a rigid pose (4, 4)."""
-    inverse = np.eye(4)
-    inverse[:3, :3] = T_target_source[:3, :3].T
-    inverse[:3, 3] = -T_target_source[:3, :3].T @ T_target_source[:3, 3]
+    inverse, R = T_target_source.copy(), T_target_source[:3, :3].T
+    inverse[:3, :3] = R
+    inverse[:3, 3] = -R @ T_target_source[:3, 3]
     return inverse
 
 
