@@ -104,13 +104,13 @@ class SurfaceMatch:
 class _Rows:
     """The voxels of a map, one a row; `used` rows are in use.
 
-    codes : (V,) see `code_of`. moments : (V, 10). shapes : (V, 9), the mean of the points and the upper
+    codes : (V,) see `add`. moments : (V, 10). shapes : (V, 9), the mean of the points and the upper
     triangle of their information, see `fit_shapes`.
     """
 
-    codes: I64 = field(default_factory=lambda: np.zeros(0, np.int64))
-    moments: F64 = field(default_factory=lambda: np.zeros((0, 10)))
-    shapes: F64 = field(default_factory=lambda: np.zeros((0, 9)))
+    codes: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+    moments: F64 = field(default_factory=lambda: np.empty((0, 10)))
+    shapes: F64 = field(default_factory=lambda: np.empty((0, 9)))
     used: int = 0
 
     def reserve(self, more: int) -> None:
@@ -119,9 +119,9 @@ class _Rows:
         if need <= len(self.codes):
             return
         room = max(2 * len(self.codes), need, 1 << 13) - len(self.codes)
-        self.codes = np.concatenate((self.codes, np.zeros(room, np.int64)))
-        self.moments = np.concatenate((self.moments, np.zeros((room, 10))))
-        self.shapes = np.concatenate((self.shapes, np.zeros((room, 9))))
+        self.codes = np.concatenate((self.codes, np.empty(room, np.int64)))
+        self.moments = np.concatenate((self.moments, np.empty((room, 10))))
+        self.shapes = np.concatenate((self.shapes, np.empty((room, 9))))
 
     def keep(self, kept: BoolGrid) -> None:
         """Keep some (used,) of the rows."""
@@ -139,6 +139,7 @@ class VoxelShapes:
         self._least, self._most, self._noise_m = least, most, noise_m
         self._rows = _Rows()
         self._slots: NDArray[np.int32] = np.full(1 << 15, -1, np.int32)
+        self._entered = 0  # rows that the slots hold
 
     def __len__(self) -> int:
         """Return the number of voxels in use."""
@@ -151,43 +152,45 @@ class VoxelShapes:
 
     def add(self, points_m: F64) -> None:
         """Add points (N, 3), in the frame of the map."""
+        rows, touched = self._rows, np.unique(self.enter(points_m))
+        fit_shapes(rows.codes, rows.moments, rows.shapes, touched, self.edge_m, self._least, self._noise_m)
+
+    def enter(self, points_m: F64) -> I64:
+        """Add points (N, 3) to the moments alone; return the row (N,) of the voxel of each."""
         rows = self._rows
         rows.reserve(len(points_m))
-        if len(self._slots) < 3 * (rows.used + len(points_m)):
-            self._slots = np.empty(4 * len(self._slots), np.int32)
-            rebuild(self._slots, rows.codes, rows.used)
+        size = 1 << (3 * (rows.used + len(points_m))).bit_length()
+        if len(self._slots) < size:
+            self._slots, self._entered = np.full(size, -1, np.int32), 0
         touched = np.empty(len(points_m), np.int64)
-        rows.used = add(
-            self._slots, rows.codes, rows.moments, rows.used, points_m, self.edge_m, self._most, touched
-        )
-        fit_shapes(
-            rows.codes, rows.moments, rows.shapes, np.unique(touched), self.edge_m, self._least, self._noise_m
-        )
+        rows.used = self._entered = add(
+            self._slots, rows.codes, rows.moments, self._entered, rows.used, points_m, self.edge_m,
+            self._most, touched,
+        )  # fmt: skip
+        return touched
 
     def forget_beyond(self, center_m: F64, reach_m: float) -> None:
         """Forget the voxels farther than `reach_m` from a place (3,)."""
         away = self.shapes[:, :3] - center_m
         self._rows.keep(np.einsum("ij,ij->i", away, away) < reach_m**2)
-        rebuild(self._slots, self._rows.codes, self._rows.used)
+        self._slots[:], self._entered = -1, 0
+        self.enter(np.empty((0, 3)))
 
     def equations(
         self, points_m: F64, weights: F64, pose: F64, scale_m: float
     ) -> tuple[F64, F64, float, float]:
         """Linearise the distances of points (N, 3) in a change of their pose (4, 4), in its own axes.
 
-        See `normal_equations` for the results.
+        Returns H (6, 6) and g (6,) of the step H d = -g, the number of points with a shape, and the sum of
+        their distances.
         """
-        rows = self._rows
-        H, g, found, distance_m = normal_equations(
-            self._slots,
-            rows.codes,
-            rows.shapes,
-            points_m,
-            weights,
+        rows, H, g, J, room = self._rows, np.zeros((6, 6)), np.zeros(6), np.eye(3, 6), np.empty((3, 8))
+        found, distance_m = normal_equations(
+            self._slots, rows.codes, rows.shapes, points_m, weights,
             np.ascontiguousarray(pose),  # or the kernel is compiled twice
-            self.edge_m,
-            scale_m,
-        )
+            self.edge_m, scale_m, H, g, J, room,
+        )  # fmt: skip
+        H = H + np.triu(H, 1).T
         R = np.zeros((6, 6))
         R[:3, :3] = R[3:, 3:] = pose[:3, :3]
         return R.T @ H @ R, R.T @ g, found, distance_m
@@ -227,8 +230,10 @@ class SurfaceMap:
 
     def thinned(self, points_m: F32) -> F64:
         """Downsample the points (N, 3) of a scan to about one for each half voxel."""
-        chosen = first_per_voxel(points_m, self._parameters.thinning * self.fine.edge_m)
-        return points_m[chosen].astype(np.float64)
+        p, points = self._parameters, points_m.astype(np.float64)
+        rows = VoxelShapes(p.thinning * self.fine.edge_m, p.least, p.most, p.noise_m).enter(points)
+        # The rows are numbered by the first of their points.
+        return points[np.diff(np.maximum.accumulate(rows), prepend=-1) > 0]
 
     def alone(self, points_m: F64) -> F64:
         """Return the shapes (V, 9) of the surfaces in points (N, 3) alone."""
@@ -317,7 +322,7 @@ class SurfaceMap:
             information,
             found / max(len(points_m), 1),
             distance_m / max(found, 1.0),
-            weakest(information, 3) > p.least_points * unit,
+            weakest(information) > p.least_points * unit,
         )
 
 
@@ -343,10 +348,29 @@ def _displacement(points_m: F64) -> F64:
     return mean + 1e-9 * np.eye(6)
 
 
-@compiled(inline="always")
-def code_of(i: int, j: int, k: int) -> int:
-    """Return the three indices of a voxel, each within a million of zero, as one number."""
-    return ((i + HALF_VOXELS) << (2 * AXIS_BITS)) | ((j + HALF_VOXELS) << AXIS_BITS) | (k + HALF_VOXELS)
+_MATRIX = np.array([4, 5, 6, 5, 7, 8, 6, 8, 9])
+"""Columns of the second moments, as a symmetric matrix (3, 3) row by row."""
+
+
+def fit_shapes(
+    codes: I64, moments: F64, shapes: F64, rows: I64, edge: float, least: float, noise: float
+) -> None:
+    """Write mean and information (V, 9) of the voxels in `rows`; zero where there are too few points.
+
+    The information is the constraint of a point in each direction, 0..1: s^2 / (v + s^2) for a variance v of
+    the points along it and a noise s, less that of the widest direction. So a plane constrains along its
+    normal, an edge across its line, and a ball not at all.
+    """
+    code, count = codes[rows, None] >> np.array([2 * AXIS_BITS, AXIS_BITS, 0]), moments[rows, :1]
+    mean = moments[rows, 1:4] / count
+    shapes[rows, :3] = mean + ((code & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
+    shapes[rows, 3:] = 0.0
+    some = count[:, 0] >= least
+    C = (moments[rows[some]][:, _MATRIX] / count[some]).reshape(-1, 3, 3)
+    variances, axes = np.linalg.eigh(C - mean[some, :, None] * mean[some, None])
+    held = noise**2 / (np.maximum(variances, 0.0) + noise**2)
+    information = (axes * (held - held[:, 2:])[:, None]) @ axes.swapaxes(1, 2)
+    shapes[rows[some], 3:] = information.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
 
 
 @compiled(inline="always")
@@ -361,18 +385,11 @@ def _slot(slots: NDArray[np.int32], codes: I64, code: int) -> int:
 
 
 @compiled()
-def rebuild(slots: NDArray[np.int32], codes: I64, used: int) -> None:
-    """Enter the first `used` rows into `slots`, which is overwritten."""
-    slots[:] = -1
-    for row in range(used):
-        slots[_slot(slots, codes, codes[row])] = row
-
-
-@compiled()
 def add(
     slots: NDArray[np.int32],
     codes: I64,
     moments: F64,
+    entered: int,
     used: int,
     points: F64,
     edge: float,
@@ -381,14 +398,18 @@ def add(
 ) -> int:
     """Add points (N, 3) to the moments (V, 10) of their voxels: number, sums and second moments.
 
-    Coordinates are relative to the corner of the voxel. A voxel with more than `most` points forgets old ones
-    in proportion. `touched` (N,) gets the row of each point. Returns the number of rows in use.
+    A code is the three indices of a voxel, each within a million of zero, as one number. Rows from `entered`
+    to before `used` are entered into the slots first. Coordinates are relative to the corner of the voxel. A
+    voxel with more than `most` points forgets old ones in proportion. `touched` (N,) gets the row of each
+    point. Returns the number of rows in use.
     """
+    for row in range(entered, used):
+        slots[_slot(slots, codes, codes[row])] = row
     for n in range(len(points)):
         i = math.floor(points[n, 0] / edge)
         j = math.floor(points[n, 1] / edge)
         k = math.floor(points[n, 2] / edge)
-        code = code_of(i, j, k)
+        code = ((i + HALF_VOXELS) << (2 * AXIS_BITS)) | ((j + HALF_VOXELS) << AXIS_BITS) | (k + HALF_VOXELS)
         slot = _slot(slots, codes, code)
         row = slots[slot]
         if row < 0:
@@ -396,11 +417,14 @@ def add(
             used += 1
             slots[slot] = row
             codes[row] = code
-            moments[row] = 0.0
-        if moments[row, 0] >= most:
-            moments[row] *= (most - 1.0) / moments[row, 0]
-        x, y, z = points[n, 0] - i * edge, points[n, 1] - j * edge, points[n, 2] - k * edge
+            for c in range(10):
+                moments[row, c] = 0.0
         m = moments[row]
+        if m[0] >= most:
+            kept = (most - 1.0) / m[0]
+            for c in range(10):
+                m[c] *= kept
+        x, y, z = points[n, 0] - i * edge, points[n, 1] - j * edge, points[n, 2] - k * edge
         m[0] += 1.0
         m[1] += x
         m[2] += y
@@ -415,67 +439,8 @@ def add(
     return used
 
 
-@compiled()
-def fit_shapes(
-    codes: I64, moments: F64, shapes: F64, rows: I64, edge: float, least: float, noise: float
-) -> None:
-    """Write mean and information (V, 9) of the voxels in `rows`; zero where there are too few points.
-
-    The information is the constraint of a point in each direction, 0..1: s^2 / (v + s^2) for a variance v of
-    the points along it and a noise s, less that of the widest direction. So a plane constrains along its
-    normal, an edge across its line, and a ball not at all.
-    """
-    C = np.empty((3, 3))
-    for row in rows:
-        m, shape = moments[row], shapes[row]
-        n, code = m[0], codes[row]
-        x, y, z = m[1] / n, m[2] / n, m[3] / n
-        shape[0] = x + (((code >> (2 * AXIS_BITS)) & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
-        shape[1] = y + (((code >> AXIS_BITS) & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
-        shape[2] = z + ((code & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
-        shape[3:] = 0.0
-        if n < least:
-            continue
-        C[0, 0] = m[4] / n - x * x
-        C[0, 1] = C[1, 0] = m[5] / n - x * y
-        C[0, 2] = C[2, 0] = m[6] / n - x * z
-        C[1, 1] = m[7] / n - y * y
-        C[1, 2] = C[2, 1] = m[8] / n - y * z
-        C[2, 2] = m[9] / n - z * z
-        values, axes = np.linalg.eigh(C)
-        widest = noise * noise / (max(values[2], 0.0) + noise * noise)
-        for axis in range(2):
-            held = noise * noise / (max(values[axis], 0.0) + noise * noise) - widest
-            u, v, w = axes[0, axis], axes[1, axis], axes[2, axis]
-            shape[3] += held * u * u
-            shape[4] += held * u * v
-            shape[5] += held * u * w
-            shape[6] += held * v * v
-            shape[7] += held * v * w
-            shape[8] += held * w * w
-
-
-@compiled()
-def first_per_voxel(points: F32, edge: float) -> NDArray[np.int64]:
-    """Return the indices of the first of points (N, 3) in each voxel, in order."""
-    size = 1 << 12
-    while size < 3 * len(points):
-        size *= 2
-    slots = np.full(size, -1, np.int32)
-    codes = np.empty(len(points), np.int64)
-    kept = np.empty(len(points), np.int64)
-    used = 0
-    for n in range(len(points)):
-        code = code_of(
-            math.floor(points[n, 0] / edge), math.floor(points[n, 1] / edge), math.floor(points[n, 2] / edge)
-        )
-        slot = _slot(slots, codes, code)
-        if slots[slot] < 0:
-            slots[slot] = used
-            codes[used] = code
-            kept[used] = n
-            used += 1
-    return kept[:used]
+_ROW = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]])
+"""Columns of a shape that hold its information, as a symmetric matrix."""
 
 
 @compiled()
@@ -488,22 +453,20 @@ def normal_equations(
     pose: F64,
     edge: float,
     scale: float,
-) -> tuple[F64, F64, float, float]:
+    H: F64,
+    g: F64,
+    J: F64,
+    room: F64,
+) -> tuple[float, float]:
     """Linearise the distances of points (N, 3) from the shapes (V, 9) of the voxels around them.
 
     pose : (4, 4). A point meets the shape whose mean is nearest, of its own voxel and the 26 around it. scale
     : of the Cauchy weight of a distance. weights : (N,) inverse variances of the points, relative. The
     unknowns are the shift and the rotation vector of the placed points about the origin of the base.
 
-    Returns H (6, 6) and g (6,) of the step H d = -g, the number of points with a shape, and the sum of their
-    distances.
+    Adds to the upper triangle of H (6, 6) and to g (6,), and returns the number of points with a shape, and
+    the sum of their distances. J : (3, 6), the identity and zeros; it and `room` (3, 8) are written to.
     """
-    H, g = np.zeros((6, 6)), np.zeros(6)
-    J = np.zeros((3, 6))
-    J[0, 0] = J[1, 1] = J[2, 2] = 1.0
-    W = np.empty((3, 3))
-    d = np.empty(3)
-    WJ = np.empty((3, 6))
     found, total = 0.0, 0.0
     for n in range(len(points)):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]
@@ -512,11 +475,12 @@ def normal_equations(
         rz = pose[2, 0] * px + pose[2, 1] * py + pose[2, 2] * pz
         x, y, z = rx + pose[0, 3], ry + pose[1, 3], rz + pose[2, 3]
         i, j, k = math.floor(x / edge), math.floor(y / edge), math.floor(z / edge)
+        code = ((i + HALF_VOXELS) << (2 * AXIS_BITS)) | ((j + HALF_VOXELS) << AXIS_BITS) | (k + HALF_VOXELS)
         best, best_row = 2.25 * edge * edge, -1
         for a in range(-1, 2):
             for b in range(-1, 2):
                 for c in range(-1, 2):
-                    row = slots[_slot(slots, codes, code_of(i + a, j + b, k + c))]
+                    row = slots[_slot(slots, codes, code + (a << (2 * AXIS_BITS)) + (b << AXIS_BITS) + c)]
                     if row < 0 or shapes[row, 3] + shapes[row, 6] + shapes[row, 8] <= 0.0:
                         continue
                     dx, dy, dz = x - shapes[row, 0], y - shapes[row, 1], z - shapes[row, 2]
@@ -525,30 +489,29 @@ def normal_equations(
                         best, best_row = apart, row
         if best_row < 0:
             continue
-        s = shapes[best_row]
-        d[0], d[1], d[2] = x - s[0], y - s[1], z - s[2]
-        W[0, 0], W[0, 1], W[0, 2] = s[3], s[4], s[5]
-        W[1, 0], W[1, 1], W[1, 2] = s[4], s[6], s[7]
-        W[2, 0], W[2, 1], W[2, 2] = s[5], s[7], s[8]
-        wx = W[0, 0] * d[0] + W[0, 1] * d[1] + W[0, 2] * d[2]
-        wy = W[1, 0] * d[0] + W[1, 1] * d[1] + W[1, 2] * d[2]
-        wz = W[2, 0] * d[0] + W[2, 1] * d[1] + W[2, 2] * d[2]
-        squared = d[0] * wx + d[1] * wy + d[2] * wz
-        weight = weights[n] / (1.0 + squared / (scale * scale))
+        room[0, 7], room[1, 7], room[2, 7] = (
+            x - shapes[best_row, 0],
+            y - shapes[best_row, 1],
+            z - shapes[best_row, 2],
+        )
         J[0, 4], J[0, 5] = rz, -ry
         J[1, 3], J[1, 5] = -rz, rx
         J[2, 3], J[2, 4] = ry, -rx
+        squared = 0.0
         for a in range(3):
+            p, q, r = shapes[best_row, _ROW[a, 0]], shapes[best_row, _ROW[a, 1]], shapes[best_row, _ROW[a, 2]]
             for b in range(6):
-                WJ[a, b] = weight * (W[a, 0] * J[0, b] + W[a, 1] * J[1, b] + W[a, 2] * J[2, b])
-        wx, wy, wz = weight * wx, weight * wy, weight * wz
+                room[a, b] = p * J[0, b] + q * J[1, b] + r * J[2, b]
+            room[a, 6] = p * room[0, 7] + q * room[1, 7] + r * room[2, 7]
+            squared += room[a, 7] * room[a, 6]
+        weight = weights[n] / (1.0 + squared / (scale * scale))
+        for a in range(3):
+            for b in range(7):
+                room[a, b] *= weight
         for a in range(6):
-            g[a] += J[0, a] * wx + J[1, a] * wy + J[2, a] * wz
+            g[a] += J[0, a] * room[0, 6] + J[1, a] * room[1, 6] + J[2, a] * room[2, 6]
             for b in range(a, 6):
-                H[a, b] += J[0, a] * WJ[0, b] + J[1, a] * WJ[1, b] + J[2, a] * WJ[2, b]
+                H[a, b] += J[0, a] * room[0, b] + J[1, a] * room[1, b] + J[2, a] * room[2, b]
         found += 1.0
         total += math.sqrt(squared)
-    for a in range(6):
-        for b in range(a):
-            H[a, b] = H[b, a]
-    return H, g, found, total
+    return found, total

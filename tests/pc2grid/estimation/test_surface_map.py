@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pc2grid.estimation import surface_map
 from pc2grid.estimation.line_map import weakest
 from pc2grid.estimation.smoother import SPATIAL, PoseWithCovariance
-from pc2grid.estimation.surface_map import SurfaceMap
+from pc2grid.estimation.surface_map import SURFACES, SurfaceMap
 from pc2grid.geometry import F64, invert_pose, motion_size, pose_from_rotation_vector, transform_points
 from pc2grid.settings import RegistrationConfig
 
@@ -81,7 +80,7 @@ def test_what_only_seems_to_be_held_is_not() -> None:
         surfaces, weights = seen(first), np.ones(len(middle))
         placed = surfaces.match(middle, weights, np.eye(4), held(np.eye(4), 1.0))
         truly = surfaces.observable(middle, weights, placed)
-        left = weakest(truly.information, 3) / weakest(placed.information, 3)
+        left = weakest(truly.information) / weakest(placed.information)
         return placed.measured, truly.measured, left
 
     assert after((0, 2)) == (True, False, pytest.approx(0.0, abs=1e-6))
@@ -134,4 +133,5 @@ def test_the_equations_are_those_of_points_and_planes() -> None:
 
 def test_the_first_point_of_each_voxel_is_kept() -> None:
     points = np.array([(0.1, 0.1, 0.1), (0.2, 0.2, 0.2), (1.1, 0.1, 0.1), (-0.1, 0.1, 0.1)], np.float32)
-    assert surface_map.first_per_voxel(points, 1.0).tolist() == [0, 2, 3]
+    voxels_of_1_m = SurfaceMap(1.0 / SURFACES.thinning, 20.0, RegistrationConfig())
+    assert np.array_equal(voxels_of_1_m.thinned(points), points[[0, 2, 3]])
