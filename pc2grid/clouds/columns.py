@@ -104,13 +104,9 @@ class ColumnMap:
             self._seen[:] = 0
             self._touched[:] = 0
         cell, margin = (edge_m, p.layer_m), (p.margin_m, p.margin_sigmas * self._noise_per_m2)
-        observe_points(
-            self._evidence, self._seen, self._touched, self._sums, self._low, points_m, cell,
-            self._band_m(floor_m), self._stamp, p.hit, p.limits[1],
-        )  # fmt: skip
-        observe_rays(
-            self._evidence, self._seen, self._touched, self._low, rays_m, sensor_m, cell, margin,
-            self._stamp, p.miss, p.limits[0],
+        observe(
+            self._evidence, self._seen, self._touched, self._sums, self._low, points_m, rays_m, sensor_m,
+            cell, self._band_m(floor_m), margin, self._stamp, p.hit, p.miss, p.limits,
         )  # fmt: skip
         same_floor = abs(floor_m - self._floor_m) < 0.5 * p.layer_m
         if not same_floor:
@@ -198,59 +194,63 @@ class ColumnMap:
             self._low = low
         slack = np.array([size // 10, size // 10, p.layers // 10])
         if (np.abs(low - self._low) > slack).any():
-            clear(self._evidence, self._sums, self._low, low)
-            self._low = low
+            self._forget(low)
             self._floor_m = math.nan  # states are made again
+
+    def _forget(self, low: I64) -> None:
+        """Forget the cells that leave the window when its lowest indices (3,) become `low`."""
+        for axis, size in enumerate(self._evidence.shape):
+            cells = np.arange(low[axis], low[axis] + size)
+            leaves = cells[np.abs(cells - self._low[axis] - 0.5 * (size - 1)) > 0.5 * size] % size
+            np.moveaxis(self._evidence, axis, 0)[leaves] = 0
+            if axis < 2:
+                np.moveaxis(self._sums, axis, 0)[leaves] = 0.0
+        self._low = low
 
 
 # --- compiled functions -------------------------------------------------------------------------------
 
 
 @compiled()
-def clear(evidence: NDArray[np.int8], sums: F32, low: I64, new: I64) -> None:
-    """Forget the cells that leave the window when its lowest indices (3,) change from `low` to `new`."""
-    size, layers = evidence.shape[0], evidence.shape[2]
-    for i in range(new[0], new[0] + size):
-        for j in range(new[1], new[1] + size):
-            if not (low[0] <= i < low[0] + size and low[1] <= j < low[1] + size):
-                evidence[i % size, j % size] = 0
-                sums[i % size, j % size] = 0.0
-    for k in range(new[2], new[2] + layers):
-        if not low[2] <= k < low[2] + layers:
-            evidence[:, :, k % layers] = 0
-
-
-@compiled()
-def observe_points(
+def observe(
     evidence: NDArray[np.int8],
     seen: NDArray[np.uint8],
     touched: NDArray[np.uint8],
     sums: F32,
     low: I64,
     points: F64,
+    rays: F64,
+    sensor: F64,
     cell: tuple[float, float],
     band: tuple[float, float],
+    margin: tuple[float, float],
     stamp: int,
     hit: int,
-    most: int,
+    miss: int,
+    limits: tuple[int, int],
 ) -> None:
-    """Enter a hit where the points (N, 3) of a scan lie, one a cell and scan.
+    """Enter a hit where the points (N, 3) of a scan lie, one a cell and scan, and then a miss along its rays
+    to points (M, 3) where it has no hit.
 
     evidence, seen : (W, W, L), `seen` is the stamp of the last scan that entered a cell. touched : (W, W) the
     same of columns. sums : (W, W, 3) sums of x and y, relative to the column's corner, of the points in the
-    band, and their number. cell : edge and height of a cell. band : lowest and highest z of an obstacle.
+    band, and their number. sensor : (3,) origin of the rays. cell : edge and height of a cell. band : lowest
+    and highest z of an obstacle. margin : (a, b), a ray ends a + b * range^2 before its point. limits : of
+    the evidence.
     """
     size, layers = evidence.shape[0], evidence.shape[2]
     edge, height = cell
     for n in range(len(points)):
         i, j = math.floor(points[n, 0] / edge), math.floor(points[n, 1] / edge)
         k = math.floor(points[n, 2] / height)
-        if not (_within(low, size, i, j) and low[2] <= k < low[2] + layers):
+        if not (
+            low[0] <= i < low[0] + size and low[1] <= j < low[1] + size and low[2] <= k < low[2] + layers
+        ):
             continue
         a, b, c = i % size, j % size, k % layers
         if seen[a, b, c] != stamp:
             seen[a, b, c] = stamp
-            evidence[a, b, c] = min(evidence[a, b, c] + hit, most)
+            evidence[a, b, c] = min(evidence[a, b, c] + hit, limits[1])
             touched[a, b] = stamp
         if band[0] <= points[n, 2] <= band[1]:
             if sums[a, b, 2] >= 200.0:
@@ -260,27 +260,6 @@ def observe_points(
             sums[a, b, 1] += points[n, 1] - j * edge
             sums[a, b, 2] += 1.0
 
-
-@compiled()
-def observe_rays(
-    evidence: NDArray[np.int8],
-    seen: NDArray[np.uint8],
-    touched: NDArray[np.uint8],
-    low: I64,
-    rays: F64,
-    sensor: F64,
-    cell: tuple[float, float],
-    margin: tuple[float, float],
-    stamp: int,
-    miss: int,
-    least: int,
-) -> None:
-    """Enter a miss along the rays of a scan to points (M, 3) where it has no hit, one a cell and scan.
-
-    The others as for `observe_points`. margin : (a, b), a ray ends a + b * range^2 before its point.
-    """
-    size, layers = evidence.shape[0], evidence.shape[2]
-    edge, height = cell
     x, y, z = sensor[0] / edge - low[0], sensor[1] / edge - low[1], sensor[2] / height - low[2]
     first_a, first_b, first_c = low[0] % size, low[1] % size, low[2] % layers
     for n in range(len(rays)):
@@ -300,7 +279,7 @@ def observe_rays(
             c -= layers * (c >= layers)
             if seen[a, b, c] != stamp:
                 seen[a, b, c] = stamp
-                evidence[a, b, c] = max(evidence[a, b, c] - miss, least)
+                evidence[a, b, c] = max(evidence[a, b, c] - miss, limits[0])
                 touched[a, b] = stamp
 
 
@@ -333,47 +312,27 @@ def classify(
     ground = max(ground[0], low[2]), min(ground[1], low[2] + layers)
     for a in range(size):
         for b in range(size):
-            if stamp == 0 or touched[a, b] == stamp:
-                measured = sums[a, b, 2] > 0
-                state[a, b], heights[a, b] = _column(
-                    evidence[a, b], ground, band, borders, share, least, over, measured
-                )
-
-
-@compiled()
-def _column(
-    evidence: NDArray[np.int8],
-    ground: tuple[int, int],
-    band: tuple[int, int],
-    borders: tuple[int, int],
-    share: float,
-    least: int,
-    over: int,
-    measured: bool,
-) -> tuple[int, int]:
-    """Return the state and the heights of a column from the evidence (L,) in its cells.
-
-    ground, band : first layer, and the layer behind the last one, of the floor and of obstacles. measured :
-    True if points in the band locate the wall.
-    """
-    layers = len(evidence)
-    occupied, free, passed_over = 0, 0, 0
-    filled, empty = 0, 0
-    for k in range(band[0], band[1]):
-        value = evidence[k % layers]
-        slice_bit = 1 << ((k >= borders[0]) + (k >= borders[1]))
-        filled |= slice_bit * (value > 0)
-        empty |= slice_bit * (value < 0)
-        occupied += value > 0
-        free += value < 0
-        passed_over = 0 if value > 0 else passed_over + (value < 0)
-    if occupied:
-        tall = occupied >= least and passed_over < over
-        is_wall = tall and measured and occupied >= share * (occupied + free)
-        return WALL if is_wall else LOW, filled | (empty & ~filled) << SLICES
-    for k in range(ground[0], ground[1]):
-        free += evidence[k % layers] > 0
-    return FREE if free else UNKNOWN, 0
+            if stamp != 0 and touched[a, b] != stamp:
+                continue
+            occupied, free, passed_over, filled, empty = 0, 0, 0, 0, 0
+            for k in range(band[0], band[1]):
+                value = evidence[a, b, k % layers]
+                slice_bit = 1 << ((k >= borders[0]) + (k >= borders[1]))
+                filled |= slice_bit * (value > 0)
+                empty |= slice_bit * (value < 0)
+                occupied += value > 0
+                free += value < 0
+                passed_over = 0 if value > 0 else passed_over + (value < 0)
+            heights[a, b] = 0
+            if occupied:
+                tall = occupied >= least and passed_over < over
+                # Points in the band locate a wall.
+                is_wall = tall and sums[a, b, 2] > 0 and occupied >= share * (occupied + free)
+                state[a, b], heights[a, b] = WALL if is_wall else LOW, filled | (empty & ~filled) << SLICES
+                continue
+            for k in range(ground[0], ground[1]):
+                free += evidence[a, b, k % layers] > 0
+            state[a, b] = FREE if free else UNKNOWN
 
 
 @compiled()
@@ -398,107 +357,60 @@ def view(
     3), by increasing bearing, and the middles (K, 2) of the low columns that were passed, each once.
     """
     size = state.shape[0]
-    free_m = np.zeros(bearings)
-    walls = np.empty((bearings, 3))
-    passed = np.zeros((size, size), np.uint8)
-    found = 0
-    lows = np.empty((size * size, 2))
-    count = 0
+    free_m, walls, lows = np.zeros(bearings), np.empty((bearings, 3)), np.empty((size * size, 2))
+    passed = np.zeros((size, size), np.uint8)  # low columns
+    found, count = 0, 0
+    x, y = origin[0] / edge - low[0], origin[1] / edge - low[1]
     for bearing in range(bearings):
         angle = turn + bearing * (2.0 * math.pi / bearings)
-        along = (math.cos(angle), math.sin(angle))
-        free, first, count = _first_wall(state, low, origin, along, reach, edge, gap, passed, lows, count)
-        if first >= 0.0:
-            if first - free <= gap:
-                free = max(first - 0.5 * edge, free)
-            thick = depth[0] + depth[1] * first * first
-            sx, sy, total = _wall(state, sums, low, origin, along, first, thick, reach, edge)
-            walls[found, 0], walls[found, 1], walls[found, 2] = sx, sy, total
-            found += 1
-        free_m[bearing] = free
-    return free_m, walls[:found].copy(), lows[:count].copy()
-
-
-@compiled()
-def _first_wall(
-    state: NDArray[np.uint8],
-    low: I64,
-    origin: F64,
-    along: tuple[float, float],
-    reach: float,
-    edge: float,
-    gap: float,
-    passed: NDArray[np.uint8],
-    lows: F64,
-    count: int,
-) -> tuple[float, float, int]:
-    """Return the free range of a bearing, the range of its first wall (-1: none), and the count of low
-    columns.
-
-    passed : (W, W), 1 for low columns that were passed before. lows : gets the middles of the others.
-    """
-    size = state.shape[0]
-    x, y = origin[0] / edge - low[0], origin[1] / edge - low[1]
-    dx, dy = along[0] / edge, along[1] / edge
-    free, known = 0.0, False
-    last_i, last_j = -1, -1
-    r = 0.0
-    while r < reach:
-        r += 0.5 * edge
-        i, j = math.floor(x + r * dx), math.floor(y + r * dy)
-        if i == last_i and j == last_j:
-            continue
-        last_i, last_j = i, j
-        if not (0 <= i < size and 0 <= j < size):
-            break
-        a, b = (i + low[0]) % size, (j + low[1]) % size
-        if state[a, b] == WALL:
-            return free, r, count
-        if state[a, b] == UNKNOWN:
-            if known and r - free > gap:
+        along_x, along_y = math.cos(angle), math.sin(angle)
+        dx, dy = along_x / edge, along_y / edge
+        free, known, is_wall, last_i, last_j, r = 0.0, False, False, -1, -1, 0.0
+        while r < reach and not is_wall:
+            r += 0.5 * edge
+            i, j = math.floor(x + r * dx), math.floor(y + r * dy)
+            if i == last_i and j == last_j:
+                continue
+            last_i, last_j = i, j
+            if not (0 <= i < size and 0 <= j < size):
                 break
+            a, b = (i + low[0]) % size, (j + low[1]) % size
+            is_wall = state[a, b] == WALL
+            if state[a, b] == UNKNOWN:
+                if known and r - free > gap:
+                    break
+            elif not is_wall:
+                known, free = True, r
+                if state[a, b] == LOW and not passed[a, b]:
+                    passed[a, b] = 1
+                    lows[count, 0], lows[count, 1] = (low[0] + i + 0.5) * edge, (low[1] + j + 0.5) * edge
+                    count += 1
+        free_m[bearing] = free
+        if not is_wall:
             continue
-        known, free = True, r
-        if state[a, b] == LOW and not passed[a, b]:
-            passed[a, b] = 1
-            lows[count, 0], lows[count, 1] = (low[0] + i + 0.5) * edge, (low[1] + j + 0.5) * edge
-            count += 1
-    return free, -1.0, count
-
-
-@compiled()
-def _wall(
-    state: NDArray[np.uint8],
-    sums: F32,
-    low: I64,
-    origin: F64,
-    along: tuple[float, float],
-    first: float,
-    thick: float,
-    reach: float,
-    edge: float,
-) -> tuple[float, float, float]:
-    """Return the sums of x, y and 1 of the points of a wall of the thickness `thick` that begins at range
-    `first`.
-    """
-    size = state.shape[0]
-    sx = sy = total = 0.0
-    last_a, last_b = -1, -1
-    r = first
-    while True:
-        i, j = math.floor((origin[0] + r * along[0]) / edge), math.floor((origin[1] + r * along[1]) / edge)
-        a, b = i % size, j % size
-        new = a != last_a or b != last_b
-        last_a, last_b = a, b
-        if not _within(low, size, i, j) or (new and r - first > thick):
-            return sx, sy, total
-        if new and state[a, b] == WALL:
-            total += sums[a, b, 2]
-            sx += sums[a, b, 0] + i * edge * sums[a, b, 2]
-            sy += sums[a, b, 1] + j * edge * sums[a, b, 2]
-        if r >= reach:
-            return sx, sy, total
-        r += 0.5 * edge
+        if r - free <= gap:
+            free_m[bearing] = max(r - 0.5 * edge, free)
+        first, thick = r, depth[0] + depth[1] * r * r
+        sx = sy = total = 0.0
+        last_i, last_j = -1, -1  # of a column in the window, as its state is looked up
+        while True:
+            i, j = math.floor((origin[0] + r * along_x) / edge), math.floor((origin[1] + r * along_y) / edge)
+            a, b = i % size, j % size
+            new = a != last_i or b != last_j
+            last_i, last_j = a, b
+            outside = i < low[0] or i >= low[0] + size or j < low[1] or j >= low[1] + size
+            if outside or (new and r - first > thick):
+                break
+            if new and state[a, b] == WALL:
+                total += sums[a, b, 2]
+                sx += sums[a, b, 0] + i * edge * sums[a, b, 2]
+                sy += sums[a, b, 1] + j * edge * sums[a, b, 2]
+            if r >= reach:
+                break
+            r += 0.5 * edge
+        walls[found, 0], walls[found, 1], walls[found, 2] = sx, sy, total
+        found += 1
+    return free_m, walls[:found].copy(), lows[:count].copy()
 
 
 @compiled()
@@ -531,10 +443,3 @@ def agreement_counts(
         elif here < 0:
             against += 1
     return met, against, inside
-
-
-@compiled()
-def _within(low: I64, size: int, i: int, j: int) -> bool:
-    """Return True if the column (i, j) of the map is in the window."""
-    inside: bool = low[0] <= i < low[0] + size and low[1] <= j < low[1] + size
-    return inside

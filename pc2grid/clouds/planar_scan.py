@@ -212,8 +212,14 @@ def heights_seen(
     the bearing: along a wall rays pass beside it.
     """
 
+    away = points_m[:, :2] - sensor_m[:2]
+    bearing = np.floor(np.arctan2(away[:, 1], away[:, 0]) * (_BEARINGS / (2.0 * math.pi))).astype(np.int16)
+    bearing %= _BEARINGS
+    order = np.argsort(bearing, kind="stable")  # of numbers this short: by counting
+    starts = np.searchsorted(bearing[order], np.arange(_BEARINGS + 1))
+    ranges = np.hypot(away[:, 0], away[:, 1])
     return _compiled_heights(
-        at_m, points_m, sensor_m, plane, band_m, depths, np.array(SLICE_BORDERS_M), _BEARINGS
+        at_m, points_m, ranges, order, starts, sensor_m, plane, band_m, depths, SLICE_BORDERS_M
     )
 
 
@@ -278,11 +284,16 @@ def scan_bearings(
 
     Measured: 0.6 ms instead of 23 ms a scan of a lidar, 0.015 instead of 0.7 ms of a planar laser.
     """
-    nearest, reach = np.empty(bearings), np.empty(bearings)
-    for b in range(bearings):
-        nearest[b], reach[b] = math.inf, 0.0
     count = points.shape[0]
-    bearing_of, ranges = np.empty(count, dtype=np.int32), np.empty(count)
+    nearest, reach, ranges = np.empty(bearings), np.empty(bearings), np.empty(count)
+    order, starts, filled = (
+        np.empty(count, np.int64),
+        np.empty(bearings + 1, np.int64),
+        np.empty(bearings, np.int64),
+    )
+    bearing_of = np.empty(count, np.int64)
+    for b in range(bearings):
+        nearest[b], reach[b], filled[b] = math.inf, 0.0, 0
     sensor_height = plane[0] * sensor[0] + plane[1] * sensor[1] + plane[2] * sensor[2] + plane[3]
     for k in range(count):
         px, py = float(points[k, 0]), float(points[k, 1])
@@ -301,28 +312,12 @@ def scan_bearings(
             nearest[bearing] = min(nearest[bearing], distance)
             if distance <= limit:
                 bearing_of[k] = bearing
-    order, starts = _by_bearing(bearing_of, ranges, bearings)
-    return nearest, reach, _surfaces(points, ranges, order, starts, depths)
-
-
-@compiled()
-def _by_bearing(
-    bearing_of: NDArray[np.int32], ranges: F64, bearings: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sort the points with a bearing (not -1) by bearing and range; returns their order and the start of each
-    bearing.
-    """
-    starts = np.zeros(bearings + 1, dtype=np.int64)
-    for bearing in bearing_of:
-        if bearing >= 0:
-            starts[bearing + 1] += 1
-    filled = np.empty(bearings + 1, dtype=np.int64)
-    filled[0] = 0
+                filled[bearing] += 1
+    starts[0] = 0
     for b in range(bearings):
-        starts[b + 1] += starts[b]
-        filled[b + 1] = starts[b + 1]
-    order = np.empty(starts[bearings], dtype=np.int64)
-    for k in range(len(bearing_of)):
+        starts[b + 1] = starts[b] + filled[b]
+        filled[b] = starts[b]
+    for k in range(count):
         bearing = bearing_of[k]
         if bearing >= 0:
             place = filled[bearing]  # insertion sort by range: one bearing has a few dozen points
@@ -331,32 +326,19 @@ def _by_bearing(
                 place -= 1
             order[place] = k
             filled[bearing] += 1
-    return order, starts
-
-
-@compiled()
-def _surfaces(
-    points: F32,
-    ranges: F64,
-    order: NDArray[np.int64],
-    starts: NDArray[np.int64],
-    depths: tuple[float, float],
-) -> F64:
-    """Return for each surface (S, 3) the sums of x and y of its points, and their number."""
-    surfaces = np.empty((len(order), 3))
-    found = 0
-    for bearing in range(len(starts) - 1):
+    surfaces, found = np.empty((starts[bearings], 3)), 0
+    for b in range(bearings):
         first = 0.0
-        for place in range(starts[bearing], starts[bearing + 1]):
+        for place in range(starts[b], starts[b + 1]):
             k = order[place]
-            if place == starts[bearing] or ranges[k] - first > depths[0] + depths[1] * ranges[k] * ranges[k]:
+            if place == starts[b] or ranges[k] - first > depths[0] + depths[1] * ranges[k] * ranges[k]:
                 first = ranges[k]
                 surfaces[found, 0] = surfaces[found, 1] = surfaces[found, 2] = 0.0
                 found += 1
             surfaces[found - 1, 0] += points[k, 0]
             surfaces[found - 1, 1] += points[k, 1]
             surfaces[found - 1, 2] += 1.0
-    return surfaces[:found].copy()
+    return nearest, reach, surfaces[:found].copy()
 
 
 @compiled()
@@ -422,86 +404,50 @@ def _compiled_normals(
 def _compiled_heights(
     at: F32,
     points: F32,
+    ranges: F64,
+    order: NDArray[np.intp],
+    starts: NDArray[np.intp],
     sensor: F64,
     plane: F64,
     band: tuple[float, float],
     depths: tuple[float, float],
-    borders: F64,
-    bearings: int,
+    borders: tuple[float, float],
 ) -> U8:
     """Return the heights of `heights_seen`; only the points of the bearings around an obstacle are compared
     with it.
+
+    ranges : (N,) of the points. order : (N,) sorts them by bearing. starts : (B + 1,) the first of each
+    bearing in that order.
     """
+    bearings = len(starts) - 1
     per_rad = bearings / (2.0 * math.pi)
-    bearing_of, ranges = np.empty(len(points), dtype=np.int32), np.empty(len(points))
-    for n in range(len(points)):
-        dx, dy = points[n, 0] - sensor[0], points[n, 1] - sensor[1]
-        bearing_of[n] = math.floor(math.atan2(dy, dx) * per_rad) % bearings
-        ranges[n] = math.hypot(dx, dy)
-    order, starts = _sorted(bearing_of, bearings)
-    heights = np.zeros(len(at), dtype=np.uint8)
+    sensor_height = plane[0] * sensor[0] + plane[1] * sensor[1] + plane[2] * sensor[2] + plane[3]
+    heights = np.empty(len(at), np.uint8)
     for k in range(len(at)):
         x, y = at[k, 0] - sensor[0], at[k, 1] - sensor[1]
         r = math.hypot(x, y)
+        deep = depths[0] + depths[1] * r * r
         reach = 0.5 * math.pi if r <= 0.5 * depths[0] else math.asin(0.5 * depths[0] / r)
         first = math.floor((math.atan2(y, x) - reach) * per_rad)
         filled, empty = 0, 0
-        for bearing in range(first, first + min(math.ceil(2.0 * reach * per_rad) + 1, bearings)):
-            here = order[starts[bearing % bearings] : starts[bearing % bearings + 1]]
-            more = _heights_along(here, points, ranges, (x, y, r), sensor, plane, band, depths, borders)
-            filled, empty = filled | more[0], empty | more[1]
+        for b in range(first, first + min(math.ceil(2.0 * reach * per_rad) + 1, bearings)):
+            for place in range(starts[b % bearings], starts[b % bearings + 1]):
+                n = order[place]
+                dx, dy = points[n, 0] - sensor[0], points[n, 1] - sensor[1]
+                away = max(ranges[n], 1e-9)
+                aside = abs(x * dy - y * dx) / away
+                behind = away > r + deep
+                if away < r - deep or aside > (0.25 if behind else 0.5) * depths[0] or dx * x + dy * y <= 0.0:
+                    continue
+                height = (
+                    plane[0] * points[n, 0] + plane[1] * points[n, 1] + plane[2] * points[n, 2] + plane[3]
+                )
+                if behind:
+                    height = sensor_height + (height - sensor_height) * r / away
+                if band[0] <= height <= band[1]:
+                    bit = 1
+                    for border in borders:
+                        bit <<= height >= border
+                    filled, empty = filled | bit * (not behind), empty | bit * behind
         heights[k] = filled | (empty & ~filled) << SLICES
     return heights
-
-
-@compiled()
-def _sorted(bearing_of: NDArray[np.int32], bearings: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Sort the points by bearing; returns their order and the start of each bearing."""
-    starts = np.zeros(bearings + 1, dtype=np.int64)
-    for bearing in bearing_of:
-        starts[bearing + 1] += 1
-    order, filled = np.empty(len(bearing_of), dtype=np.int64), np.empty(bearings + 1, dtype=np.int64)
-    filled[0] = 0
-    for b in range(bearings):
-        starts[b + 1] += starts[b]
-        filled[b + 1] = starts[b + 1]
-    for n in range(len(bearing_of)):
-        order[filled[bearing_of[n]]] = n
-        filled[bearing_of[n]] += 1
-    return order, starts
-
-
-@compiled()
-def _heights_along(
-    order: NDArray[np.int64],
-    points: F32,
-    ranges: F64,
-    at: tuple[float, float, float],
-    sensor: F64,
-    plane: F64,
-    band: tuple[float, float],
-    depths: tuple[float, float],
-    borders: F64,
-) -> tuple[int, int]:
-    """Return the slices that the points in `order` fill, and those they leave empty, at x, y and the range
-    `at`.
-    """
-    x, y, r = at
-    deep = depths[0] + depths[1] * r * r
-    sensor_height = plane[0] * sensor[0] + plane[1] * sensor[1] + plane[2] * sensor[2] + plane[3]
-    filled, empty = 0, 0
-    for n in order:
-        dx, dy, away = points[n, 0] - sensor[0], points[n, 1] - sensor[1], max(ranges[n], 1e-9)
-        aside = abs(x * dy - y * dx) / away
-        behind = away > r + deep
-        if away < r - deep or aside > (0.25 if behind else 0.5) * depths[0] or dx * x + dy * y <= 0.0:
-            continue
-        height = plane[0] * points[n, 0] + plane[1] * points[n, 1] + plane[2] * points[n, 2] + plane[3]
-        if behind:
-            height = sensor_height + (height - sensor_height) * r / away
-        if band[0] <= height <= band[1]:
-            bit = 1
-            for border in borders:
-                bit <<= height >= border
-            filled, empty = filled | bit * (not behind), empty | bit * behind
-    return filled, empty

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from pc2grid.clouds import planar_scan
 from pc2grid.clouds.ground import CLOUD_PARAMETERS, CloudParameters, Ground
 from pc2grid.clouds.planar_scan import (
     BEARINGS,
@@ -19,7 +20,6 @@ from pc2grid.clouds.planar_scan import (
     project_to_plane,
     scan_bearings,
 )
-from pc2grid.clouds.planar_scan import _compiled_heights as compiled
 from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import F32, F64, U8
 from pc2grid.model import SLICE_BORDERS_M, SLICES, Scan, SensorKind
@@ -154,7 +154,7 @@ def heights_seen_plain(
     return heights
 
 
-def test_the_compiled_form_is_the_plain_one() -> None:
+def test_the_compiled_form_is_the_plain_one(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform((-4.0, -4.0, -0.2), (4.0, 4.0, 2.5), (2000, 3)).astype(np.float32)
     at = rng.uniform(-3.0, 3.0, (200, 2)).astype(np.float32)
@@ -162,7 +162,8 @@ def test_the_compiled_form_is_the_plain_one() -> None:
     sensor_m, borders = np.array([0.1, 0.2, 0.6]), np.array(SLICE_BORDERS_M)
     expected = heights_seen_plain(at, points, sensor_m, tilted, BAND_M, (0.05, 0.01), borders)
     for bearings in (90, 720):  # how the points are sorted does not matter
-        found: U8 = compiled(at, points, sensor_m, tilted, BAND_M, (0.05, 0.01), borders, bearings)
+        monkeypatch.setattr(planar_scan, "_BEARINGS", bearings)
+        found = heights_seen(at, points, sensor_m, tilted, BAND_M, (0.05, 0.01))
         assert np.array_equal(found, expected)
     assert len(np.unique(expected)) > 20
 
