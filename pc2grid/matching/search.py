@@ -279,9 +279,11 @@ def _distinct(found: F64, parameters: SearchParameters) -> F64:
 
 _ROWS, _COLUMNS = TILE
 _NEUTRAL = LIKELIHOOD.neutral_value
-_HALF = SQUARE // 2
+_HALF, _MIDDLE = SQUARE // 2, 0.5 * SQUARE
 _PARTS = 1 + 4 + SQUARE * SQUARE
-"""Parts of a square: all of it, its quarters, and the cells, those of one quarter after the other."""
+"""Parts of a square: all of it, and its quarters, each before its cells."""
+_QUARTER = 1 + _HALF**2
+"""Parts of a quarter: all of it, and its cells."""
 
 
 @compiled(nogil=True)
@@ -302,14 +304,12 @@ def tile_bounds(
     wall. points : (N, 2). corner, yaw_rad, inside : as of `Tiles`. turns : (K,).
     """
     bounds = np.empty((len(corner), len(turns)), np.int64)
-    turned, at = np.empty((2, len(points))), np.empty(len(points), np.int64)
-    counted, sums = np.empty(2, np.int64), np.empty((_ROWS, _COLUMNS), np.uint16)
-    middle = 0.5 * SQUARE
+    at, counted = np.empty(len(points), np.int64), np.empty(2, np.int64)
+    sums = np.empty((_ROWS, _COLUMNS), np.uint16)
     for t in range(len(corner)):
         for k in range(len(turns)):
-            _turn(points, yaw_rad[t] + turns[k], turned)
-            _place(turned, level, middle, middle, shape, corner[t], at, counted)
-            bounds[t, k] = _sum_tile(flat, at[: counted[0]], counted[1], shape[1], inside[t], sums)
+            _place(points, yaw_rad[t] + turns[k], level, _MIDDLE, _MIDDLE, shape, corner[t], at, counted)
+            bounds[t, k] = _sum_tile(flat, at, counted, shape[1], inside[t], sums)
     return bounds
 
 
@@ -337,20 +337,29 @@ def best_in_tiles(
     in `inside`.
     """
     n, full, width = len(points), 255.0 * len(points), shape[1]
-    turned, sums = np.empty((2, n)), np.empty((_ROWS, _COLUMNS), np.uint16)
+    sums, number = np.empty((_ROWS, _COLUMNS), np.uint16), 0
     at, counted = np.empty((2, _PARTS, n), np.int64), np.empty((2, _PARTS, 2), np.int64)
-    found, number = np.empty((64, 4)), 0
+    found = np.empty((64, 4))
     least = max(floor, 1.0 / full)
     for b in range(len(bounds)):
         if bounds[b] < full * least:
             break
         here, yaw = corners[b], yaws[b]
-        _turn(points, yaw, turned)
-        _place(turned, levels[0], _HALF, _HALF, shape, here, at[0, 0], counted[0, 0])
-        _sum_tile(flat, at[0, 0, : counted[0, 0, 0]], counted[0, 0, 1], width, inside[tile[b]], sums)
+        _place(points, yaw, levels[0], _MIDDLE, _MIDDLE, shape, here, at[0, 0], counted[0, 0])
+        _sum_tile(flat, at[0, 0], counted[0, 0], width, inside[tile[b]], sums)
         for side in range(2):
-            _turn(points, yaw + (side - 0.5) * half_a_rad, turned)
-            _place_parts(turned, levels, shape, here, at[side], counted[side])
+            for part in range(_PARTS):
+                quarter, cell = (part - 1) // _QUARTER, (part - 1) % _QUARTER - 1
+                level, down, right = 1, _MIDDLE, _MIDDLE
+                if part:
+                    level, down, right = 2, 0.5 * _HALF, 0.5 * _HALF
+                    if cell >= 0:
+                        level, down, right = 3, cell // _HALF + 0.5, cell % _HALF + 0.5
+                    down, right = down + quarter // 2 * _HALF, right + quarter % 2 * _HALF
+                half = yaw + (side - 0.5) * half_a_rad
+                _place(
+                    points, half, levels[level], down, right, shape, here, at[side, part], counted[side, part]
+                )
         for block in range(_ROWS * _COLUMNS // BLOCK**2):
             down, right = block // (_COLUMNS // BLOCK) * BLOCK, block % (_COLUMNS // BLOCK) * BLOCK
             best, square, side, part = _best_in_block(
@@ -359,8 +368,12 @@ def best_in_tiles(
             if best < 0:
                 continue
             if number == len(found):
-                found = np.concatenate((found, np.empty_like(found)))
-            quarter, cell = (part - 5) // _HALF**2, (part - 5) % _HALF**2
+                more = np.empty((2 * number, 4))
+                for row in range(number):
+                    for column in range(4):
+                        more[row, column] = found[row, column]
+                found = more
+            quarter, cell = (part - 1) // _QUARTER, (part - 1) % _QUARTER - 1
             i, j = quarter // 2 * _HALF + cell // _HALF, quarter % 2 * _HALF + cell % _HALF
             found[number, 0] = (here[1] + square % _COLUMNS) * SQUARE + j + 0.5
             found[number, 1] = (here[0] + square // _COLUMNS) * SQUARE + i + 0.5
@@ -368,7 +381,7 @@ def best_in_tiles(
             found[number, 3] = best / full
             number += 1
             least = max(least, keep * best / full)
-    return found[:number]
+    return found[:number].copy()
 
 
 @compiled(nogil=True)
@@ -382,54 +395,35 @@ def _best_in_block(
     """
     best, best_square, best_side, best_part = -1, 0, 0, 0
     # The most promising square first: what it reaches excludes most of the others.
-    first = int(sums[down : down + BLOCK, right : right + BLOCK].argmax())
+    first, top = 0, -1
+    for square in range(BLOCK**2):
+        here = sums[down + square // BLOCK, right + square % BLOCK]
+        if here > top:
+            first, top = square, here
     for visit in range(BLOCK**2):
         square = (first + visit) % BLOCK**2
         r, c = down + square // BLOCK, right + square % BLOCK
         for side in range(2):
             needed = max(least, best + 1.0)
-            if sums[r, c] >= needed:
-                total, part = _best_cell(flat, at[side], counted[side], r * width + c, needed)
-                if total > best:
+            part = 0 if sums[r, c] >= needed else _PARTS
+            while part < _PARTS:
+                total = counted[side, part, 1]
+                for p in range(counted[side, part, 0]):
+                    total += flat[at[side, part, p] + r * width + c]
+                is_whole = (part - 1) % _QUARTER == 0 or part == 0
+                if not is_whole and total >= needed and total > best:
                     best, best_square, best_side, best_part = total, r * _COLUMNS + c, side, part
+                if is_whole and total < needed:  # nor do its parts reach more
+                    part += _QUARTER if part else _PARTS
+                else:
+                    part += 1
     return best, best_square, best_side, best_part
 
 
 @compiled(nogil=True)
-def _best_cell(flat: U8, at: I64, counted: I64, move: int, least: float) -> tuple[int, int]:
-    """Return the highest sum of a cell of a square, and its part; -1 where it is below `least`."""
-    best, part = -1, 0
-    if _sum(flat, at[0, : counted[0, 0]], counted[0, 1], move) < least:
-        return best, part
-    for q in range(4):
-        if _sum(flat, at[1 + q, : counted[1 + q, 0]], counted[1 + q, 1], move) < least:
-            continue
-        for c in range(5 + q * _HALF**2, 5 + (q + 1) * _HALF**2):
-            total = _sum(flat, at[c, : counted[c, 0]], counted[c, 1], move)
-            if total >= least and total > best:
-                best, part = total, c
-    return best, part
-
-
-@compiled(nogil=True)
-def _place_parts(
-    turned: F64, levels: I64, shape: tuple[int, int], corner: I64, at: I64, counted: I64
-) -> None:
-    """Set `at` (_PARTS, N) and `counted` (_PARTS, 2), see `_place`, for each part of a square."""
-    _place(turned, levels[1], _HALF, _HALF, shape, corner, at[0], counted[0])
-    for q in range(4):
-        down, right = q // 2 * _HALF, q % 2 * _HALF
-        middle = 0.5 * _HALF
-        _place(turned, levels[2], down + middle, right + middle, shape, corner, at[1 + q], counted[1 + q])
-        for c in range(_HALF**2):
-            part = 5 + q * _HALF**2 + c
-            i, j = down + c // _HALF, right + c % _HALF
-            _place(turned, levels[3], i + 0.5, j + 0.5, shape, corner, at[part], counted[part])
-
-
-@compiled(nogil=True)
 def _place(
-    turned: F64,
+    points: F64,
+    yaw: float,
     level: I64,
     down: float,
     right: float,
@@ -438,7 +432,8 @@ def _place(
     at: I64,
     counted: I64,
 ) -> None:
-    """Look up the cells of the points for a pose `down` and `right` of the corner of its square.
+    """Look up the cells of the points, turned by `yaw`, for a pose `down` and `right` of the corner of its
+    square.
 
     Sets the first entries of `at` to the cells for the first square of the tile at `corner`, as indices into
     all images, flat. Sets `counted` (2,) to their number, and to the sum of all other points: those without a
@@ -446,11 +441,13 @@ def _place(
     """
     height, width = shape
     count, rest = 0, 0
-    for p in range(turned.shape[1]):
+    c, s = math.cos(yaw), math.sin(yaw)
+    for p in range(len(points)):
         if level[p] < 0:
             rest += 255
             continue
-        i, j = math.floor(turned[0, p] + down), math.floor(turned[1, p] + right)
+        i = math.floor(s * points[p, 0] + c * points[p, 1] + down)
+        j = math.floor(c * points[p, 0] - s * points[p, 1] + right)
         row, column = corner[0] + i // SQUARE + _ROWS, corner[1] + j // SQUARE + _COLUMNS
         if row < 0 or column < 0 or row > height - _ROWS or column > width - _COLUMNS:
             rest += _NEUTRAL
@@ -462,22 +459,13 @@ def _place(
 
 
 @compiled(nogil=True)
-def _turn(points: F64, yaw: float, turned: F64) -> None:
-    """Set `turned` (2, N), rows y and x, to the points rotated by `yaw`."""
-    c, s = math.cos(yaw), math.sin(yaw)
-    for p in range(len(points)):
-        turned[0, p] = s * points[p, 0] + c * points[p, 1]
-        turned[1, p] = c * points[p, 0] - s * points[p, 1]
-
-
-@compiled(nogil=True)
-def _sum_tile(flat: U8, at: I64, rest: int, width: int, inside: U16, sums: U16) -> int:
+def _sum_tile(flat: U8, at: I64, counted: I64, width: int, inside: U16, sums: U16) -> int:
     """Set `sums` (TILE) to the sums of a tile, 0 for squares that are not `inside`; returns the highest."""
     top = 0
     for r in range(_ROWS):
         for k in range(_COLUMNS):
-            sums[r, k] = rest
-    for p in range(len(at)):
+            sums[r, k] = counted[1]
+    for p in range(counted[0]):
         for r in range(_ROWS):
             first = at[p] + r * width
             window, row = flat[first : first + _COLUMNS], sums[r]
@@ -488,12 +476,3 @@ def _sum_tile(flat: U8, at: I64, rest: int, width: int, inside: U16, sums: U16) 
             sums[r, k] &= inside[r, k]
             top = max(top, sums[r, k])
     return top
-
-
-@compiled(nogil=True)
-def _sum(flat: U8, at: I64, rest: int, move: int) -> int:
-    """Return the sum of one square of a tile, `move` cells behind the first one in all images, flat."""
-    total = rest
-    for p in range(len(at)):
-        total += flat[at[p] + move]
-    return total
