@@ -170,10 +170,15 @@ def weighed_pairs(points: F64, walls: F64, opens: F64, counts: F64) -> None:
             for j in range(i + 1, points.shape[1]):
                 x = points[row, i, 0] - points[row, j, 0]
                 y = points[row, i, 1] - points[row, j, 1]
-                at = min(int(np.sqrt(x * x + y * y) + 1e-6), bins - 1)
+                at = min(int(math.sqrt(x * x + y * y) + 1e-6), bins - 1)
                 for rim in range(walls.shape[1]):
                     counts[row, rim, at] += walls[row, rim, i] * walls[row, rim, j]
         for rim in range(walls.shape[1]):
-            wall, none = walls[row, rim], opens[row, rim]
-            counts[row, rim, bins] += wall.sum() * none.sum() - (wall * none).sum()
-            counts[row, rim, bins + 1] += 0.5 * (none.sum() ** 2 - (none * none).sum())
+            wall = none = both = none_twice = 0.0
+            for i in range(points.shape[1]):
+                wall += walls[row, rim, i]
+                none += opens[row, rim, i]
+                both += walls[row, rim, i] * opens[row, rim, i]
+                none_twice += opens[row, rim, i] * opens[row, rim, i]
+            counts[row, rim, bins] += wall * none - both
+            counts[row, rim, bins + 1] += 0.5 * (none * none - none_twice)

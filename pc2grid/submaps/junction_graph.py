@@ -213,7 +213,7 @@ def thin(mask: BoolGrid, thinning: Thinning = "guo_hall") -> BoolGrid:
     """
 
     image, border = _padded(mask)
-    thin_in_place(image.reshape(-1), image.shape[1], border, _DELETABLE[thinning])
+    thin_in_place(image.reshape(-1), _neighbour_steps(image.shape[1]), border, _DELETABLE[thinning])
     return image[1:-1, 1:-1].view(np.bool_)
 
 
@@ -306,20 +306,20 @@ _END = np.array([sum(p) == 1 for p in _NEIGHBOURS])
 
 
 @compiled()
-def thin_in_place(flat: NDArray[np.uint8], width: int, border: I64, deletable: NDArray[np.bool_]) -> None:
+def thin_in_place(flat: NDArray[np.uint8], steps: I64, border: I64, deletable: NDArray[np.bool_]) -> None:
     """Thin a 0/1 image in place.
 
     In each half of an iteration all pixels are tested on the same image, and those that may go are deleted
     together. A pixel is tested again only if a neighbour of it has gone.
 
-    flat : the image row by row, `width` pixels a row, with a border of zeros. border : indices of the set
-    pixels that have a zero neighbour. deletable : (2, 256), by half of an iteration and neighbour code.
+    flat : the image row by row, with a border of zeros. steps : (8,) to the neighbours of a pixel. border :
+    indices of the set pixels that have a zero neighbour. deletable : (2, 256), by half of an iteration and
+    neighbour code.
 
     Measured: 20 times as fast as the numpy form on a whole map (killian, 20 million cells: 0.12 against 2.6
     s) and 20 to 30 times on one submap (0.2 against 4 ms for its boundary, 0.16 against 5 ms for its free
     space), both of which every description needs.
     """
-    steps = np.array([-width, 1 - width, 1, width + 1, width, width - 1, -1, -width - 1])
     # In how many halves of an iteration a pixel still has to be tested: two after a neighbour has gone.
     pending = np.zeros(len(flat), np.uint8)
     # One entry more than there are pixels: what is written behind the last one is not read.

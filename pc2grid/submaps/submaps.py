@@ -8,6 +8,7 @@ the sensor.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -170,7 +171,7 @@ def look_around(
     """Return ranges (N, B) in metres and ends (N, B) of the isovists of many points (N, 2); see `isovist`."""
     columns, rows = ((centers_m - np.asarray(grid.origin_m)) / grid.resolution_m).T
     ranges, ends = cast_rays(
-        grid.cells,
+        np.ascontiguousarray(grid.cells),
         np.ascontiguousarray(rows, np.float64),
         np.ascontiguousarray(columns, np.float64),
         sight_m / grid.resolution_m,
@@ -237,12 +238,11 @@ def cast_rays(
     and every query casts rays.
     """
     height, width = cells.shape
-    flat = np.ascontiguousarray(cells).reshape(-1)
     ranges = np.empty((len(rows), bearings), dtype=np.float32)
     ends = np.empty((len(rows), bearings), dtype=np.int8)
     for b in range(bearings):
-        angle = 2.0 * np.pi * b / bearings
-        dc, dr = np.cos(angle) * _STEP_CELLS, np.sin(angle) * _STEP_CELLS
+        angle = 2.0 * math.pi * b / bearings
+        dc, dr = math.cos(angle) * _STEP_CELLS, math.sin(angle) * _STEP_CELLS
         for n in range(len(rows)):
             r, c, length = rows[n], columns[n], 0.0
             end = OPEN
@@ -255,7 +255,7 @@ def cast_rays(
                 if not (0.0 <= r < height and 0.0 <= c < width):
                     end = HIDDEN
                     break
-                value = flat[np.uint64(r) * np.uint64(width) + np.uint64(c)]
+                value = cells[np.uint64(r), np.uint64(c)]
                 if value >= OCCUPIED_FROM:
                     end = WALL
                     known = length
