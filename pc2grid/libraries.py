@@ -162,7 +162,8 @@ class _Compiled:
         from numba import njit
 
         names = self._function.__globals__
-        found = self.__dict__["dispatcher"] = njit(cache=True, **self._options)(self._function)
+        options = {"cache": True, "no_cfunc_wrapper": True, **self._options}  # C calls none of them
+        found = self.__dict__["dispatcher"] = njit(**options)(self._function)
         for name, value in list(names.items()):
             if isinstance(value, _Compiled):
                 names[name] = value.dispatcher
