@@ -120,27 +120,6 @@ class OffMap:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """The decision over all hypotheses.
-
-    confidence : mass of the first place, see `signature.localization.posterior`.
-    hypotheses : all that fit, by the mass of their places. places : parallel to them, which of them are the
-    same place, seen in the maps of different sessions; numbered from 0, best first.
-    masses : of each place, by its number. evidence : what tells for the first place.
-    off_map : further places, which the map does not show, the likeliest first; their masses are parts of the
-    same probability.
-    """
-
-    status: Status
-    confidence: float
-    hypotheses: tuple[Hypothesis, ...]
-    places: tuple[int, ...]
-    masses: tuple[float, ...]
-    evidence: Evidence
-    off_map: tuple[OffMap, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Moment:
     """The answer as it stood after `path_m` of travel.
 
@@ -175,13 +154,13 @@ class Answer:
     """Where the query was.
 
     status : located, ambiguous (several places fit) or not_found (none does).
-    session : name of the session whose map frame `T_map_base` is in; None unless located.
-    T_map_base : base at the query's last scan. covariance : (3, 3) of x, y, yaw.
-    T_map_odom : puts the whole query trajectory into the map.
-    confidence : probability that the best hypothesis is right.
-    hypotheses : all that fit, best first. places : the place each of them is at; masses : of each place, see
-    `Verdict`.
-    history : how the answer came to be. evidence : what the confidence rests on.
+    confidence : mass of the first place, see `signature.localization.posterior`.
+    hypotheses : all that fit, by the mass of their places. places : parallel to them, which of them are the
+    same place, seen in the maps of different sessions; numbered from 0, best first.
+    masses : of each place, by its number. evidence : what tells for the first place.
+    off_map : further places, which the map does not show, the likeliest first; their masses are parts of the
+    same probability.
+    history : how the answer came to be.
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with. views_m :
     where it was described by signatures, in that frame. map : of the session of the best hypothesis.
     sessions, labels : all of the database, that `Hypothesis.session_index` counts.
@@ -192,7 +171,6 @@ class Answer:
     are in the map frames of their sessions (`signature.localization.answer`).
     in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
     none. Of a place that was turned down because they contradict it, the pose there.
-    off_map : places beside the map, the likeliest first, see `Verdict`.
 
     `pc2grid.relocalize` returns a `Found`, which can be drawn, too.
 
@@ -206,22 +184,18 @@ class Answer:
     """
 
     status: Status
-    session: str | None
-    stamp_ns: int
-    T_map_base: SE2 | None
-    covariance: F64 | None
-    T_map_odom: SE2 | None
     confidence: float
     hypotheses: tuple[Hypothesis, ...]
     places: tuple[int, ...]
-    history: tuple[Moment, ...]
-    T_odom_base: SE2
+    evidence: Evidence
+    stamp_ns: int
     path_m: float
+    T_odom_base: SE2
+    local_map: OccupancyGrid
     sessions: tuple[str, ...]
     labels: tuple[Label, ...]
-    submap_ids: tuple[int, ...]
-    evidence: Evidence
-    local_map: OccupancyGrid
+    submap_ids: tuple[int, ...] = ()
+    history: tuple[Moment, ...] = ()
     timing_ms: dict[str, float] = field(default_factory=dict)
     masses: tuple[float, ...] = ()
     prior: Literal["used", "lapsed", "ahead"] | None = None
@@ -266,6 +240,48 @@ class Answer:
         return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
 
     @property
+    def located(self) -> Hypothesis | None:
+        """Return the hypothesis that is the answer; None unless one place is certain."""
+        return self.hypotheses[0] if self.status == "located" else None
+
+    @property
+    def session(self) -> str | None:
+        """Return the session whose map frame the pose is in; None unless located."""
+        return self.located and self.sessions[self.located.session_index]
+
+    @property
+    def T_map_odom(self) -> SE2 | None:
+        """Return what puts the whole query trajectory into the map; None unless located."""
+        return self.located and self.located.fit.T_map_query
+
+    @property
+    def T_map_base(self) -> SE2 | None:
+        """Return the base at the query's last scan; None unless located."""
+        return self.T_map_odom and self.T_map_odom @ self.T_odom_base
+
+    @property
+    def covariance(self) -> F64 | None:
+        """Return that of the pose, (3, 3) of x, y, yaw; None unless located."""
+        return self.located and self.located.fit.covariance
+
+    @property
+    def moment(self) -> Moment:
+        """Return the answer as it stands, for the history of those after it."""
+        best = self.hypotheses[0] if self.hypotheses else None
+        return Moment(
+            stamp_ns=self.stamp_ns,
+            path_m=self.path_m,
+            status=self.status,
+            session=best and self.sessions[best.session_index],
+            pose=best and best.fit.T_map_query @ self.T_odom_base,
+            confidence=self.confidence,
+        )
+
+    def place(self, number: int) -> tuple[Hypothesis, ...]:
+        """Return the hypotheses of one place."""
+        return tuple(h for h, of in zip(self.hypotheses, self.places, strict=True) if of == number)
+
+    @property
     def beside_map(self) -> OffMap | None:
         """Return where the robot is, beside the map, if that is more likely than all else together."""
         return next((away for away in self.off_map if away.mass >= POSTERIOR.likely), None)
@@ -283,7 +299,7 @@ class Answer:
     @property
     def label(self) -> Label:
         """Return building and floor of the session it was located in, as far as they are known."""
-        return Label() if self.status != "located" else self.labels[self.hypotheses[0].session_index]
+        return Label() if self.located is None else self.labels[self.located.session_index]
 
     def frame_of(self, hypothesis: Hypothesis) -> str | None:
         """Return the frame of the building that a hypothesis is in; None: the map frame of its session."""
@@ -292,7 +308,7 @@ class Answer:
     @property
     def frame(self) -> str | None:
         """Return the frame of the building that the pose is in; None: the map frame of the session."""
-        return self.frame_of(self.hypotheses[0]) if self.status == "located" else None
+        return self.located and self.frame_of(self.located)
 
     @property
     def stamped_pose(self) -> dict[str, Any] | None:
@@ -455,16 +471,9 @@ def answer_in_building(answer: AnswerT, frames: Mapping[str, BuildingFrame]) -> 
         excluded=answer.excluded and _moment(answer.excluded, frames),
         frames=tuple(frame.name or None for frame in frame_of),
     )
-    if answer.status != "located":
+    if stated.located is None or answer.in_space is None:
         return stated
-    fit = hypotheses[0].fit
-    return replace(
-        stated,
-        T_map_base=fit.T_map_query @ answer.T_odom_base,
-        T_map_odom=fit.T_map_query,
-        covariance=fit.covariance,
-        in_space=answer.in_space and _in_space(answer.in_space, frame_of[hypotheses[0].session_index]),
-    )
+    return replace(stated, in_space=_in_space(answer.in_space, frame_of[stated.located.session_index]))
 
 
 def covariance_in_building(covariance: F64, T_session_base: SE2, frame: BuildingFrame) -> F64:

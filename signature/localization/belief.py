@@ -43,8 +43,7 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.matching.score import score_fit
-from signature.localization.answer import Answer, OffMap, Verdict
-from signature.localization.decision import place_of
+from signature.localization.answer import Answer, OffMap
 from signature.localization.hypotheses import Hypothesis, agree, more_exact
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR, PRIOR
@@ -73,13 +72,13 @@ class Masses:
     places: tuple[tuple[OffMap, ...], ...] = ()
 
     @staticmethod
-    def of(query: QueryMap, found: Verdict | Answer) -> Masses:
+    def of(query: QueryMap, found: Answer) -> Masses:
         """Return the masses that a query gives, first place first. A place of which the map shows too little
         to align it stays where odometry has carried the robot."""
         beside = list(found.off_map)
         places: list[tuple[OffMap, ...]] = []
         for number, mass in enumerate(found.masses):
-            place = place_of(found, number)
+            place = found.place(number)
             for k, away in enumerate(beside):
                 if place[0].fit.overlap < POSTERIOR.shown and agree(
                     query.T_odom_base, away.hypothesis, place[0]

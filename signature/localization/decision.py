@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 from pc2grid.matching.score import Fit
-from signature.localization.answer import Answer, OffMap, Status, Verdict
+from signature.localization.answer import Answer, OffMap, Status
 from signature.localization.hypotheses import Hypothesis, agree, more_exact, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
@@ -29,11 +29,6 @@ LEFT = 0.05
 PriorOf = Callable[[Place], float]
 """Prior of a place, relative to that of "not in this map"."""
 
-NOTHING = Verdict(
-    status="not_found", confidence=0.0, hypotheses=(), places=(), masses=(), evidence=NO_EVIDENCE
-)
-"""The verdict on a query for which nothing is found."""
-
 
 def anywhere(place: Place) -> float:
     """Return the prior of a place without any knowledge."""
@@ -45,22 +40,21 @@ def decide(
     query: QueryMap,
     known: tuple[Hypothesis, ...] = (),
     prior_of: PriorOf = anywhere,
-) -> tuple[Verdict, tuple[Hypothesis, ...]]:
-    """Return the verdict on the hypotheses that are known and those that the search finds, and all of these.
+) -> tuple[Answer, tuple[Hypothesis, ...]]:
+    """Return the answer by the hypotheses that are known and those that the search finds, and all of these.
     The search ends when one place is certain and the right one likely searched, or when what is left has too
     little mass to matter."""
-    verdict, found = NOTHING, known
     for found, left in index.search(query, known):
-        verdict = judge(index, query, found, prior_of)
+        answer = judge(index, query, found, prior_of)
         # What was not searched may fit as well as what was.
-        if left < LEFT or (verdict.status == "located" and left < 1.0 - index.config.accept):
+        if left < LEFT or (answer.located and left < 1.0 - index.config.accept):
             break
-    return verdict, found
+    return answer, found
 
 
 def judge(
     index: MapIndex, query: QueryMap, hypotheses: Sequence[Hypothesis], prior_of: PriorOf = anywhere
-) -> Verdict:
+) -> Answer:
     """Return the posterior over the places of the hypotheses, see `signature.localization.posterior`.
 
     A place that the prior of the index excludes has no mass. But it shows what wrong places score for this
@@ -68,66 +62,60 @@ def judge(
     certain.
     """
     places, rivals = _allowed(index, query, places_of(index, query, hypotheses))
-    if not places:
-        return NOTHING
     evidence_for = evidence_of([place[0].fit for place in places], query, rivals)
     known = list(zip(places, map(prior_of, places), evidence_for, strict=True))
     known.sort(key=lambda each: -math.log(each[1]) - each[2].log_odds())
-    ordered, prior, evidence = (list(each) for each in zip(*known, strict=True))
-    mass = masses(evidence, prior).tolist()
-    in_the_map = evidence[0].log_odds() + math.log(prior[0]) >= 0.0
+    mass = masses([each[2] for each in known], [each[1] for each in known]).tolist()
+    ordered = tuple(h for place, *_ in known for h in place)
+    in_the_map = any(each[2].log_odds() + math.log(each[1]) >= 0.0 for each in known[:1])
     status: Status = "ambiguous" if in_the_map else "not_found"
-    return Verdict(
-        status="located" if mass[0] >= index.config.accept else status,
-        confidence=mass[0],
-        hypotheses=tuple(h for place in ordered for h in place),
-        places=tuple(number for number, place in enumerate(ordered) for _ in place),
+    return Answer(
+        status="located" if sum(mass[:1]) >= index.config.accept else status,
+        confidence=sum(mass[:1]),
+        hypotheses=ordered,
+        places=tuple(number for number, (place, *_) in enumerate(known) for _ in place),
         masses=tuple(mass),
-        evidence=evidence[0],
+        evidence=known[0][2] if known else NO_EVIDENCE,
+        stamp_ns=query.stamp_ns,
+        path_m=query.path_m,
+        T_odom_base=query.T_odom_base,
+        local_map=query.grid,
+        views_m=tuple(view.center_m for view in query.views),
+        sessions=index.sessions,
+        labels=index.labels,
     )
 
 
 def weighed(
-    verdict: Verdict,
-    query: QueryMap,
-    prior_of: PriorOf,
-    off_map: Sequence[OffMap],
-    slipped: float,
-    accept: float,
-) -> Verdict:
-    """Return the verdict weighed against what else may be: places that the map does not show, and that the
+    answer: Answer, prior_of: PriorOf, off_map: Sequence[OffMap], slipped: float, accept: float
+) -> Answer:
+    """Return the answer weighed against what else may be: places that the map does not show, and that the
     robot was carried away or tracking slipped. Of a place beside the map that the map puts where the query
     lies by its walls, too, both masses count for the confidence.
 
     off_map : with masses relative to "nowhere". slipped : relative to the first place.
     """
-    first, at = place_of(verdict, 0), query.T_odom_base
+    first, at = answer.place(0), answer.T_odom_base
     odds = 1.0
-    if verdict.confidence:
-        odds = prior_of(first) * math.exp(verdict.evidence.log_odds()) / verdict.masses[0]
-    share = 1.0 / (odds * (1.0 + slipped * verdict.confidence) + sum(away.mass for away in off_map))
-    masses = tuple(mass * odds * share for mass in verdict.masses)
+    if answer.confidence:
+        odds = prior_of(first) * math.exp(answer.evidence.log_odds()) / answer.masses[0]
+    share = 1.0 / (odds * (1.0 + slipped * answer.confidence) + sum(away.mass for away in off_map))
+    masses = tuple(mass * odds * share for mass in answer.masses)
     here = [
         away
         for away in off_map
         if any(agree(at, away.hypothesis, h) and more_exact(h, away.hypothesis) for h in first)
     ]
     confidence = sum(masses[:1]) + share * sum(away.mass for away in here)
-    doubtful = verdict.status == "located" and confidence < accept
     return replace(
-        verdict,
-        status="ambiguous" if doubtful else verdict.status,
+        answer,
+        status="ambiguous" if answer.located and confidence < accept else answer.status,
         confidence=confidence,
         masses=masses,
         off_map=tuple(
             replace(away, mass=away.mass * share) for away in sorted(off_map, key=lambda away: -away.mass)
         ),
     )
-
-
-def place_of(found: Verdict | Answer, number: int) -> Place:
-    """Return the hypotheses of one place."""
-    return tuple(h for h, of in zip(found.hypotheses, found.places, strict=True) if of == number)
 
 
 def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:

@@ -32,7 +32,7 @@ import numpy as np
 from pc2grid.geometry import F64, SE2
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, Unfit, register_in_space
 from signature.database import SubmapDatabase
-from signature.localization.answer import PoseInSpace, SpaceStatus, Status, Verdict
+from signature.localization.answer import Answer, PoseInSpace, SpaceStatus, Status
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.query import QueryInSpace
 
@@ -78,42 +78,41 @@ def surface_reader(database: SubmapDatabase) -> SurfaceOf | None:
 
 
 def settle_in_space(
-    verdict: Verdict, query: QueryInSpace, surface_of: Callable[[int], MapSurface | None], accept: float
-) -> tuple[Verdict, PoseInSpace | None]:
-    """Return the verdict with the points as a factor, and the pose in space of the place that is located, or
-    of the one that was located and is rejected now; else None. Return it unchanged where no place can be
-    compared.
+    answer: Answer, query: QueryInSpace, surface_of: Callable[[int], MapSurface | None], accept: float
+) -> Answer:
+    """Return the answer with the points as a factor, and the pose in space of the place that is located, or
+    of the one that was located and is rejected now. Return it unchanged where no place can be compared.
 
     surface_of : the points of a session, by its index. accept : least confidence to be located.
     """
     if not query.views or query.T_odom_base is None:
-        return verdict, None
-    fits, masses, best = _compared(verdict, query, surface_of, accept)
+        return answer
+    fits, masses, best = _compared(answer, query, surface_of, accept)
     if not fits:
-        return verdict, None
+        return answer
     poses = {k: _pose(fit, query.T_odom_base) for k, fit in fits.items() if isinstance(fit, SpatialFit)}
-    settled = _settled(verdict, best, masses, poses.get(best), query.T_odom_base, accept)
-    if settled.status == "located":
-        return settled, poses.get(best)
-    return settled, poses.get(0) if verdict.status == "located" else None
+    settled = _settled(answer, best, masses, poses.get(best), query.T_odom_base, accept)
+    if settled.located:
+        return replace(settled, in_space=poses.get(best))
+    return replace(settled, in_space=poses.get(0) if answer.located else None)
 
 
 def _compared(
-    verdict: Verdict, query: QueryInSpace, surface_of: Callable[[int], MapSurface | None], accept: float
+    answer: Answer, query: QueryInSpace, surface_of: Callable[[int], MapSurface | None], accept: float
 ) -> tuple[dict[int, SpatialFit | Unfit], F64, int]:
     """Return the fits of places by number, without those of which nothing is known; the masses with them, and
     the likeliest place. The places with the most mass are compared, until no other one can change what is
     certain."""
     fits: dict[int, SpatialFit | Unfit] = {}
-    best, masses = 0, np.array(verdict.masses)
+    best, masses = 0, np.array(answer.masses)
     for place in range(min(len(masses), SPACE.places)):
-        h = verdict.hypotheses[verdict.places.index(place)]
+        h = answer.hypotheses[answer.places.index(place)]
         fit = fit_in_space(query, surface_of(h.session_index), h)
         if log_odds_in_space(fit):
             fits[place] = fit
-            masses, best = masses_of(verdict.masses, fits)
+            masses, best = masses_of(answer.masses, fits)
         # The places that are left can agree as well as the best one: is that certain all the same?
-        left = sum(verdict.masses[place + 1 :]) / max(verdict.masses[best], np.finfo(float).tiny)
+        left = sum(answer.masses[place + 1 :]) / max(answer.masses[best], np.finfo(float).tiny)
         if best in fits and masses[best] >= accept * (1.0 + masses[best] * left):
             break
     return fits, masses, best
@@ -181,27 +180,27 @@ def _pose(fit: SpatialFit, T_odom_base: F64) -> PoseInSpace:
 
 
 def _settled(
-    verdict: Verdict, best: int, masses: F64, in_space: PoseInSpace | None, T_odom_base: F64, accept: float
-) -> Verdict:
-    """Return the verdict with new masses (P,) of its places, `best` first, at the pose that its points
+    answer: Answer, best: int, masses: F64, in_space: PoseInSpace | None, T_odom_base: F64, accept: float
+) -> Answer:
+    """Return the answer with new masses (P,) of its places, `best` first, at the pose that its points
     give."""
     located = masses[best] >= accept
     order = sorted(
-        range(len(verdict.places)), key=lambda k: (verdict.places[k] != best, -masses[verdict.places[k]])
+        range(len(answer.places)), key=lambda k: (answer.places[k] != best, -masses[answer.places[k]])
     )
-    hypotheses = [verdict.hypotheses[k] for k in order]
+    hypotheses = [answer.hypotheses[k] for k in order]
     if located and in_space is not None:
         planar = np.ix_((0, 1, 5), (0, 1, 5))
         T_map_query = SE2.from_matrix(in_space.T_map_base) @ SE2.from_matrix(T_odom_base).inverse()
         refined = replace(hypotheses[0].fit, T_map_query=T_map_query, covariance=in_space.covariance[planar])
         hypotheses[0] = replace(hypotheses[0], fit=refined)
-    numbers = {k: n for n, k in enumerate(dict.fromkeys(verdict.places[k] for k in order))}
+    numbers = {k: n for n, k in enumerate(dict.fromkeys(answer.places[k] for k in order))}
     likely: Status = "ambiguous" if masses[best] >= 1.0 - masses.sum() else "not_found"
     return replace(
-        verdict,
+        answer,
         status="located" if located else likely,
         confidence=float(masses[best]),
         hypotheses=tuple(hypotheses),
-        places=tuple(numbers[verdict.places[k]] for k in order),
+        places=tuple(numbers[answer.places[k]] for k in order),
         masses=tuple(masses[list(numbers)].tolist()),
     )

@@ -16,11 +16,11 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from types import TracebackType
-from typing import Generic, Literal, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
-from signature.localization.answer import Answer, Moment, Verdict
+from signature.localization.answer import Answer, Moment
 from signature.localization.belief import Belief, Masses, State
 from signature.localization.decision import PriorOf, decide, judge, weighed
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis, moved_to_origin
@@ -204,29 +204,26 @@ class Localizer:
         clock.lap("describe")
         before, off_map = self._belief.before(index, seen)
         prior_of = prior_of or before.prior
-        verdict, found = decide(index, seen, (*self._known, *known), prior_of)
+        answer, found = decide(index, seen, (*self._known, *known), prior_of)
         clock.lap("search")
-        prior, excluded = _with_prior(index, seen, verdict, found)
+        answer = _with_prior(index, seen, answer, found)
         slipped, later = 0.0, None
-        if verdict.hypotheses:
-            best = verdict.hypotheses[0]
+        if answer.hypotheses:
+            best = answer.hypotheses[0]
             walls = index.maps_for(seen)[best.session_index].walls
             slipped, scans = slip_of(seen, best.fit, walls, index.config.step_m)
             if scans and query is self.query:
                 later = self.search(query.since(scans), index=index)
                 slipped *= _elsewhere(*later, best)
-        verdict = weighed(verdict, seen, prior_of, off_map, slipped, index.config.accept)
-        if later and slipped * verdict.masses[0] >= POSTERIOR.likely:
+        answer = weighed(answer, prior_of, off_map, slipped, index.config.accept)
+        if later and slipped * answer.masses[0] >= POSTERIOR.likely:
             return later
-        verdict = _in_map(verdict, self._belief.session_index)
+        answer = _in_map(answer, self._belief.session_index)
         clock.lap("decide")
-        in_space = None
         if query.in_space is not None:
-            verdict, in_space = settle_in_space(verdict, query.in_space, index.surface, index.config.accept)
+            answer = settle_in_space(answer, query.in_space, index.surface, index.config.accept)
             clock.lap("in_space")
-        answer = _answer(index, seen, verdict, tuple(self._history))
-        timing_ms = dict(clock.total_ms)
-        return query, replace(answer, prior=prior, excluded=excluded, in_space=in_space, timing_ms=timing_ms)
+        return query, _told(index, answer, self._history, clock)
 
 
 class Clock:
@@ -243,20 +240,16 @@ class Clock:
         self._last = now
 
 
-def _with_prior(
-    index: MapIndex, query: QueryMap, verdict: Verdict, found: tuple[Hypothesis, ...]
-) -> tuple[Literal["used", "lapsed", "ahead"] | None, Moment | None]:
-    """Return whether the prior was used, and, if no place that it allows is certain, the best place found
-    that it excludes."""
+def _with_prior(index: MapIndex, query: QueryMap, answer: Answer, found: tuple[Hypothesis, ...]) -> Answer:
+    """Return the answer with whether the prior was used, and, if no place that it allows is certain, the best
+    place found that it excludes."""
     if index.whole is None or index.region is None:
-        return None, None
+        return answer
     if not index.prior_applies(query):
-        return "ahead" if index.region.is_ahead(query) else "lapsed", None
-    if verdict.status == "located":
-        return "used", None
-    best = judge(index.whole, query, found)
+        return replace(answer, prior="ahead" if index.region.is_ahead(query) else "lapsed")
+    best = judge(index.whole, query, () if answer.located else found)
     excluded = best.hypotheses and not index.allows(query, best.hypotheses[0])
-    return "used", moment_of(index.whole, query, best) if excluded else None
+    return replace(answer, prior="used", excluded=best.moment if excluded else None)
 
 
 def _elsewhere(query: Query, alone: Answer, place: Hypothesis) -> float:
@@ -268,13 +261,13 @@ def _elsewhere(query: Query, alone: Answer, place: Hypothesis) -> float:
     return 1.0 + math.exp(alone.evidence.log_odds()) / first * (sum(alone.masses) - here)
 
 
-def _in_map(verdict: Verdict, session_index: int | None) -> Verdict:
-    """Return the verdict in which, of each place, the hypothesis in the map of one session comes first."""
+def _in_map(answer: Answer, session_index: int | None) -> Answer:
+    """Return the answer in which, of each place, the hypothesis in the map of one session comes first."""
     ordered = sorted(
-        zip(verdict.places, verdict.hypotheses, strict=True),
+        zip(answer.places, answer.hypotheses, strict=True),
         key=lambda each: (each[0], each[1].session_index != session_index),
     )
-    return replace(verdict, hypotheses=tuple(h for _, h in ordered))
+    return replace(answer, hypotheses=tuple(h for _, h in ordered))
 
 
 @one_blas_thread
@@ -295,12 +288,10 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     clock = Clock()
     query = map_as_query(grid, index.made_with, index.config, drawn=True)
     clock.lap("describe")
-    verdict, _ = decide(index, query)
+    answer, _ = decide(index, query)
     clock.lap("search")
-    at_origin = tuple(_at_origin(h, query.T_odom_base) for h in verdict.hypotheses)
-    verdict = replace(verdict, hypotheses=at_origin)
-    answer = _answer(index, replace(query, T_odom_base=SE2()), verdict, ())
-    return replace(answer, timing_ms=clock.total_ms)
+    at_origin = tuple(_at_origin(h, query.T_odom_base) for h in answer.hypotheses)
+    return _told(index, replace(answer, hypotheses=at_origin, T_odom_base=SE2()), (), clock)
 
 
 def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
@@ -311,45 +302,16 @@ def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
     return replace(hypothesis, fit=replace(fit, covariance=covariance))
 
 
-def moment_of(index: MapIndex, query: QueryMap, verdict: Verdict) -> Moment:
-    """Return the state of the answer now."""
-    best = verdict.hypotheses[0] if verdict.hypotheses else None
-    return Moment(
-        stamp_ns=query.stamp_ns,
-        path_m=query.path_m,
-        status=verdict.status,
-        session=index.sessions[best.session_index] if best else None,
-        pose=best.fit.T_map_query @ query.T_odom_base if best else None,
-        confidence=verdict.confidence,
-    )
-
-
-def _answer(index: MapIndex, query: QueryMap, verdict: Verdict, history: tuple[Moment, ...]) -> Answer:
-    located = verdict.hypotheses[0] if verdict.status == "located" else None
-    table = index.places.table
-    T_map_query = located.fit.T_map_query if located else None
-    return Answer(
-        status=verdict.status,
-        session=index.sessions[located.session_index] if located else None,
-        stamp_ns=query.stamp_ns,
-        T_map_base=T_map_query @ query.T_odom_base if T_map_query else None,
-        covariance=located.fit.covariance if located else None,
-        T_map_odom=T_map_query,
-        confidence=verdict.confidence,
-        hypotheses=verdict.hypotheses,
-        places=verdict.places,
-        masses=verdict.masses,
-        off_map=verdict.off_map,
-        history=(*history, moment_of(index, query, verdict)),
-        T_odom_base=query.T_odom_base,
-        path_m=query.path_m,
-        sessions=index.sessions,
-        labels=index.labels,
-        submap_ids=tuple(int(table.submap_id[h.row]) if h.row >= 0 else -1 for h in verdict.hypotheses),
-        evidence=verdict.evidence,
-        local_map=query.grid,
-        map=index.grids[verdict.hypotheses[0].session_index] if verdict.hypotheses else None,
-        views_m=tuple(view.center_m for view in query.views),
+def _told(index: MapIndex, answer: Answer, history: Iterable[Moment], clock: Clock) -> Answer:
+    """Return an answer, of which nothing is decided any more, with what shows it."""
+    ids = index.places.table.submap_id
+    best = answer.hypotheses[:1]
+    return replace(
+        answer,
+        submap_ids=tuple(int(ids[h.row]) if h.row >= 0 else -1 for h in answer.hypotheses),
+        map=index.grids[best[0].session_index] if best else None,
+        history=(*history, answer.moment),
+        timing_ms=dict(clock.total_ms),
     )
 
 

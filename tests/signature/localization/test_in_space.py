@@ -15,7 +15,7 @@ from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_sp
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, PointMap
 from signature.database import Label
-from signature.localization.answer import Verdict
+from signature.localization.answer import Answer
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.in_space import SPACE, log_odds_in_space, masses_of, settle_in_space
 from signature.localization.localizer import Estimate, Follower, Localizer
@@ -34,7 +34,7 @@ def points() -> MapSurface:
     return MapSurface(twin_map())
 
 
-def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[QueryInSpace, Verdict]:
+def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[QueryInSpace, Answer]:
     """A query, and the planar verdict that it lies in the rooms that begin at these x."""
     query, scans = QueryInSpace(), drive(height_m, cupboard=cupboard)
     for registered, _ in scans:
@@ -60,13 +60,19 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
     )
     alone = len(rooms_x_m) == 1
     mass = 0.95 if alone else 0.49
-    verdict = Verdict(
+    verdict = Answer(
         status="located" if alone else "ambiguous",
         confidence=mass,
         hypotheses=hypotheses,
         places=tuple(range(len(hypotheses))),
         masses=(mass,) * len(hypotheses),
         evidence=NO_EVIDENCE,
+        stamp_ns=0,
+        path_m=0.0,
+        T_odom_base=SE2(),
+        local_map=office(),
+        sessions=("twins",),
+        labels=(Label(),),
     )
     return query, verdict
 
@@ -78,7 +84,7 @@ def other_walls() -> MapSurface:
     return MapSurface(PointMap.of(np.concatenate((*floor, *walls)), 0.05))
 
 
-def base_of(verdict: Verdict, query: QueryInSpace) -> SE2:
+def base_of(verdict: Answer, query: QueryInSpace) -> SE2:
     """The base at the first hypothesis, in the plane."""
     assert query.T_odom_base is not None
     return verdict.hypotheses[0].fit.T_map_query @ SE2.from_matrix(query.T_odom_base)
@@ -89,7 +95,8 @@ def test_twins_in_the_plane_are_told_apart_by_their_height(
     height_m: float, x_m: float, points: MapSurface
 ) -> None:
     query, verdict = ask(height_m, 0.0, APART_M)
-    settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    settled = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    in_space = settled.in_space
     assert settled.status == "located" and settled.confidence > 0.9
     assert in_space is not None and in_space.status == "agrees"
     base = base_of(settled, query)
@@ -103,7 +110,8 @@ def test_twins_in_the_plane_are_told_apart_by_their_height(
 def test_equal_twins_stay_ambiguous(points: MapSurface) -> None:
     """Both hypotheses in the same room, which is taken for two places."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, 0.0)
-    settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    settled = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    in_space = settled.in_space
     assert settled.status == "ambiguous" and in_space is None
     assert settled.masses == pytest.approx((0.5, 0.5), abs=0.01)
 
@@ -116,7 +124,7 @@ def test_furniture_does_not_tell_twins_apart() -> None:
     assert isinstance(fits[0], SpatialFit) and isinstance(fits[1], SpatialFit)
     assert fits[1].on - fits[0].on > 0.05
     assert fits[1].compared.patches_over(fits[0].compared) == 0
-    settled, _ = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    settled = settle_in_space(verdict, query, lambda _: points, accept=0.9)
     assert settled.status == "ambiguous" and settled.masses == pytest.approx((0.5, 0.5), abs=0.01)
 
 
@@ -124,7 +132,8 @@ def test_a_located_pose_is_refined_and_becomes_surer(points: MapSurface) -> None
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     first = verdict.hypotheses[0]
     moved = replace(first, fit=replace(first.fit, T_map_query=first.fit.T_map_query @ SE2(0.1, -0.05, 0.03)))
-    settled, at = settle_in_space(replace(verdict, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
+    settled = settle_in_space(replace(verdict, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
+    at = settled.in_space
     assert settled.status == "located" and settled.confidence > 0.99
     # Not surer than the map.
     assert at is not None
@@ -138,7 +147,8 @@ def test_a_place_that_the_points_contradict_is_turned_down() -> None:
     """The map has the floor there, and walls that stand elsewhere."""
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     wrong = other_walls()
-    settled, in_space = settle_in_space(verdict, query, lambda _: wrong, accept=0.9)
+    settled = settle_in_space(verdict, query, lambda _: wrong, accept=0.9)
+    in_space = settled.in_space
     assert settled.status == "not_found" and settled.confidence < 0.9
     assert in_space is not None and in_space.status == "contradicts"
 
@@ -147,7 +157,8 @@ def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: Map
     """Its mass in the plane is small, as if its things had been moved; a wrong place has more."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M + 3.0)
     unsure = replace(verdict, status="not_found", confidence=0.2, places=(1, 0), masses=(0.2, 0.02))
-    settled, in_space = settle_in_space(unsure, query, lambda _: points, accept=0.9)
+    settled = settle_in_space(unsure, query, lambda _: points, accept=0.9)
+    in_space = settled.in_space
     assert settled.status == "located" and settled.places == (0, 1)
     assert in_space is not None and in_space.status == "agrees"
     assert base_of(settled, query).x < 4.9
@@ -166,7 +177,8 @@ def test_a_place_that_is_not_compared_keeps_its_odds(points: MapSurface) -> None
 def test_a_place_that_icp_leaves_is_turned_down(points: MapSurface) -> None:
     """0.65 m beside the right one; what it tells is the same wherever the place is."""
     query, verdict = ask(HEIGHTS_M[0], 0.65)
-    settled, in_space = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    settled = settle_in_space(verdict, query, lambda _: points, accept=0.9)
+    in_space = settled.in_space
     assert settled.status == "not_found" and in_space is None
     odds = 0.95 / 0.05 * math.exp(SPACE.left)
     assert settled.confidence == pytest.approx(odds / (1.0 + odds))
@@ -186,7 +198,8 @@ def test_a_place_that_is_turned_down_is_not_kept_for_one_that_is_not_compared() 
     query, verdict = ask(HEIGHTS_M[0], 0.0, 60.0)
     believed = replace(verdict, status="located", confidence=0.95, masses=(0.95, 0.01))
     wrong = other_walls()
-    settled, in_space = settle_in_space(believed, query, lambda _: wrong, accept=0.9)
+    settled = settle_in_space(believed, query, lambda _: wrong, accept=0.9)
+    in_space = settled.in_space
     assert settled.status == "not_found" and settled.confidence < 0.5
     assert in_space is not None and in_space.status == "contradicts"
 
@@ -201,7 +214,7 @@ def test_only_what_can_matter_is_compared(points: MapSurface) -> None:
 
     query, alone = ask(HEIGHTS_M[0], 0.0, APART_M)
     likely = replace(alone, status="located", confidence=0.95, masses=(0.95, 0.01))
-    assert settle_in_space(likely, query, points_of, accept=0.9)[0].status == "located"
+    assert settle_in_space(likely, query, points_of, accept=0.9).status == "located"
     assert len(asked) == 1
     settle_in_space(alone, query, points_of, accept=0.9)
     assert len(asked) == 3
@@ -209,8 +222,8 @@ def test_only_what_can_matter_is_compared(points: MapSurface) -> None:
 
 def test_without_points_on_a_side_nothing_changes(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
-    assert settle_in_space(verdict, query, lambda _: None, accept=0.9) == (verdict, None)
-    assert settle_in_space(verdict, QueryInSpace(), lambda _: points, accept=0.9) == (verdict, None)
+    assert settle_in_space(verdict, query, lambda _: None, accept=0.9) is verdict
+    assert settle_in_space(verdict, QueryInSpace(), lambda _: points, accept=0.9) is verdict
 
 
 def test_what_was_seen_before_tracking_was_lost_is_forgotten() -> None:
