@@ -11,7 +11,7 @@ import enum
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -291,10 +291,8 @@ class OccupancyGrid:
 
     def is_free(self, x_m: float, y_m: float) -> bool:
         """Return True if a point of the map frame lies in a free cell of the grid."""
-        row, column = (int(v) for v in self.to_cell(np.array([(x_m, y_m)]))[0])
-        height, width = self.cells.shape
-        inside = 0 <= row < height and 0 <= column < width
-        return inside and 0 <= int(self.cells[row, column]) < FREE_BELOW
+        (cell,) = self.look_up(self.cells, np.array([(x_m, y_m)]), UNKNOWN).tolist()
+        return bool(0 <= cell < FREE_BELOW)
 
     def to_cell(self, points_m: NDArray[np.floating]) -> I64:
         """Return the cells (N, 2), as (row, column), of points (N, 2) in the map frame; they may lie
@@ -305,6 +303,15 @@ class OccupancyGrid:
     def to_point(self, cells: NDArray[np.integer]) -> F64:
         """Return the centres (N, 2) of cells (N, 2), given as (row, column), in the map frame, metres."""
         return (np.asarray(cells)[:, ::-1] + 0.5) * self.resolution_m + self.origin_m
+
+    def look_up(self, values: NDArray[Any], points_m: NDArray[np.floating], outside: float) -> NDArray[Any]:
+        """Return the values (N,) of cells (H, W) at points (N, 2) in the map frame. outside : of points that
+        lie there."""
+        at = self.to_cell(points_m)
+        inside = ((at >= 0) & (at < values.shape)).all(axis=1)
+        found = np.full(len(at), outside, values.dtype)
+        found[inside] = values[tuple(at[inside].T)]
+        return found
 
     def crop(self, center_m: tuple[float, float], half_width_m: float) -> OccupancyGrid:
         """Return the square of (2 n + 1)^2 cells around the cell that holds `center_m`; unknown past the

@@ -136,10 +136,7 @@ def viewpoints_of(grid: OccupancyGrid, centers_m: F64) -> tuple[F32, I64]:
     reach = np.ceil(AROUND_M / LATTICE_M)
     axes = [np.arange(a - reach, b + reach + 1) for a, b in zip(low, high, strict=True)]
     lattice_m = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 2) * LATTICE_M
-    cells = grid.to_cell(lattice_m)
-    usable: BoolGrid = np.asarray(np.all((cells >= 0) & (cells < grid.cells.shape), axis=1))
-    usable[usable] = _roomy(grid)[tuple(cells[usable].T)]
-    lattice_m = lattice_m[usable]
+    lattice_m = lattice_m[grid.look_up(_roomy(grid), lattice_m, outside=False)]
     distance_m, place = cKDTree(centers_m).query(lattice_m)
     near = distance_m <= AROUND_M
     alone = np.setdiff1d(np.arange(len(centers_m)), place[near])

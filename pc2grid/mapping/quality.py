@@ -184,11 +184,7 @@ def _drawn(
     np.maximum.at(farthest_m, sector, range_m)
     ends_view = range_m > farthest_m[sector] - parameters.behind_m
     hits_m = pose.apply(keyframe.planar_scan.hits_m[ends_view & (range_m < parameters.reach_m)])
-    cells = grid.to_cell(hits_m)
-    inside = ((cells >= 0) & (cells < clear.shape)).all(axis=1)
-    on_clear = np.zeros(len(hits_m), np.bool_)
-    on_clear[inside] = clear[tuple(cells[inside].T)]
-    return _Drawn(keyframe.index, hits_m, on_clear)
+    return _Drawn(keyframe.index, hits_m, grid.look_up(clear, hits_m, outside=False))
 
 
 def _with_neighbours(scans: Iterable[_Drawn]) -> Iterator[tuple[_Drawn | None, _Drawn, _Drawn | None]]:

@@ -10,6 +10,7 @@ are blended by a Gaussian of the distance. A map without rows is rigid.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -198,6 +199,14 @@ class BuildingFrame:
     def to_session(self, points_m: F64) -> F64:
         """Transform points (N, 2) of the building into the session's map."""
         return undeformed(self.bend, self.T_building_session.inverse().apply(points_m))
+
+
+def by_building(frames: Mapping[str, BuildingFrame]) -> dict[str, dict[str, BuildingFrame]]:
+    """Return the joined sessions by the frame of their building. frames : by session."""
+    found: dict[str, dict[str, BuildingFrame]] = defaultdict(dict)
+    for session, at in frames.items():
+        found[at.name][session] = at
+    return found
 
 
 Deformation = tuple[tuple[float, float, float, float, float], ...]

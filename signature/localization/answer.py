@@ -247,12 +247,12 @@ class Answer:
     @property
     def session(self) -> str | None:
         """Return the session whose map frame the pose is in; None unless located."""
-        return self.located and self.sessions[self.located.session_index]
+        return None if self.located is None else self.sessions[self.located.session_index]
 
     @property
     def T_map_odom(self) -> SE2 | None:
         """Return what puts the whole query trajectory into the map; None unless located."""
-        return self.located and self.located.fit.T_map_query
+        return None if self.located is None else self.located.fit.T_map_query
 
     @property
     def T_map_base(self) -> SE2 | None:
@@ -262,7 +262,7 @@ class Answer:
     @property
     def covariance(self) -> F64 | None:
         """Return that of the pose, (3, 3) of x, y, yaw; None unless located."""
-        return self.located and self.located.fit.covariance
+        return None if self.located is None else self.located.fit.covariance
 
     @property
     def moment(self) -> Moment:
@@ -272,8 +272,8 @@ class Answer:
             stamp_ns=self.stamp_ns,
             path_m=self.path_m,
             status=self.status,
-            session=best and self.sessions[best.session_index],
-            pose=best and best.fit.T_map_query @ self.T_odom_base,
+            session=self.sessions[best.session_index] if best else None,
+            pose=best.fit.T_map_query @ self.T_odom_base if best else None,
             confidence=self.confidence,
         )
 
@@ -308,7 +308,7 @@ class Answer:
     @property
     def frame(self) -> str | None:
         """Return the frame of the building that the pose is in; None: the map frame of the session."""
-        return self.located and self.frame_of(self.located)
+        return None if self.located is None else self.frame_of(self.located)
 
     @property
     def stamped_pose(self) -> dict[str, Any] | None:

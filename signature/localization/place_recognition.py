@@ -11,6 +11,7 @@ them.
 from __future__ import annotations
 
 import math
+import pickle
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -67,7 +68,7 @@ class SessionRecognizer:
         self._config = config.relocalize.model_copy(update={"views": parameters.views})
         self._parameters = parameters
         # Grids are kept compressed: some 10 kB a stretch, so that a long session needs little memory.
-        self._stored: list[tuple[bytes, tuple[int, ...], float, tuple[float, float]]] = []
+        self._stored: list[bytes] = []
         self._map = lru_cache(parameters.maps)(lambda index: SearchMap.of(self._grid(index)))
         self._places: Places | None = None
 
@@ -97,10 +98,7 @@ class SessionRecognizer:
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:
         """Add the newest stretch to the places that later ones are looked up in."""
         index = len(self._stored)
-        layers = np.stack([grid.cells] if grid.heights is None else [grid.cells, grid.heights.view(np.int8)])
-        self._stored.append(
-            (zlib.compress(layers.tobytes(), 1), layers.shape, grid.resolution_m, grid.origin_m)
-        )
+        self._stored.append(zlib.compress(pickle.dumps(grid), 1))
         table = SignatureTable.bare(
             np.array([view.center_m for view in query.views]).reshape(-1, 2),
             np.full(len(query.views), index, np.int32),
@@ -115,14 +113,8 @@ class SessionRecognizer:
         self._places = Places(table, grids, self._made_with.partition.radius_m, [0.0] * count, known)
 
     def _grid(self, index: int) -> OccupancyGrid:
-        layers, shape, resolution_m, origin_m = self._stored[index]
-        cells, *heights = np.frombuffer(zlib.decompress(layers), np.int8).reshape(shape)
-        return OccupancyGrid(
-            cells=cells,
-            heights=heights[0].view(np.uint8) if heights else None,
-            resolution_m=resolution_m,
-            origin_m=origin_m,
-        )
+        grid: OccupancyGrid = pickle.loads(zlib.decompress(self._stored[index]))
+        return grid
 
 
 def recognizer_for(config: Config) -> SessionRecognizer | None:

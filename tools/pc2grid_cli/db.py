@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 from pc2grid.display import counted, plain, probability
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid_cli import console, options, output
-from pc2grid_cli.documents import Document, buildings, joined_document, stored_document
+from pc2grid_cli.documents import Document, joined_document, stored_document
 from signature.database import Problem, SessionInfo, SubmapDatabase, maintenance, open_database
 from signature.database.maintenance import shown
-from signature.database.protocol import largest_m
+from signature.database.protocol import by_building, largest_m
 
 if TYPE_CHECKING:
     from signature.localization.joining.building import Joined
@@ -35,7 +35,9 @@ def info(given: options.DbInfo, terminal: console.Console) -> None:
     }
     submaps = counted(sum(session.submaps for session in sessions), "submap")
     lines = [f"{where}: {counted(len(sessions), 'session')}, {submaps}", *map(_line, sessions)]
-    lines += [f"  joined, in the frame of {name}: {', '.join(of)}" for name, of in buildings(frames).items()]
+    lines += [
+        f"  joined, in the frame of {name}: {', '.join(of)}" for name, of in by_building(frames).items()
+    ]
     console.print_result(plain(about) if given.json else "\n".join(map(one_line, lines)))
 
 
@@ -165,7 +167,7 @@ def _report(found: Joined, alone: Sequence[str], *, stored: bool) -> None:
     for pair in found.pairs:
         pairs.add_row(*map(one_line, _row(pair)))
     lines = []
-    for name, sessions in buildings(found.frames).items():
+    for name, sessions in by_building(found.frames).items():
         lines.append(f"in the frame of {name}:")
         for session, at in sessions.items():
             T = at.T_building_session
@@ -204,7 +206,7 @@ def _draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
     """Draw the building with most sessions; nothing if none is joined."""
     from signature.localization.shown.picture import draw_building
 
-    known = buildings(found.frames)
+    known = by_building(found.frames)
     if not known:
         console.warn(f"{path}: not written, no two sessions are joined")
         return

@@ -10,8 +10,6 @@ from __future__ import annotations
 import json
 import re
 import statistics
-from collections import defaultdict
-from collections.abc import Mapping
 from importlib.resources import files
 from typing import Any
 
@@ -127,14 +125,6 @@ def joined_document(session: str, frame: BuildingFrame) -> Document:
         "covariance": frame.covariance,
         "bent_m": round(largest_m(frame.bend), 3),
     }
-
-
-def buildings(frames: Mapping[str, BuildingFrame]) -> dict[str, dict[str, BuildingFrame]]:
-    """Return the joined sessions by the frame of their building. frames : by session."""
-    found: dict[str, dict[str, BuildingFrame]] = defaultdict(dict)
-    for session, at in frames.items():
-        found[at.name][session] = at
-    return found
 
 
 def _summary(precision: Precision | None) -> Document | None:

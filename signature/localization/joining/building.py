@@ -44,13 +44,19 @@ from pc2grid.model import (
     Trajectory,
 )
 from pc2grid.observer import Observer
-from signature.database.protocol import BuildingFrame, Covariance, Deformation, SessionInfo, largest_m
+from signature.database.protocol import (
+    BuildingFrame,
+    Covariance,
+    Deformation,
+    SessionInfo,
+    by_building,
+    largest_m,
+)
 from signature.database.rows import no_session
 from signature.localization.joining.join import (
     Link,
     Names,
     SessionPair,
-    by_building,
     compare_pairs,
     told_apart,
 )
@@ -504,7 +510,8 @@ def _drawn(
     """Yield for each map the window of the grid that it lies in, and its values for the cells there."""
     for grid, frame in maps:
         rows, columns = _covered(whole, _corners(grid, frame))
-        told = _cells_at(grid, _as_drawn(frame, whole, rows, columns).reshape(-1, 2))
+        there_m = _as_drawn(frame, whole, rows, columns).reshape(-1, 2)
+        told = grid.look_up(grid.cells, there_m, UNKNOWN)
         window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         yield window, told.reshape(len(rows), len(columns))
 
@@ -549,21 +556,10 @@ def _covered(
     return np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
 
 
-def _cells_at(grid: OccupancyGrid, points_m: NDArray[np.float64]) -> NDArray[np.int8]:
-    """Return the cells (N,) of a grid at points (N, 2); unknown outside."""
-    at = grid.to_cell(points_m)
-    inside = ((at >= 0) & (at < grid.cells.shape)).all(axis=1)
-    found = np.full(len(at), UNKNOWN, np.int8)
-    found[inside] = grid.cells[tuple(at[inside].T)]
-    return found
-
-
 def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> tuple[tuple[str, ...], ...]:
     """Return the joined sessions of each floor, the oldest first. frames : of sessions, by name."""
-    floors: dict[str, list[str]] = {}
-    for name in (info.name for info in database.sessions() if info.name in frames):
-        floors.setdefault(frames[name].name, []).append(name)
-    return tuple(tuple(names) for names in floors.values())
+    joined = {info.name: frames[info.name] for info in database.sessions() if info.name in frames}
+    return tuple(map(tuple, by_building(joined).values()))
 
 
 def map_of(database: SubmapDatabase, session: str, frames: Mapping[str, BuildingFrame]) -> OccupancyGrid:

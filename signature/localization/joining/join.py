@@ -16,23 +16,22 @@ from __future__ import annotations
 
 import functools
 import math
-from collections import defaultdict
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations
-from typing import TYPE_CHECKING, Literal
+from itertools import combinations, islice
+from typing import TYPE_CHECKING, Literal, TypeVar
 
 import cv2
 import numpy as np
 
-from pc2grid.geometry import F32, F64, SE2, BoolGrid, freeze, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, freeze, wrap_angle
 from pc2grid.matching.score import Fit, refine, score_fit, self_similarity
 from pc2grid.matching.search import SearchMap
 from pc2grid.matching.walls import LIKELIHOOD, Walls
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.observer import Observer
-from signature.database.protocol import BuildingFrame, SessionInfo
+from signature.database.protocol import SessionInfo
 from signature.localization.hypotheses import HYPOTHESES, moved_to_origin, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import NO_EVIDENCE, POSTERIOR, Evidence, evidence_of, masses
@@ -121,14 +120,6 @@ def compare_pairs(
             join = join_maps(prepared(a), prepared(b), labelled=labelled)
             yield SessionPair(target=a, source=b, join=join)
             observer.on_progress(done / len(pairs))
-
-
-def by_building(frames: Mapping[str, BuildingFrame]) -> dict[str, list[str]]:
-    """Return the names of the sessions of each building, by the name of its frame."""
-    found: dict[str, list[str]] = defaultdict(list)
-    for name, at in frames.items():
-        found[at.name].append(name)
-    return found
 
 
 @dataclass(frozen=True)  # no slots, for what is computed once
@@ -237,28 +228,20 @@ def join_maps(
 
 def _candidates(target: JoinableMap, points_m: F32, pieces: Sequence[Piece]) -> list[_ExactTransform]:
     """Return the transforms of a source that its pieces propose, no two alike."""
-    found: list[_ExactTransform] = []
-    for proposal in proposals(target.index, pieces):
-        refined = _refined(target, points_m, pieces, proposal)
-        if not any(_same(refined, other) for other in found):
-            found.append(refined)
-    return found
+    refined = (_refined(target, points_m, pieces, one) for one in proposals(target.index, pieces))
+    return list(_distinct(refined))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ExactTransform:
-    """A transform that was made exact by walls. at : the piece of the source that proposed it. fits : of each
-    piece of the source. links : of those that agree. covariance : (3, 3) of the transform at `at`."""
+    """A transform that was made exact by walls. at_m : the piece of the source that proposed it. fits : of
+    each piece of the source. links : of those that agree. covariance : (3, 3) of the transform at `at_m`."""
 
     T_target_source: SE2
-    at: SE2
+    at_m: tuple[float, float]
     fits: tuple[Fit, ...]
     links: tuple[Link, ...]
     covariance: F64
-
-
-def _same(a: _ExactTransform, b: _ExactTransform) -> bool:
-    return same_pose(a.T_target_source @ a.at, b.T_target_source @ a.at)
 
 
 def _refined(
@@ -276,7 +259,7 @@ def _refined(
     covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
     return _ExactTransform(
         T_target_source=T_target_source,
-        at=SE2(*proposal.at_m),
+        at_m=proposal.at_m,
         fits=fits,
         links=links,
         covariance=covariance,
@@ -365,10 +348,12 @@ def _judged(
     probability = float(masses([evidence] * equal, odds)[0])
     # Of thousands of wall points a small lead is much, even where walls fit as wrong places do.
     enough = common_m2 >= parameters.least_m2 and min(forward, backward) >= JOIN.follows
+    # That the source lies here, or at a place that fits equally well, is more probable than not.
+    doubt: JoinStatus = "ambiguous" if evidence.log_odds() + math.log(odds) > 0.0 else "different"
     return Join(
-        status=_status(evidence, odds, probability, enough, parameters),
+        status="joined" if enough and probability >= parameters.accept else doubt,
         T_target_source=candidate.T_target_source,
-        covariance=moved_to_origin(candidate.covariance, candidate.T_target_source, candidate.at),
+        covariance=moved_to_origin(candidate.covariance, candidate.T_target_source, SE2(*candidate.at_m)),
         probability=probability,
         agreement=min(forward, backward),
         common_m2=common_m2,
@@ -378,22 +363,13 @@ def _judged(
     )
 
 
-def _status(
-    evidence: Evidence, odds: float, probability: float, enough: bool, parameters: JoinParameters
-) -> JoinStatus:
-    """Return the status of a transform. enough : whether enough is in common, and alike, to be joined."""
-    if enough and probability >= parameters.accept:
-        return "joined"
-    # That the source lies here, or at a place that fits equally well, is more probable than not.
-    return "ambiguous" if evidence.log_odds() + math.log(odds) > 0.0 else "different"
-
-
 def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> OccupancyGrid:
     """Return the source without what the target does not know, widened by `JoinParameters.wall_m`."""
     n = math.ceil(JOIN.wall_m / target.resolution_m)
     known = cv2.dilate((target.cells != UNKNOWN).astype(np.uint8), np.ones((2 * n + 1, 2 * n + 1), np.uint8))
     cells = np.argwhere(source.cells != UNKNOWN)
-    inside = _looked_up(known.astype(bool), target, T_target_source.apply(source.to_point(cells)))
+    there_m = T_target_source.apply(source.to_point(cells))
+    inside = target.look_up(known.astype(bool), there_m, outside=False)
     left = source.cells.copy()
     left[tuple(cells[~inside].T)] = UNKNOWN
     return replace(source, cells=left)
@@ -402,15 +378,7 @@ def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE
 def free_in_both(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> float:
     """Return how many square metres are free in both."""
     points_m = T_target_source.apply(source.to_point(np.argwhere(source.free)))
-    return float(_looked_up(target.free, target, points_m).sum()) * source.resolution_m**2
-
-
-def _looked_up(mask: BoolGrid, grid: OccupancyGrid, points_m: F64) -> BoolGrid:
-    """Return the values (N,) of a mask over a grid at points (N, 2); False outside."""
-    at = grid.to_cell(points_m)
-    inside: BoolGrid = np.asarray(((at >= 0) & (at < mask.shape)).all(axis=1))
-    inside[inside] = mask[tuple(at[inside].T)]
-    return inside
+    return float(target.look_up(target.free, points_m, outside=False).sum()) * source.resolution_m**2
 
 
 _MIRROR = np.array((-1.0, 1.0), np.float32)
@@ -427,16 +395,13 @@ class Proposal:
     log_odds: float
 
 
+_TransformT = TypeVar("_TransformT", Proposal, _ExactTransform)
+
+
 def proposals(target: MapIndex, pieces: Sequence[Piece]) -> list[Proposal]:
     """Return how a source may lie in a target, the likeliest transform first, no two alike."""
     every = [one for piece in pieces for one in _places_of(target, piece)]
-    found: list[Proposal] = []
-    for proposal in sorted(every, key=lambda one: -one.log_odds):
-        if len(found) == JOIN.proposed:
-            break
-        if not any(_alike(proposal, other) for other in found):
-            found.append(proposal)
-    return found
+    return list(islice(_distinct(sorted(every, key=lambda one: -one.log_odds)), JOIN.proposed))
 
 
 def _places_of(target: MapIndex, piece: Piece) -> list[Proposal]:
@@ -449,10 +414,14 @@ def _places_of(target: MapIndex, piece: Piece) -> list[Proposal]:
     ]
 
 
-def _alike(a: Proposal, b: Proposal) -> bool:
-    """Tell whether both put the piece of the first at one place."""
-    at = SE2(*a.at_m)
-    return same_pose(a.T_target_source @ at, b.T_target_source @ at)
+def _distinct(transforms: Iterable[_TransformT]) -> Iterator[_TransformT]:
+    """Yield the transforms that put their piece of the source at another place than all before them."""
+    found: list[_TransformT] = []
+    for one in transforms:
+        at = SE2(*one.at_m)
+        if not any(same_pose(one.T_target_source @ at, other.T_target_source @ at) for other in found):
+            found.append(one)
+            yield one
 
 
 @dataclass(frozen=True, slots=True)
@@ -469,11 +438,6 @@ class Piece:
         x, y = query.walls.points_m.mean(axis=0).tolist() if len(query.walls.points_m) else (0.0, 0.0)
         return Piece(query, (x, y))
 
-    @property
-    def walls(self) -> Walls:
-        """Return its walls."""
-        return self.query.walls
-
 
 def pieces_of(index: MapIndex) -> tuple[Piece, ...]:
     """Cut the map of one session into squares, and keep those with enough walls."""
@@ -484,7 +448,7 @@ def pieces_of(index: MapIndex) -> tuple[Piece, ...]:
         _square(grid, row, column, side) for row in range(0, height, side) for column in range(0, width, side)
     )
     pieces = (Piece.of(square, index) for square in squares if (square.cells > UNKNOWN).any())
-    return tuple(piece for piece in pieces if piece.walls.weight >= JOIN.least_walls)
+    return tuple(piece for piece in pieces if piece.query.walls.weight >= JOIN.least_walls)
 
 
 def mirrored(piece: Piece, index: MapIndex) -> Piece:
@@ -523,9 +487,9 @@ def align_pieces(
             nearest = np.argmin(np.hypot(*(centers_m[trusted] - centers_m[number]).T))
             start = fits[trusted[int(nearest)]].T_map_query
         piece = pieces[number]
-        points_m = piece.walls.facing(target.walls).points_m
+        points_m = piece.query.walls.facing(target.walls).points_m
         pose, covariance = refine(target.field, points_m, start, piece.center_m)
-        fits[number] = fit = score_fit(target.walls, piece.walls, pose, covariance)
+        fits[number] = fit = score_fit(target.walls, piece.query.walls, pose, covariance)
         if fit.known_agreement_both_ways >= JOIN.follows:
             trusted.append(number)
     return tuple(fits[number] for number in range(len(pieces)))

@@ -33,7 +33,7 @@ import numpy as np
 from pc2grid._version import __version__
 from pc2grid.display import adapter
 from pc2grid.errors import OutputError
-from pc2grid.geometry import F32, F64, I64, SE2, BoolGrid
+from pc2grid.geometry import F32, F64, I64, SE2
 from pc2grid.io.atomic import replace_file, require_writable
 from pc2grid.matching.score import Support
 from pc2grid.model import Consistency, Loop, OccupancyGrid, Precision, ReadReport, Submap, Trajectory
@@ -498,13 +498,8 @@ def why_here(answer: Answer, database: SubmapDatabase) -> dict[str, Any] | None:
 
 def _document(view: ComparedView) -> dict[str, Any]:
     names = ("boundary", "freespace", "symmetry")
-    drawn = {name: [_short_number(getattr(side, name)) for side in (view.query, view.map)] for name in names}
+    drawn = {name: [_short(getattr(side, name), 3) for side in (view.query, view.map)] for name in names}
     return {"log_ratio": None if view.log_ratio is None else round(view.log_ratio, 2)} | drawn
-
-
-def _short_number(values: np.ndarray) -> list[float]:
-    """Return shares, to three digits behind the point."""
-    return [round(v, 3) for v in values.tolist()]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -564,17 +559,9 @@ def compare_views(
     return tuple(
         ComparedView(at_m=view, query=mine, map=other, log_ratio=ratio if free else None)
         for view, mine, other, ratio, free in zip(
-            views_m, own, theirs, counted, _free_at(grid, there_m), strict=True
+            views_m, own, theirs, counted, grid.look_up(grid.free, there_m, outside=False), strict=True
         )
     )
-
-
-def _free_at(grid: OccupancyGrid, points_m: F64) -> list[bool]:
-    """Return whether the cells at points (N, 2) are free."""
-    cells = grid.to_cell(points_m)
-    inside: BoolGrid = np.asarray(((cells >= 0) & (cells < grid.cells.shape)).all(axis=1))
-    inside[inside] = grid.free[tuple(cells[inside].T)]
-    return [bool(free) for free in inside]
 
 
 def _described(

@@ -6,8 +6,6 @@ import io
 import itertools
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -52,55 +50,33 @@ _CLOSE_SHARE = 0.5
 """A close-up is drawn if the query is shorter than this share of the map."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Box:
-    """A part of a map frame, metres."""
+def _box(points_m: F64, margin_m: float = 0.0) -> F64:
+    """Return the box around points (N, 2), or around the corners of boxes: (2, 2), low and high corner."""
+    return np.array((points_m.min(axis=0) - margin_m, points_m.max(axis=0) + margin_m), np.float64)
 
-    left: float
-    right: float
-    bottom: float
-    top: float
 
-    @staticmethod
-    def around(points_m: F64, margin_m: float = 0.0) -> _Box:
-        """Return the box of points (N, 2)."""
-        (left, bottom), (right, top) = points_m.min(axis=0) - margin_m, points_m.max(axis=0) + margin_m
-        return _Box(float(left), float(right), float(bottom), float(top))
+def _with_ratio(box: F64, height_by_width: float) -> F64:
+    """Return the smallest box around one with a given ratio of its sides."""
+    width_m, height_m = np.ptp(box, axis=0)
+    half_m = 0.5 * max(width_m, height_m / height_by_width)
+    return np.asarray(
+        box.mean(axis=0) + half_m * np.array(((-1.0, -height_by_width), (1.0, height_by_width)))
+    )
 
-    @property
-    def width_m(self) -> float:
-        """Return the width, in x."""
-        return self.right - self.left
 
-    @property
-    def height_m(self) -> float:
-        """Return the height, in y."""
-        return self.top - self.bottom
-
-    def with_ratio(self, height_by_width: float) -> _Box:
-        """Return the smallest box around this one with a given ratio of its sides."""
-        x, y = 0.5 * (self.left + self.right), 0.5 * (self.bottom + self.top)
-        half_x = 0.5 * max(self.width_m, self.height_m / height_by_width)
-        half_y = half_x * height_by_width
-        return _Box(x - half_x, x + half_x, y - half_y, y + half_y)
-
-    def united(self, other: _Box) -> _Box:
-        """Return the smallest box around both."""
-        left, right = min(self.left, other.left), max(self.right, other.right)
-        return _Box(left, right, min(self.bottom, other.bottom), max(self.top, other.top))
-
-    def __contains__(self, pose: SE2) -> bool:
-        return self.left < pose.x < self.right and self.bottom < pose.y < self.top
+def _in_panel(axes: Any, pose: SE2) -> bool:
+    """Return whether a pose lies within what a panel shows."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    return bool(left < pose.x < right and bottom < pose.y < top)
 
 
 def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...]:
     """Return for each hypothesis of an answer, best first, what supports and what contradicts it."""
     query = Walls.of(answer.local_map)
-    indices = {hypothesis.session_index for hypothesis in answer.hypotheses}
-    names = {index: answer.sessions[index] for index in indices}
     maps = {
         index: Walls.of(database.grid(name), drawn=not len(database.trajectory(name)))
-        for index, name in names.items()
+        for index, name in enumerate(answer.sessions)
+        if index in {hypothesis.session_index for hypothesis in answer.hypotheses}
     }
     return tuple(
         agreement(maps[hypothesis.session_index], query, hypothesis.fit.T_map_query)
@@ -148,10 +124,10 @@ def draw_building(path: Path, name: str, maps: Mapping[str, tuple[OccupancyGrid,
     write_figure(_with_legend(figure, panels[0]), path)
 
 
-def _around_walls(walls: Iterable[F64]) -> _Box:
+def _around_walls(walls: Iterable[F64]) -> F64:
     """Return the box of all walls; of none a square metre."""
-    boxes = [_Box.around(points_m, _CLOSE_MARGIN_M) for points_m in walls if len(points_m)]
-    return reduce(_Box.united, boxes or [_Box(0.0, 1.0, 0.0, 1.0)])
+    boxes = [_box(points_m, _CLOSE_MARGIN_M) for points_m in walls if len(points_m)]
+    return _box(np.concatenate(boxes or [np.eye(2)]))
 
 
 def draw_answer(
@@ -194,9 +170,9 @@ def answer_figure(
         compared = agreement(walls, Walls.of(answer.local_map), best.fit.T_map_query)
     whole, close = _known(grid), None
     if best is not None and compared is not None and len(compared.points_m):
-        close = _Box.around(best.fit.T_map_query.apply(compared.points_m), _CLOSE_MARGIN_M)
-        whole = whole.united(close)
-        if max(close.width_m, close.height_m) > _CLOSE_SHARE * max(whole.width_m, whole.height_m):
+        close = _box(best.fit.T_map_query.apply(compared.points_m), _CLOSE_MARGIN_M)
+        whole = _box(np.concatenate((whole, close)))
+        if np.ptp(close, axis=0).max() > _CLOSE_SHARE * np.ptp(whole, axis=0).max():
             close = None
     figure, panels = _panels(whole, *(() if close is None else (close,)))
     for axes in panels:
@@ -258,30 +234,31 @@ def _title(answer: Answer, session: str, compared: Agreement | None) -> str:
     )
 
 
-def _known(grid: OccupancyGrid) -> _Box:
+def _known(grid: OccupancyGrid) -> F64:
     """Return the part of the map that is known, with a margin."""
     cells = np.argwhere(grid.cells >= 0)
     if not len(cells):
         cells = np.array([(0, 0), grid.cells.shape])
     corners = np.array([cells.min(axis=0), cells.max(axis=0) + 1])[:, ::-1]
     corners_m = np.asarray(grid.origin_m) + corners * grid.resolution_m
-    return _Box.around(corners_m, _MARGIN * float(np.ptp(corners_m, axis=0).max()))
+    return _box(corners_m, _MARGIN * float(np.ptp(corners_m, axis=0).max()))
 
 
-def _panels(whole: _Box, *more: _Box) -> tuple[Any, list[Any]]:
+def _panels(whole: F64, *more: F64) -> tuple[Any, list[Any]]:
     """Return a figure with a panel for a map and, beside or below it, one for each other box."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    ratio = float(np.clip(whole.height_m / whole.width_m, 0.1, 2.5))
-    boxes, sizes_in = [whole.with_ratio(ratio)], [(_WIDTH_IN, _WIDTH_IN * ratio)]
+    width_m, height_m = np.ptp(whole, axis=0)
+    ratio = float(np.clip(height_m / width_m, 0.1, 2.5))
+    boxes, sizes_in = [_with_ratio(whole, ratio)], [(_WIDTH_IN, _WIDTH_IN * ratio)]
     beside = ratio > 0.8
     if more:
         if beside:
             sizes_in = [(_WIDTH_IN * 0.6, _WIDTH_IN * 0.6 * ratio)] * (1 + len(more))
         else:
             sizes_in += [(_WIDTH_IN, _WIDTH_IN * 0.55)] * len(more)
-        boxes += [box.with_ratio(sizes_in[1][1] / sizes_in[1][0]) for box in more]
+        boxes += [_with_ratio(box, sizes_in[1][1] / sizes_in[1][0]) for box in more]
     step = (1, 0) if beside else (0, 1)
     total_in = [
         sum(size[k] for size in sizes_in) + _GAP_IN * (len(boxes) - 1) if step[k] else sizes_in[0][k]
@@ -293,8 +270,8 @@ def _panels(whole: _Box, *more: _Box) -> tuple[Any, list[Any]]:
     for box, (width, height) in zip(boxes, sizes_in, strict=True):
         place = (left / total_in[0], (top - height) / total_in[1], width / total_in[0], height / total_in[1])
         axes = figure.add_axes(place)
-        axes.set_xlim(box.left, box.right)
-        axes.set_ylim(box.bottom, box.top)
+        axes.set_xlim(*box[:, 0])
+        axes.set_ylim(*box[:, 1])
         axes.set_aspect("equal")
         axes.set_facecolor(_colour(UNKNOWN))
         axes.tick_params(labelsize=8, color=GREY, labelcolor="#444444")
@@ -327,9 +304,7 @@ def _draw_map(axes: Any, grid: OccupancyGrid) -> None:
 
 
 def _draw_submaps(axes: Any, database: SubmapDatabase, session: str) -> None:
-    index = [info.name for info in database.sessions()].index(session)
-    table = database.signatures()
-    centers = table.center_m[table.session_index == index]
+    centers = database.signatures(session).center_m
     label = counted(len(centers), "submap centre")
     axes.plot(centers[:, 0], centers[:, 1], ".", color=GREEN, ms=4, label=label)
 
@@ -367,7 +342,7 @@ def _draw_robot(axes: Any, best: Hypothesis, answer: Answer, poses: Trajectory) 
         )
         axes.plot(path[:, 0], path[:, 1], color=PURPLE, lw=1.8, label=label)
     pose = best.fit.T_map_query @ answer.T_odom_base
-    if pose not in _Box(*axes.get_xlim(), *axes.get_ylim()):
+    if not _in_panel(axes, pose):
         return
     _draw_arrow(axes, pose, PURPLE)
     label = "robot at the last scan" if answer.status == "located" else "robot, if it were here"
@@ -390,13 +365,12 @@ def _draw_arrow(axes: Any, pose: SE2, colour: str) -> None:
 
 def _draw_rivals(axes: Any, answer: Answer, session: str) -> None:
     """Draw the next hypotheses in this session, where they lie within the panel."""
-    box = _Box(*axes.get_xlim(), *axes.get_ylim())
     places = [
         h.fit.T_map_query @ answer.T_odom_base
         for h in answer.hypotheses[1:6]
         if answer.sessions[h.session_index] == session
     ]
-    shown = [(pose.x, pose.y) for pose in places if pose in box]
+    shown = [(pose.x, pose.y) for pose in places if _in_panel(axes, pose)]
     if shown:
         label = "other hypotheses"
         axes.plot(*zip(*shown, strict=True), "s", color=PURPLE, ms=6, mfc="none", mew=1.5, label=label)

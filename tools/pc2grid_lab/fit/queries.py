@@ -34,7 +34,7 @@ import numpy as np
 import typer
 
 from pc2grid.errors import Pc2GridError
-from pc2grid.geometry import F32, F64, SE2, BoolGrid
+from pc2grid.geometry import F32, F64, SE2
 from pc2grid.io.maps import load_map
 from pc2grid.io.recording import open_log
 from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid
@@ -146,9 +146,7 @@ def pairs_of(
         for grid, T_plan_map in maps:
             there = (T_plan_map.inverse() @ T_plan_query).apply(views_m)
             there = there + rng.uniform(-_BESIDE_M, _BESIDE_M, there.shape)
-            cells = grid.to_cell(there)
-            free: BoolGrid = np.all((cells >= 0) & (cells < grid.cells.shape), axis=1)
-            free[free] = grid.free[cells[free, 0], cells[free, 1]]
+            free = grid.look_up(grid.free, there, outside=False)
             if free.any():
                 found.append(views[free])
                 same.append(described(grid, there[free]))
@@ -280,9 +278,8 @@ def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> Occupan
     known = (query.grid.cells != UNKNOWN).astype(np.uint8)
     known = cv2.dilate(known, np.ones((2 * n + 1, 2 * n + 1), np.uint8))
     cells = np.argwhere(grid.cells != UNKNOWN)
-    at = query.grid.to_cell(T_map_query.inverse().apply(grid.to_point(cells)))
-    inside = np.all((at >= 0) & (at < known.shape), axis=1)
-    seen = cells[inside][known[tuple(at[inside].T)] > 0]
+    at_m = T_map_query.inverse().apply(grid.to_point(cells))
+    seen = cells[query.grid.look_up(known, at_m, outside=0) > 0]
     left = grid.cells.copy()
     left[tuple(seen.T)] = UNKNOWN
     return replace(grid, cells=left)

@@ -44,7 +44,7 @@ def test_a_map_that_tells_heights_is_cut_in_the_same_pieces() -> None:
     assert len(tells.pieces) == len(west.pieces) > 1  # the map is larger than a piece
     for piece, same in zip(tells.pieces, west.pieces, strict=True):
         # Where walls meet, they are solid, and have no points inside.
-        assert 0.9 * same.walls.weight < piece.walls.weight <= same.walls.weight
+        assert 0.9 * same.query.walls.weight < piece.query.walls.weight <= same.query.walls.weight
 
 
 @pytest.mark.parametrize("lidar_asked", [True, False])
