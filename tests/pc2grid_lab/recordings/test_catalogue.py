@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import os
 import re
+from itertools import combinations
 from pathlib import Path
 
 import pytest
 
-from pc2grid_lab.recordings.catalogue import PAIR_KINDS, PAIRS, RECORDINGS, Catalogue, evenly_spaced
+from pc2grid_lab.recordings.catalogue import (
+    FOREIGN_MAPS,
+    NOT_ALIKE,
+    PAIR_KINDS,
+    PAIRS,
+    RECORDINGS,
+    Catalogue,
+    evenly_spaced,
+)
 
 DATA = Path(os.environ.get("PC2GRID_DATA", Path(__file__).resolve().parents[4] / ".." / "shared" / "data"))
 needs_data = pytest.mark.skipif(not (DATA / "README.md").is_file(), reason="PC2GRID_DATA is not there")
@@ -48,6 +57,18 @@ def test_names_are_unique_and_pairs_name_recordings() -> None:
         else:
             assert pair.query != pair.map, pair
     assert {pair.kind for pair in PAIRS} == set(PAIR_KINDS)
+
+
+def test_all_maps_of_one_building_are_compared_and_each_with_some_of_others() -> None:
+    joins = Catalogue.of().joins
+    building = {recording.name: recording.building for recording in RECORDINGS}
+    names = {name for pair in joins for name in pair}
+    same = {pair for pair in joins if building[pair[0]] == building[pair[1]]}
+    others = [name for pair in {*joins} - same for name in pair]
+    assert len({frozenset(pair) for pair in joins}) == len(joins) and {*NOT_ALIKE} <= {*joins}
+    assert len(same) == sum(building[a] == building[b] for a, b in combinations(names, 2))
+    assert "wean.yaml" in names and not any("without" in name or "every" in name for name in names)
+    assert min(others.count(name) for name in names) >= FOREIGN_MAPS
 
 
 def test_the_quick_form_is_a_part_of_all() -> None:

@@ -11,6 +11,7 @@ import pytest
 from pc2grid_lab.pages import by_chance, clopper_pearson
 from pc2grid_lab.recordings.judging import warned
 from pc2grid_lab.recordings.table import (
+    JoinRow,
     MapRow,
     PairRow,
     QueryRow,
@@ -223,3 +224,16 @@ def test_a_terminal_shows_each_row(capsys: pytest.CaptureFixture[str]) -> None:
     lines = [line.split() for line in capsys.readouterr().out.splitlines()]
     assert ["hall", "lidar", "1.0", "30", "10.0", "1", "0.0", "0.030", "poses"] in lines
     assert ["b", "a", "laser", "3", "3", "2", "1", "1", "0", "1", "0.040", "2.0", "poses"] in lines
+
+
+def test_a_pair_of_maps_that_is_joined_wrongly_now_is_worse() -> None:
+    kept = JoinRow(target="a", source="b", same=False, status="ambiguous", right=False)
+    before = Table(program="", commit="", quick=False, cpu_s=0.0, maps=(), pairs=(), joins=(kept,))
+    after = replace(before, joins=(replace(kept, status="joined"),))
+    assert changes(before, before) == []
+    assert changes(before, after) == [
+        RowChange(row="b joined with a", text="not joined -> wrong", worse=True)
+    ]
+    page = " ".join(markdown_page(after).split())
+    assert "| a | b | two | joined |" in page and "Of 1 pairs of two buildings 1 are joined" in page
+    assert Table.from_json(after.to_json()) == after and "Of 0 pairs of one building 0 join right" in page

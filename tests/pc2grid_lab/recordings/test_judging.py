@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from pc2grid_lab.recordings import judging
 from pc2grid_lab.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
 from pc2grid_lab.recordings.judging import Judge, LocatedWindow, RecordedDrive, known_share, levelled
 from pc2grid_lab.recordings.run import Folder
+from pc2grid_lab.recordings.table import JoinRow
 from pc2grid_lab.runner import Finished
 
 T_A_B, T_PLAN_A = SE2(3.0, -1.0, 0.4), SE2(20.0, 8.0, -1.2)
@@ -52,7 +53,8 @@ class Known(Judge):
     """A judge who is told the answers."""
 
     def __init__(self, answers: Mapping[Pair, list[LocatedWindow]]) -> None:
-        catalogue = Catalogue(recordings=RECORDINGS, mapped=(), pairs=tuple(answers))
+        mapped = tuple(RECORDINGS.values())
+        catalogue = Catalogue(recordings=RECORDINGS, mapped=mapped, pairs=tuple(answers))
         super().__init__(catalogue, Folder(Path("/data"), Path("/work")))
         self._windows.update(answers)
 
@@ -178,6 +180,30 @@ def test_what_cannot_be_judged_is_a_row_that_says_why(monkeypatch: pytest.Monkey
     monkeypatch.setattr(judging, "_agreed", broken)
     row = Known(answers(a=(T_PLAN_A,), b=(T_PLAN_A,))).row(B_IN_A)
     assert row.problem == "KeyError: 'hypotheses'"
+
+
+def test_a_join_is_judged_by_the_answers_that_relate_its_maps(monkeypatch: pytest.MonkeyPatch) -> None:
+    """b is located in a, and a in the plan: how b lies in the plan follows."""
+    way = Trajectory(stamps_ns=np.arange(4), T_session_base=np.array([pose(k).lift() for k in range(4)]))
+    monkeypatch.setattr(judging, "drive_of", lambda *_: RecordedDrive((way,), None))
+    known = {
+        B_IN_A: [located("b", k, T_A_B @ pose(k)) for k in range(4)],
+        A_IN_PLAN: [located("a", k, T_PLAN_A @ pose(k)) for k in range(4)],
+    }
+
+    def joined(target: str, source: str, T: SE2, answers: Any = known) -> JoinRow:
+        document = {"status": "joined", "probability": 1.0, "common_m2": 50.0, "looks": []}
+        poses = {"T_target_source": asdict(T), "middle": asdict(pose(2))}
+        done = Finished(code=0, cpu_s=1.0, document=document | poses)
+        monkeypatch.setattr(judging, "kept_result", lambda _: done)
+        return Known(answers).join_row(target, source)
+
+    right = joined("plan", "b", T_PLAN_A @ T_A_B)
+    assert right.outcome == "right" and right.error_m == pytest.approx(0.0, abs=1e-6)
+    assert joined("a", "b", T_A_B).outcome == joined("b", "a", T_A_B.inverse()).outcome == "right"
+    wrong = joined("plan", "b", SE2(0.0, 1.0, 0.0) @ T_PLAN_A @ T_A_B)
+    assert wrong.outcome == "wrong" and wrong.error_m == pytest.approx(1.0)
+    assert joined("plan", "b", T_PLAN_A @ T_A_B, {B_IN_A: known[B_IN_A]}).outcome == "not judged"
 
 
 def trajectory(*stamps_s: float) -> Trajectory:

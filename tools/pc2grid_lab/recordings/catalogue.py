@@ -443,6 +443,12 @@ PAIRS: tuple[Pair, ...] = (
 """All pairs, in the order of the page."""
 
 
+NOT_ALIKE = (("fr079", "wean.yaml"),)
+"""Maps of two buildings that were joined once: walls of one are drawn .3 m thick."""
+FOREIGN_MAPS = 2
+"""Each map is compared with so many of other buildings, those that come next on the page."""
+
+
 def evenly_spaced(first_s: float, last_s: float, count: int, duration_s: float) -> tuple[TimeSpan, ...]:
     """Return `count` parts of `duration_s`, evenly distributed over the time from `first_s` to `last_s`."""
     starts_s = np.linspace(first_s, max(last_s - duration_s, first_s), count)
@@ -509,6 +515,24 @@ class Catalogue:
             ),
             quick=quick,
         )
+
+    @property
+    def joins(self) -> tuple[tuple[str, str], ...]:
+        """Return the maps that are compared to be joined, in pairs: all of one building, and some of others.
+
+        Maps of recordings as they are: not thinned, and with their odometry.
+        """
+        maps = [r for r in self.mapped if r.every == 1 and "--odometry" not in r.options]
+        pairs: list[tuple[Recording, ...]] = []
+        for k, one in enumerate(maps):
+            after = [*maps[k + 1 :], *maps[:k]]
+            foreign = [r for r in after if r.building != one.building][:FOREIGN_MAPS]
+            pairs += [
+                tuple(sorted((one, other), key=maps.index))
+                for other in after
+                if other.building == one.building or other in foreign or (one.name, other.name) in NOT_ALIKE
+            ]
+        return tuple((a.name, b.name) for a, b in dict.fromkeys(pairs))
 
     def windows(self, pair: Pair, length_s: float) -> list[tuple[int, TimeSpan]]:
         """Return the windows of a pair with their numbers, in a recording of `length_s`.

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import networkx as nx
 import numpy as np
 
 from pc2grid.geometry import F64, SE2, invert_pose, leveling
@@ -31,6 +32,7 @@ from pc2grid_lab.recordings.table import (
     MISSING,
     NOT_RUN,
     FollowedRow,
+    JoinRow,
     MapRow,
     PairRow,
     QueryRow,
@@ -41,6 +43,7 @@ from pc2grid_lab.recordings.table import (
 )
 from pc2grid_lab.runner import Finished, kept_result
 from pc2grid_lab.truth import (
+    AGREEMENT,
     AHEAD_M,
     JUDGEMENT,
     SAME_NS,
@@ -207,9 +210,7 @@ def known_share(grid: OccupancyGrid, points_m: F64) -> float:
         return 0.0
     reach = round(_KNOWN_M / grid.resolution_m)
     known = cv2.dilate((grid.cells >= 0).astype(np.uint8), np.ones((2 * reach + 1, 2 * reach + 1), np.uint8))
-    cells = grid.to_cell(points_m)
-    inside = ((cells >= 0) & (cells < known.shape)).all(axis=1)
-    return float(known[tuple(cells[inside].T)].sum() / len(points_m))
+    return float(grid.look_up(known, points_m, outside=0).sum() / len(points_m))
 
 
 _ABOUT = {
@@ -391,6 +392,7 @@ def judged_table(
         maps=maps,
         pairs=tuple(rows),
         followed=tuple(map(judge.followed_row, followed)),
+        joins=tuple(judge.join_row(*pair) for pair in catalogue.joins),
     )
 
 
@@ -429,6 +431,7 @@ class Judge:
         self._catalogue, self._folder = catalogue, folder
         self._windows: dict[Pair, list[LocatedWindow]] = {}
         self._followed: dict[tuple[str, str], Frame | None] = {}
+        self._lie: dict[str, nx.Graph] = {}
 
     def row(self, pair: Pair) -> PairRow:
         """Return the row of a pair; what cannot be judged is a row that says why."""
@@ -569,6 +572,69 @@ class Judge:
             self._followed[name, map_] = agreed_frame(clues) if clues else None
         frame, at = self._followed[name, map_], drive.own_pose(stamp_ns)
         return None if frame is None or at is None else frame.place(at[1])
+
+    def join_row(self, target: str, source: str) -> JoinRow:
+        """Return the row of two maps that were compared; where there is no result, one that says why."""
+        building, other = (self._catalogue.recordings[name].building for name in (target, source))
+        row = JoinRow(target=target, source=source, same=building == other)
+        done = kept_result(self._folder.join(target, source))
+        if done is None or done.failed:
+            return replace(row, problem=NOT_RUN if done is None else done.error)
+        found, right, error_m = done.document, None if row.same else False, None
+        T, middle = (SE2(**found[name]) for name in ("T_target_source", "middle"))
+        try:
+            lie = self._lying(building) if row.same else nx.Graph()
+        except Exception as error:
+            return replace(row, problem=said(error))
+        if {target, source} <= {*lie} and nx.has_path(lie, source, target):
+            expected, within_m = middle, 0.0
+            for a, b in itertools.pairwise(nx.shortest_path(lie, source, target)):
+                expected, hop_m = lie.edges[a, b]["frames"][a].place(expected)
+                within_m += hop_m
+            right, error_m = is_right(T @ middle, expected, within_m)
+        told = {name: found[name] for name in ("status", "probability", "common_m2")}
+        return replace(row, **told, right=right, error_m=error_m, cpu_s=done.cpu_s)
+
+    def _lying(self, building: str) -> nx.Graph:
+        """Return which maps of a building are known to lie how in which: an edge holds a `Frame` by the name
+        of the map whose poses it places in the other one."""
+        if building in self._lie:
+            return self._lie[building]
+        lie = self._lie[building] = nx.Graph()
+        known = [r for r in self._catalogue.mapped if r.building == building]
+        for query, map_ in itertools.permutations(known, 2):
+            if lie.has_edge(query.name, map_.name) or query.sensor == "map":
+                continue
+            names, clues, within_m = (query.name, map_.name), [], []
+            pair = next((p for p in self._catalogue.pairs if (p.query, p.map_name) == names), None)
+            known_by = {} if pair is None or self._problem(pair) else self._frames(pair, query, map_)[2]
+            for part in drive_of(query, self._folder).parts[:1]:
+                for k in _steps(part, AGREEMENT.place_m):
+                    place = self._lies_at(query, map_, int(part.stamps_ns[k]), known_by)
+                    if place is not None:
+                        clues.append(Clue(SE2.from_matrix(part.T_session_base[k]), place[0]))
+                        within_m.append(place[1])
+            if len(clues) >= 2:
+                back = [Clue(clue.T_map_base, clue.T_drive_base) for clue in clues]
+                frames = {
+                    name: Frame(tuple(of), min(within_m))
+                    for name, of in zip(names, (clues, back), strict=True)
+                }
+                lie.add_edge(*names, frames=frames)
+        return lie
+
+    def _lies_at(
+        self, query: Recording, map_: Recording, stamp_ns: int, frames: Frames
+    ) -> tuple[SE2, float] | None:
+        """Return where a scan of a recording is in the map of another one, and how far off a right answer may
+        be: by the answers to its windows, which give `frames`, or else to its scans; None if these were not
+        asked, or do not tell."""
+        if not frames:
+            return self._followed_place(query.name, map_.name, stamp_ns)
+        drive = drive_of(query, self._folder)
+        places = [where for where in (drive.where(stamp_ns), drive.own_pose(stamp_ns)) if where is not None]
+        found = (frames[n, _SESSION].place(pose) for n, pose in places if (n, _SESSION) in frames)
+        return next(found, None)
 
     def _problem(self, pair: Pair) -> str:
         if gaps := self._folder.gaps(self._catalogue, pair):
@@ -712,9 +778,9 @@ class Judge:
         return {(0, _SESSION): Frame((clue,), known.within_m)}
 
 
-def _steps(trajectory: Trajectory) -> list[int]:
-    """Return the numbers of its scans, one on each `_STEP_M`."""
-    first: list[int] = np.unique((trajectory.path_m() / _STEP_M).astype(int), return_index=True)[1].tolist()
+def _steps(trajectory: Trajectory, step_m: float = _STEP_M) -> list[int]:
+    """Return the numbers of its scans, one on each step."""
+    first: list[int] = np.unique((trajectory.path_m() / step_m).astype(int), return_index=True)[1].tolist()
     return first
 
 

@@ -30,6 +30,7 @@ from mcap.records import Channel, Schema
 from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
+from pc2grid.display import plain
 from pc2grid.errors import Pc2GridError
 from pc2grid.estimation.registration import BareKissIcp
 from pc2grid.geometry import SE2, pose_from_xyz_quat
@@ -41,8 +42,11 @@ from pc2grid.observer import TimeSpan
 from pc2grid_lab.recordings.catalogue import Catalogue, Pair, Recording, digest_of_drive, write_drive
 from pc2grid_lab.runner import Finished, Task, in_processes, kept_result, pc2grid, run, run_tasks
 from pc2grid_lab.truth import trajectory_error
+from signature.database import open_database
+from signature.localization.joining.join import JoinableMap, join_maps
+from signature.localization.map_index import MapIndex
 
-_RESULTS = ("maps", "bare", "answers", "followed")
+_RESULTS = ("maps", "bare", "answers", "followed", "joins")
 """Folders of results."""
 
 
@@ -101,6 +105,10 @@ class Folder:
     def followed(self, one: Followed) -> Path:
         """Return the result of `watch` for a row."""
         return self.work / "followed" / f"{as_file_name(one.name)}.in.{as_file_name(one.map)}.json"
+
+    def join(self, target: str, source: str) -> Path:
+        """Return the result of comparing two maps."""
+        return self.work / "joins" / f"{as_file_name(source)}.in.{as_file_name(target)}.json"
 
     def missing(self, recording: Recording) -> bool:
         """Return whether the data folder lacks the recording, so that it is a gap of the page."""
@@ -241,9 +249,10 @@ def run_all(
     in_processes(_make, waiting, jobs=jobs, advance=lambda share: None)
     tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
     tasks += [_bare(folder, one) for one in catalogue.mapped if folder.has_bare(one)]
-    count = len(tasks) + sum(pair.windows for pair in pairs) + len(further)
+    joins = [_joined(folder, *pair) for pair in catalogue.joins]
+    count = len(tasks) + sum(pair.windows for pair in pairs) + len(further) + len(joins)
     run_tasks(tasks, jobs, lambda done: advance(done / count))
-    questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)]
+    questions = [task for pair in pairs for task in _questions(catalogue, folder, pair)] + joins
     run_tasks([*questions, *further], jobs, lambda done: advance((len(tasks) + done) / count))
 
 
@@ -326,6 +335,28 @@ def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) 
         *span,
     )
     return Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *asked))
+
+
+_JOIN = "from pc2grid_lab.recordings.run import print_join; print_join()"
+
+
+def _joined(folder: Folder, target: str, source: str) -> Task:
+    """Return the task that compares two maps."""
+    command = (sys.executable, "-c", _JOIN, folder.map(target), folder.map(source))
+    return Task(folder.join(target, source), lambda: run(*command, limit_s=1800.0))
+
+
+def print_join() -> None:
+    """Print how the first session of one database lies in that of another, as one JSON document.
+
+    Both databases are arguments. middle : of the pieces that agree, in the second one.
+    """
+    with open_database(sys.argv[1]) as target, open_database(sys.argv[2]) as source:
+        maps = [MapIndex.of_session(one, one.sessions()[0].name) for one in (target, source)]
+        found = join_maps(*map(JoinableMap, maps))
+    middle = SE2(*np.mean([link.center_m for link in found.links] or [(0.0, 0.0)], axis=0).tolist())
+    names = ("status", "probability", "T_target_source", "common_m2")
+    print(json.dumps(plain({**{name: getattr(found, name) for name in names}, "middle": middle})))
 
 
 _SCANS = ("PointCloud2", "PointCloud", "LaserScan", "Image", "CompressedImage")

@@ -18,7 +18,7 @@ from pydantic import TypeAdapter
 
 from pc2grid_cli import output
 from pc2grid_lab.pages import ALPHA, by_chance, markdown, number, share, strong
-from pc2grid_lab.recordings.catalogue import PAIR_KINDS
+from pc2grid_lab.recordings.catalogue import FOREIGN_MAPS, PAIR_KINDS
 
 MISSING = "not in the data folder"
 NOT_RUN = "was not run"
@@ -224,6 +224,33 @@ class FollowedRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class JoinRow:
+    """Two maps that were compared to be joined. problem : why there is no result.
+
+    same : whether they are of one building. right : whether one lies in the other as was found, of one
+    building; None if that is not known. error_m : how far off, in the middle of what agrees.
+    """
+
+    target: str
+    source: str
+    same: bool
+    problem: str = ""
+    status: str = ""
+    probability: float | None = None
+    common_m2: float | None = None
+    right: bool | None = None
+    error_m: float | None = None
+    cpu_s: float | None = None
+
+    @property
+    def outcome(self) -> str:
+        """Return what became of them, in a word."""
+        if self.problem or self.status != "joined":
+            return "failed" if self.problem else "not joined"
+        return "not judged" if self.right is None else "right" if self.right else "wrong"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """All rows of a run, and what made them: program, cpu_s (all commands together), quick."""
 
@@ -234,6 +261,7 @@ class Table:
     maps: tuple[MapRow, ...]
     pairs: tuple[PairRow, ...]
     followed: tuple[FollowedRow, ...] = ()
+    joins: tuple[JoinRow, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the table in plain types; numbers are rounded to what the page could show."""
@@ -246,7 +274,7 @@ class Table:
     def to_text(self) -> str:
         """Return the table as a JSON text with a line for each row, so that versions can be compared."""
         document = self.to_json()
-        rows = {name: document.pop(name) for name in ("maps", "pairs", "followed")}
+        rows = {name: document.pop(name) for name in ("maps", "pairs", "followed", "joins")}
         head = json.dumps(document)[1:-1]
         lists = (
             f'"{name}": [\n' + ",\n".join(json.dumps(row) for row in found) + "\n]"
@@ -284,6 +312,7 @@ def markdown_page(table: Table, changed: Sequence[RowChange] = ()) -> str:
             *_places(table),
             "",
             *_followed(table),
+            *_joined(table),
             "## By sensor",
             "",
             *sensor_matrix(table),
@@ -626,6 +655,51 @@ def _about_followed(rows: Sequence[FollowedRow]) -> str:
     )
 
 
+_JOINS = (
+    ("map", "other map", "buildings"),
+    ("status", "probability", "in common, m2", "off, m", "cpu, s"),
+    ("outcome",),
+)
+
+
+def _joined(table: Table) -> list[str]:
+    """Return the pairs of maps that are of one building or were joined, and how many there are."""
+    if not table.joins:
+        return []
+    same, others = ([row for row in table.joins if row.same is of] for of in (True, False))
+    count = Counter(row.outcome for row in same)
+    wrong = [row for row in others if row.outcome == "wrong"]
+    about = (
+        "As `db join` does, all maps of one building are compared with each other, and each with "
+        f"{FOREIGN_MAPS} of other buildings. Of {len(same)} pairs of one building {count['right']} join "
+        f"right, {count['wrong']} wrong; of {count['not judged']} that are joined nobody knows how they lie; "
+        f"{count['not joined']} are not joined. Of {len(others)} pairs of two buildings {len(wrong)} are "
+        "joined, which is wrong. right: as answers are, in the middle of what agrees."
+    )
+    return [
+        "## Joined",
+        "",
+        *markdown(_JOINS, [_join_cells(row) for row in (*same, *wrong)]),
+        "",
+        *wrap(about, 105),
+        "",
+    ]
+
+
+def _join_cells(row: JoinRow) -> list[str]:
+    return [
+        row.target,
+        row.source,
+        "one" if row.same else "two",
+        row.status,
+        number(row.probability, 3),
+        number(row.common_m2, 0),
+        number(row.error_m, 2),
+        number(row.cpu_s, 1),
+        row.problem or (f"**{row.outcome}**" if row.outcome == "wrong" else row.outcome),
+    ]
+
+
 def _count(name: str, rows: Sequence[FollowedRow]) -> int:
     return sum(getattr(row, name) is not None for row in rows)
 
@@ -703,6 +777,7 @@ def show(table: Table) -> None:
         ("Maps", _MAPS, [_map_cells(row) for row in table.maps]),
         ("Places", _PLACES, [_pair_cells(row) for row in table.pairs]),
         ("Carried away", _FOLLOWED, [_followed_cells(row) for row in table.followed]),
+        ("Joined", _JOINS, [_join_cells(row) for row in table.joins]),
     ):
         names = [name for side in heads for name in side]
         shown = [k for k, name in enumerate(names) if name not in _HIDDEN]
@@ -769,6 +844,12 @@ def changes(before: Table, after: Table) -> list[RowChange]:
         rows = [(old, new) for old, new in pairs if new.building == building]
         found += _worse(f"building {building}", _same_windows(rows, same_form=same_form))
     found += _worse("all queries", _same_windows(pairs, same_form=same_form))
+    joined = {(row.target, row.source): row.outcome for row in before.joins}
+    for row in after.joins:
+        was = joined.get((row.target, row.source), row.outcome)
+        if row.outcome != was:
+            name, text = f"{row.source} joined with {row.target}", f"{was} -> {row.outcome}"
+            found.append(RowChange(row=name, text=text, worse=row.outcome in ("wrong", "failed")))
     return found
 
 
