@@ -1,15 +1,16 @@
 """Planar and spatial poses, angles and outlines, and the array types of all packages.
 
 Convention, everywhere: `T_target_source` maps coordinates of `source` into `target`, `p_target =
-T_target_source @ p_source`. Axes as in REP-103 (x forward, y left, z up), angles in radians. `freeze` checks
-the array fields of frozen types.
+T_target_source @ p_source`. Axes as in REP-103 (x forward, y left, z up), angles in radians. `frozen_arrays`
+checks the array fields of frozen types.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar, overload
+from typing import Any, TypeVar, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -214,29 +215,64 @@ U16 = NDArray[np.uint16]
 BoolGrid = NDArray[np.bool_]
 
 A = TypeVar("A", bound=NDArray[np.generic])
+T = TypeVar("T")
 
 
-def freeze(owner: object, name: str, dtype: type, shape: tuple[int | None, ...]) -> None:
-    """Check type and shape of an array field, and make it read-only.
+def frozen_arrays(**fields: tuple[Any, ...]) -> Callable[[type[T]], type[T]]:
+    """Give array fields of a frozen dataclass a type and a shape, and make them read-only.
 
-    An array that other code can still write to is copied. For a scan of 60,000 points this takes 0.02 ms
-    (measured). `hand_over` avoids it, for arrays that are large.
+    Stands below `dataclass`. An array that other code can still write to is copied. For a scan of 60,000
+    points this takes 0.02 ms (measured). `hand_over` avoids it, for arrays that are large.
 
-    shape : expected length of each axis; None: any length.
-    Raises ValueError if the shape is another one.
+    fields : by name the type, then the length of each axis. A letter stands for any length, the same wherever
+    it stands in the class. A field whose default is None may be None.
+
+    An object with another shape raises ValueError.
+
+    >>> @dataclass(frozen=True)
+    ... @frozen_arrays(points_m=(np.float64, "N", 2), offsets_s=(np.float64, "N"))
+    ... class Points:
+    ...     points_m: F64
+    ...     offsets_s: F64
+    >>> Points([(0, 1), (2, 3)], [0.0, 0.1]).points_m.flags.writeable
+    False
+    >>> Points(np.zeros((2, 2)), np.zeros(3))
+    Traceback (most recent call last):
+    ValueError: Points.offsets_s: expected shape (2,), got (3,)
     """
+
+    def decorate(kind: type[T]) -> type[T]:
+        rest = vars(kind).get("__post_init__", lambda self: None)
+        optional = {name for name in fields if vars(kind).get(name, ...) is None}
+
+        def __post_init__(self: T) -> None:
+            lengths: dict[Any, int] = {}
+            for name, (dtype, *axes) in fields.items():
+                if name not in optional or getattr(self, name) is not None:
+                    shape = _freeze(self, name, dtype, [lengths.get(axis, axis) for axis in axes])
+                    lengths |= zip(axes, shape, strict=True)
+            rest(self)
+
+        kind.__post_init__ = __post_init__  # type: ignore[attr-defined]
+        return kind
+
+    return decorate
+
+
+def _freeze(owner: object, name: str, dtype: type, shape: Sequence[int | str]) -> tuple[int, ...]:
+    """Check type and shape of an array field, and make it read-only; returns its shape."""
     given = getattr(owner, name)
     value: NDArray[np.generic] = np.asarray(given, dtype=dtype)
     if value.ndim != len(shape) or any(
-        want is not None and want != got for want, got in zip(shape, value.shape, strict=True)
+        isinstance(want, int) and want != got for want, got in zip(shape, value.shape, strict=True)
     ):
-        wanted = tuple("N" if n is None else n for n in shape)
-        raise ValueError(f"{type(owner).__name__}.{name}: expected shape {wanted}, got {value.shape}")
+        raise ValueError(f"{type(owner).__name__}.{name}: expected shape {tuple(shape)}, got {value.shape}")
     if not _is_read_only(value):
         if isinstance(given, np.ndarray) and np.may_share_memory(value, given):
             value = value.copy()
         value.flags.writeable = False
     object.__setattr__(owner, name, value)
+    return value.shape
 
 
 def hand_over(array: A) -> A:

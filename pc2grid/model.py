@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, PlainSerializer, computed_field
 
 from pc2grid.display import html_picture, html_table, map_png, short
-from pc2grid.geometry import F32, F64, I64, SE2, U8, BoolGrid, freeze, hand_over
+from pc2grid.geometry import F32, F64, I64, SE2, U8, BoolGrid, frozen_arrays, hand_over
 
 if TYPE_CHECKING:
     import networkx as nx
@@ -55,6 +55,14 @@ k + SLICES if it was observed to be free and nowhere occupied."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(
+    points_m=(np.float32, "N", 3),
+    T_base_sensor=(np.float64, 4, 4),
+    T_odom_base=(np.float64, 4, 4),
+    T_first_last=(np.float64, 4, 4),
+    T_level_base=(np.float64, 4, 4),
+    offsets_s=(np.float32, "N"),
+)
 class Scan:
     """One scan of one sensor, in the base frame.
 
@@ -89,15 +97,6 @@ class Scan:
     T_level_base: F64 | None = None
     odometry_gap_s: float = math.inf
 
-    def __post_init__(self) -> None:
-        freeze(self, "points_m", np.float32, (None, 3))
-        freeze(self, "T_base_sensor", np.float64, (4, 4))
-        for name in ("T_odom_base", "T_first_last", "T_level_base"):
-            if getattr(self, name) is not None:
-                freeze(self, name, np.float64, (4, 4))
-        if self.offsets_s is not None:
-            freeze(self, "offsets_s", np.float32, (len(self.points_m),))
-
     def __repr__(self) -> str:
         return f"Scan({self.sensor}, {len(self.points_m)} points, stamp_ns={self.stamp_ns})"
 
@@ -117,6 +116,7 @@ class Health(enum.Enum):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(T_session_base=(np.float64, 4, 4))
 class RegisteredScan:
     """A scan with its pose in the frame of its session.
 
@@ -135,15 +135,13 @@ class RegisteredScan:
     T_session_base: F64
     health: Health = Health.FINE
 
-    def __post_init__(self) -> None:
-        freeze(self, "T_session_base", np.float64, (4, 4))
-
     def __repr__(self) -> str:
         pose = SE2.from_matrix(self.T_session_base)
         return f"RegisteredScan({self.scan}, {self.health.value}, at x {pose.x:.2f} m, y {pose.y:.2f} m)"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(stamps_ns=(np.int64, "N"), T_session_base=(np.float64, "N", 4, 4))
 class Trajectory:
     """Poses of the base over time.
 
@@ -165,8 +163,6 @@ class Trajectory:
     health: tuple[Health, ...] = ()
 
     def __post_init__(self) -> None:
-        freeze(self, "stamps_ns", np.int64, (None,))
-        freeze(self, "T_session_base", np.float64, (len(self.stamps_ns), 4, 4))
         if self.health and len(self.health) != len(self.stamps_ns):
             raise ValueError(
                 f"Trajectory.health: expected {len(self.stamps_ns)} entries, got {len(self.health)}"
@@ -205,6 +201,7 @@ class Trajectory:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(cells=(np.int8, "H", "W"), heights=(np.uint8, "H", "W"))
 class OccupancyGrid:
     """A 2D occupancy grid with cells as in nav_msgs/OccupancyGrid.
 
@@ -231,9 +228,6 @@ class OccupancyGrid:
     heights: U8 | None = None
 
     def __post_init__(self) -> None:
-        freeze(self, "cells", np.int8, (None, None))
-        if self.heights is not None:
-            freeze(self, "heights", np.uint8, self.cells.shape)
         if not (np.isfinite(self.resolution_m) and self.resolution_m > 0):
             raise ValueError(f"OccupancyGrid.resolution_m: expected > 0, got {self.resolution_m}")
 
@@ -406,6 +400,7 @@ class ReadReport:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(information=(np.float64, 3, 3))
 class Loop:
     """A place that a session came back to, with the relative pose measured there.
 
@@ -427,9 +422,6 @@ class Loop:
     T_older_newer: SE2
     information: Annotated[F64, BeforeValidator(np.asarray)]
     accepted: bool = True
-
-    def __post_init__(self) -> None:
-        freeze(self, "information", np.float64, (3, 3))
 
     def __repr__(self) -> str:
         accepted = "accepted" if self.accepted else "not accepted"
@@ -570,6 +562,7 @@ POINT_STEPS = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(origin_m=(np.float64, 3), steps=(np.int32, "V", 3))
 class PointMap:
     """The registered points of a session in space, one for each voxel that holds any: their mean.
 
@@ -584,10 +577,6 @@ class PointMap:
     voxel_m: float
     origin_m: F64
     steps: NDArray[np.int32]
-
-    def __post_init__(self) -> None:
-        freeze(self, "origin_m", np.float64, (3,))
-        freeze(self, "steps", np.int32, (None, 3))
 
     @staticmethod
     def of(points_m: NDArray[np.floating], voxel_m: float, corner_m: F64 | None = None) -> PointMap:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pc2grid.geometry import F32, F64, freeze
+from pc2grid.geometry import F32, F64, frozen_arrays
 from pc2grid.model import Submap
 from signature.boundary import boundary_edges, boundary_histogram, boundary_points
 from signature.config import SignatureConfig
@@ -17,6 +17,7 @@ from signature.symmetry import symmetry_scores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(boundary=(np.float32, "Nb"), freespace=(np.float32, "Nf"), symmetry=(np.float32, "S"))
 class Signature:
     """The three signatures of a submap.
 
@@ -30,10 +31,6 @@ class Signature:
     boundary: F32
     freespace: F32
     symmetry: F32
-
-    def __post_init__(self) -> None:
-        for name in ("boundary", "freespace", "symmetry"):
-            freeze(self, name, np.float32, (None,))
 
     def __repr__(self) -> str:
         alpha, beta = self.symmetry

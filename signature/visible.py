@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F32, F64, I64, U8, BoolGrid, freeze
+from pc2grid.geometry import F32, F64, I64, U8, BoolGrid, frozen_arrays
 from pc2grid.model import OccupancyGrid
 from pc2grid.submaps.submaps import HIDDEN, Isovist, look_around
 from signature.boundary import RANGE_BINS, RIMS, boundary_seen, rim_columns
@@ -89,6 +89,7 @@ SIGNATURE_COLUMNS = 1 + max(part.stop for part in parts().values())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(at_m=(np.float32, "V", 2), place=(np.int64, "V"), signatures=(np.uint8, "V", "K"))
 class SeenPlaces:
     """What is seen from K viewpoints around the places of one map, ordered by place.
 
@@ -99,11 +100,6 @@ class SeenPlaces:
     at_m: F32
     place: I64
     signatures: U8
-
-    def __post_init__(self) -> None:
-        freeze(self, "at_m", np.float32, (None, 2))
-        freeze(self, "place", np.int64, (len(self.at_m),))
-        freeze(self, "signatures", np.uint8, (len(self.at_m), None))
 
     @staticmethod
     def of(grid: OccupancyGrid, centers_m: F64, sight_m: float) -> SeenPlaces:

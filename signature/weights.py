@@ -27,7 +27,7 @@ from typing import NamedTuple, TypeVar
 
 import numpy as np
 
-from pc2grid.geometry import F32, F64, I64, freeze
+from pc2grid.geometry import F32, F64, I64, frozen_arrays
 from pc2grid.io.atomic import replace_file
 from signature.visible import parts, signature_columns
 
@@ -66,6 +66,13 @@ class Pairs(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(
+    query_mean=(np.float64, "C"),
+    place_mean=(np.float64, "C"),
+    within=(np.float64, "C", "C"),
+    between=(np.float64, "C", "C"),
+    spreads=(np.float64, len(COMBINATIONS), 7),
+)
 class SeenStatistics:
     """What the weights are made of, for the C columns of the three signatures.
 
@@ -78,13 +85,6 @@ class SeenStatistics:
     within: F64
     between: F64
     spreads: F64
-
-    def __post_init__(self) -> None:
-        freeze(self, "query_mean", np.float64, (None,))
-        freeze(self, "place_mean", np.float64, (len(self.query_mean),))
-        for name in ("within", "between"):
-            freeze(self, name, np.float64, (len(self.query_mean), len(self.query_mean)))
-        freeze(self, "spreads", np.float64, (len(COMBINATIONS), 7))
 
     @staticmethod
     def of(pairs: Pairs, *, seed: int = 0) -> SeenStatistics:

@@ -30,7 +30,7 @@ from pc2grid.clouds.cloud import VoxelCloud, random_subset
 from pc2grid.clouds.ground import CLOUD_PARAMETERS, Ground, find_ground
 from pc2grid.clouds.planar_scan import project_to_plane
 from pc2grid.errors import MapFileError
-from pc2grid.geometry import F32, F64, I64, SE2, U8, BoolGrid, freeze, invert_pose, transform_points
+from pc2grid.geometry import F32, F64, I64, SE2, U8, BoolGrid, frozen_arrays, invert_pose, transform_points
 from pc2grid.io.building_file import (
     UPRIGHT,
     axis_of_file,
@@ -52,6 +52,7 @@ _SPACING_NEIGHBOUR = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(T_map_file=(np.float64, 4, 4), level_points_m=(np.float64, "V", 3))
 class DrawnMap:
     """A map that was read from a file.
 
@@ -68,10 +69,6 @@ class DrawnMap:
     level_points_m: F64
     digest: str
     warnings: tuple[str, ...] = field(default=())
-
-    def __post_init__(self) -> None:
-        freeze(self, "T_map_file", np.float64, (4, 4))
-        freeze(self, "level_points_m", np.float64, (None, 3))
 
 
 def is_drawn_map(path: Path) -> bool:

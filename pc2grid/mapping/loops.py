@@ -32,7 +32,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.estimation.line_map import evenly
-from pc2grid.geometry import F64, I64, SE2, freeze
+from pc2grid.geometry import F64, I64, SE2, frozen_arrays
 from pc2grid.mapping.graph import Edge, Solution, WallDirection, between, compose, optimise, wall_direction
 from pc2grid.mapping.keyframes import TURN_M_PER_RAD, Keyframe, Keyframes, grid_of
 from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps, pose_at
@@ -484,6 +484,7 @@ class SessionGraph:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(poses=(np.float64, "K", 3), scans=(np.int64, "K"))
 class PlaceMap:
     """The map of a few metres of travel, long enough to be recognised.
 
@@ -498,10 +499,6 @@ class PlaceMap:
     grid: OccupancyGrid
     poses: F64
     scans: I64
-
-    def __post_init__(self) -> None:
-        freeze(self, "poses", float, (None, 3))
-        freeze(self, "scans", np.int64, (None,))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

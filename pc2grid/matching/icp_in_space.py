@@ -24,7 +24,7 @@ from pc2grid.geometry import (
     F64,
     I64,
     SE2,
-    freeze,
+    frozen_arrays,
     invert_pose,
     pose_from_rotation_vector,
     rotation_vector,
@@ -106,18 +106,22 @@ RAYS = RayParameters()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(sensor_m=(np.float64, 3), points_m=(np.float64, "N", 3))
 class SpatialView:
     """A scan of the query. sensor_m : (3,), points_m : (N, 3), both in the query's odom frame."""
 
     sensor_m: F64
     points_m: F64
 
-    def __post_init__(self) -> None:
-        freeze(self, "sensor_m", np.float64, (3,))
-        freeze(self, "points_m", np.float64, (None, 3))
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(
+    end_m=(np.float64, "R", 3),
+    height_m=(np.float64, "R"),
+    on=(np.bool_, "R"),
+    through=(np.bool_, "R"),
+    before=(np.bool_, "R"),
+)
 class Rays:
     """The rays of a query compared with a map; the same rays in the same order at each place.
 
@@ -132,12 +136,6 @@ class Rays:
     on: NDArray[np.bool_]
     through: NDArray[np.bool_]
     before: NDArray[np.bool_]
-
-    def __post_init__(self) -> None:
-        freeze(self, "end_m", np.float64, (None, 3))
-        freeze(self, "height_m", np.float64, (None,))
-        for name in ("on", "through", "before"):
-            freeze(self, name, np.bool_, (None,))
 
     @staticmethod
     def joined(parts: Sequence[Rays]) -> Rays:
@@ -181,6 +179,7 @@ planar pose, which nothing there constrains."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(T_map_query=(np.float64, 4, 4), information=(np.float64, 6, 6), center_m=(np.float64, 3))
 class SpatialFit:
     """A query in space on a map.
 
@@ -200,11 +199,6 @@ class SpatialFit:
     on: float
     through: float
     before: float
-
-    def __post_init__(self) -> None:
-        freeze(self, "T_map_query", np.float64, (4, 4))
-        freeze(self, "information", np.float64, (6, 6))
-        freeze(self, "center_m", np.float64, (3,))
 
     @property
     def held(self) -> float:

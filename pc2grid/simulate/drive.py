@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from pc2grid.errors import ConfigError
-from pc2grid.geometry import F32, F64, I64, SE2, freeze, wrap_angle
+from pc2grid.geometry import F32, F64, I64, SE2, frozen_arrays, wrap_angle
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate.config import DriveConfig, OdometryConfig
 from pc2grid.simulate.plan import clearance_m
@@ -36,6 +36,7 @@ _LEAST_MPS = 0.02  # mean speed of a step; keeps the time of a step finite
 
 
 @dataclass(frozen=True, slots=True)
+@frozen_arrays(poses=(np.float64, "N", 3))
 class Drive:
     """The true motion of the base, sampled evenly from time 0.
 
@@ -43,9 +44,6 @@ class Drive:
     """
 
     poses: F64
-
-    def __post_init__(self) -> None:
-        freeze(self, "poses", np.float64, (None, 3))
 
     @property
     def duration_s(self) -> float:
@@ -175,6 +173,7 @@ _LONGER, _LONGER_M = 1.3, 2.0
 
 
 @dataclass(frozen=True, slots=True)
+@frozen_arrays(points_m=(np.float64, "N", 2), turns=(np.int64, "K"))
 class Route:
     """A line to drive along.
 
@@ -184,10 +183,6 @@ class Route:
 
     points_m: F64
     turns: I64
-
-    def __post_init__(self) -> None:
-        freeze(self, "points_m", np.float64, (None, 2))
-        freeze(self, "turns", np.int64, (None,))
 
     @property
     def length_m(self) -> float:
@@ -399,6 +394,7 @@ def _smooth(points_m: F64, grid: OccupancyGrid, clearance: F32, least_m: float) 
 
 
 @dataclass(frozen=True, slots=True)
+@frozen_arrays(times_s=(np.float64, "N"), poses=(np.float64, "N", 3))
 class SimulatedOdometry:
     """Odometry as the robot publishes it, starting at the identity.
 
@@ -408,10 +404,6 @@ class SimulatedOdometry:
 
     times_s: F64
     poses: F64
-
-    def __post_init__(self) -> None:
-        freeze(self, "times_s", np.float64, (None,))
-        freeze(self, "poses", np.float64, (len(self.times_s), 3))
 
     def at(self, time_s: float) -> SE2:
         """Return T_odom_base between two messages."""

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pc2grid.errors import MapFileError
-from pc2grid.geometry import F32, F64, SE2, BoolGrid, freeze, transform_points
+from pc2grid.geometry import F32, F64, SE2, BoolGrid, frozen_arrays, transform_points
 from pc2grid.io.building_file import (
     building_points,
     is_building_file,
@@ -40,6 +40,7 @@ from pc2grid.simulate.plan import Passages, outline_mask
 
 
 @dataclass(frozen=True, slots=True)
+@frozen_arrays(vertices_m=(np.float32, "V", 3), triangles=(np.uint32, "T", 3))
 class Mesh:
     """Triangles in the map frame.
 
@@ -48,10 +49,6 @@ class Mesh:
 
     vertices_m: F32
     triangles: NDArray[np.uint32]
-
-    def __post_init__(self) -> None:
-        freeze(self, "vertices_m", np.float32, (None, 3))
-        freeze(self, "triangles", np.uint32, (None, 3))
 
     @staticmethod
     def join(meshes: Iterable[Mesh]) -> Mesh:
@@ -252,6 +249,7 @@ _JUMP_SHARE, _JUMP_M = 0.1, 0.1
 
 
 @dataclass(frozen=True, slots=True)
+@frozen_arrays(T_base_sensor=(np.float64, 4, 4), directions=(np.float64, "R", 3), offsets_s=(np.float64, "R"))
 class SimulatedSensor:
     """A sensor as the rays that it casts in each scan.
 
@@ -270,11 +268,6 @@ class SimulatedSensor:
     directions: F64
     offsets_s: F64
     config: LidarConfig | LaserConfig | DepthConfig
-
-    def __post_init__(self) -> None:
-        freeze(self, "T_base_sensor", np.float64, (4, 4))
-        freeze(self, "directions", np.float64, (None, 3))
-        freeze(self, "offsets_s", np.float64, (len(self.directions),))
 
     def measure(self, true_m: F32, rng: np.random.Generator) -> F32:
         """Turn true distances (R,), inf for none, into readings (R,) float32, NaN without a return."""

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F32, F64, SUBPIXEL_BITS, BoolGrid, cells_of, freeze, polygon_corners
+from pc2grid.geometry import F32, F64, SUBPIXEL_BITS, BoolGrid, cells_of, frozen_arrays, polygon_corners
 from pc2grid.libraries import compiled
 from pc2grid.model import OCCUPIED, OCCUPIED_FROM, UNKNOWN, OccupancyGrid, Submap
 from pc2grid.settings import PartitionConfig
@@ -119,6 +119,7 @@ WALL_MARGIN_M = 0.15
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(ranges_m=(np.float32, "B"), ends=(np.int8, "B"))
 class Isovist:
     """The area that is visible from `center_m` up to `sight_m`.
 
@@ -130,10 +131,6 @@ class Isovist:
     sight_m: float
     ranges_m: F32
     ends: NDArray[np.int8]
-
-    def __post_init__(self) -> None:
-        freeze(self, "ranges_m", np.float32, (None,))
-        freeze(self, "ends", np.int8, (len(self.ranges_m),))
 
     @property
     def observed(self) -> float:

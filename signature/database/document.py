@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, Pc2GridError
-from pc2grid.geometry import F32, F64, I64, freeze
+from pc2grid.geometry import F32, F64, I64, frozen_arrays
 from pc2grid.io.messages.types import FARTHEST_M
 from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
@@ -57,6 +57,15 @@ NODE_KINDS = ("junction", "end")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(
+    center_m=(np.float64, "N", 2),
+    kind=(np.uint8, "N"),
+    pixels=(np.int32, "N"),
+    edges=(np.int32, "E", 2),
+    length_m=(np.float64, "E"),
+    path_start=(np.int64, "S"),
+    path_m=(np.float32, "K", 2),
+)
 class GraphArrays:
     """A junction graph as plain arrays, to be stored.
 
@@ -73,16 +82,6 @@ class GraphArrays:
     length_m: F64
     path_start: I64
     path_m: F32
-
-    def __post_init__(self) -> None:
-        nodes, edges = len(self.kind), len(self.length_m)
-        freeze(self, "center_m", np.float64, (nodes, 2))
-        freeze(self, "kind", np.uint8, (nodes,))
-        freeze(self, "pixels", np.int32, (nodes,))
-        freeze(self, "edges", np.int32, (edges, 2))
-        freeze(self, "length_m", np.float64, (edges,))
-        freeze(self, "path_start", np.int64, (edges + 1,))
-        freeze(self, "path_m", np.float32, (None, 2))
 
 
 def graph_to_arrays(graph: nx.Graph) -> GraphArrays:
@@ -118,7 +117,10 @@ def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
         "edges": all(0 <= a < b < nodes for a, b in edges) and len(set(map(tuple, edges))) == len(edges),
         "center_m": np.isfinite(arrays.center_m).all(),
         "length_m": positive.all(),
-        "path_start": starts[0] == 0 and starts[-1] == len(arrays.path_m) and (np.diff(starts) >= 0).all(),
+        "path_start": len(starts) == len(edges) + 1
+        and starts[0] == 0
+        and starts[-1] == len(arrays.path_m)
+        and (np.diff(starts) >= 0).all(),
         "path_m": np.isfinite(arrays.path_m).all(),
     }
     for name, good in valid.items():
@@ -134,6 +136,13 @@ def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(
+    submap_id=(np.int32, "N"),
+    center_m=(np.float64, "N", 2),
+    boundary=(np.float32, "N", "Nb"),
+    freespace=(np.float32, "N", "Nf"),
+    symmetry=(np.float32, "N", 2),
+)
 class SubmapArrays:
     """The N submaps of a session: their centres and their signatures.
 
@@ -149,13 +158,6 @@ class SubmapArrays:
     boundary: F32
     freespace: F32
     symmetry: F32
-
-    def __post_init__(self) -> None:
-        n = len(self.submap_id)
-        freeze(self, "submap_id", np.int32, (n,))
-        freeze(self, "center_m", np.float64, (n, 2))
-        for name, width in (("boundary", None), ("freespace", None), ("symmetry", 2)):
-            freeze(self, name, np.float32, (n, width))
 
     def __len__(self) -> int:
         return len(self.submap_id)

@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field
 
 from pc2grid.display import html_picture, html_table, map_png, plain, probability, short
-from pc2grid.geometry import F64, I64, SE2, freeze, wrap_angle
+from pc2grid.geometry import F64, I64, SE2, frozen_arrays, wrap_angle
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
@@ -52,6 +52,7 @@ class QueryRecording:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(T_map_base=(np.float64, 4, 4), covariance=(np.float64, 6, 6))
 class PoseInSpace:
     """A pose of the base with six degrees of freedom, and how well it agrees with the map.
 
@@ -69,10 +70,6 @@ class PoseInSpace:
     on: float
     through: float
     before: float
-
-    def __post_init__(self) -> None:
-        freeze(self, "T_map_base", np.float64, (4, 4))
-        freeze(self, "covariance", np.float64, (6, 6))
 
     @property
     def rpy_rad(self) -> tuple[float, float, float]:

@@ -246,7 +246,7 @@ STILL = Trajectory(stamps_ns=np.arange(3), T_session_base=np.stack([np.eye(4)] *
         ),
         (
             lambda: Signature(boundary=np.ones((1, 3)), freespace=np.ones(3), symmetry=np.ones(2)),
-            r"Signature\.boundary: expected shape \('N',\), got \(1, 3\)",
+            r"Signature\.boundary: expected shape \('Nb',\), got \(1, 3\)",
         ),
         (
             lambda: SignatureTable.of((), np.empty((0, 2)), submap_id=[1]),

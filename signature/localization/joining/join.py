@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 import cv2
 import numpy as np
 
-from pc2grid.geometry import F32, F64, SE2, freeze, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, frozen_arrays, wrap_angle
 from pc2grid.matching.score import Fit, refine, score_fit, self_similarity
 from pc2grid.matching.search import SearchMap
 from pc2grid.matching.walls import LIKELIHOOD, Walls
@@ -171,6 +171,7 @@ class JoinableMap:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(covariance=(np.float64, 3, 3))
 class Join:
     """How a source session lies in the map of a target session, as far as that is known.
 
@@ -191,9 +192,6 @@ class Join:
     rivals: int
     evidence: Evidence
     links: tuple[Link, ...] = ()
-
-    def __post_init__(self) -> None:
-        freeze(self, "covariance", np.float64, (3, 3))
 
 
 UNJOINED = Join(
