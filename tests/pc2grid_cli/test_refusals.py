@@ -29,7 +29,7 @@ from pc2grid.io.maps import save_map
 from pc2grid.model import MISSING_FILES, ReadReport
 from pc2grid_cli import console, relocalize
 from pc2grid_cli import output as data_loss
-from pc2grid_cli.main import REMOVED, app
+from pc2grid_cli.main import app
 from signature.database.maintenance import store
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import STEP, T0, drive, ros, write_mcap
@@ -170,11 +170,7 @@ REFUSED: list[tuple[str, int, type[Exception] | None, tuple[str, ...]]] = [
         "--check-topic goes on until it is stopped", "hint: ")),
     (f"{WATCH} ws://robot:1 --first --publish tf", 2, ConfigError, (
         "--publish tf goes on until it is stopped", "hint: ")),
-    (f"{WATCH} drive.mcap --keep", 2, None, ("--first", "hint: ")),
     (f"{WATCH} drive.mcap --real-time --publish tf", 2, ConfigError, ("takes no messages", "hint: ")),
-    # what was removed
-    *((old.removeprefix("pc2grid "), 2, None, ("error: No such ", f"\nhint: {new}\n"))
-      for old, new in REMOVED.items()),
 ]
 # fmt: on
 

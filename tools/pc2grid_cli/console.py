@@ -262,8 +262,7 @@ def _report_usage(error: Any) -> int:
     message = " ".join(error.format_message().split())  # click lists choices on lines of their own
     print(f"pc2grid: error: {one_line(message)}", file=sys.stderr)
     if context is not None:
-        hint = getattr(error, "suggestion", None) or f"{context.command_path} --help"
-        print(f"hint: {one_line(hint)}", file=sys.stderr)
+        print(f"hint: {context.command_path} --help", file=sys.stderr)
     return USAGE
 
 

@@ -1,4 +1,4 @@
-"""The program `pc2grid`: its commands, the options that may stand anywhere, and what was removed.
+"""The program `pc2grid`: its commands, and the options that may stand anywhere.
 
 A command is known by its name and one sentence until it is used. Then its declaration is imported: a type of
 `options.py`, or of the laboratory. What does its work is imported when it runs.
@@ -73,22 +73,6 @@ _made.command()(_global_options)
 _GLOBAL = get_command(_made).params
 
 
-class Command(TyperCommand):
-    """A command that takes the global options."""
-
-    def __init__(self, *arguments: Any, **about: Any) -> None:
-        super().__init__(*arguments, **about)
-        self.params += _GLOBAL
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the words; an error says what to type instead."""
-        try:
-            return super().parse_args(ctx, args)
-        except Exception as error:  # its class is not public
-            _hint_of_removed(error, ctx, getattr(error, "option_name", ""))
-            raise
-
-
 def _callback(options: Any, work: str) -> Callable[..., None]:
     """Return a function for typer, which makes the options of what is typed and gives them to the work.
 
@@ -136,8 +120,10 @@ class LateCommand(TyperCommand):
                 hint="in the clone: pip install -e .",
             ) from None
         app = typer.Typer(add_completion=False, rich_markup_mode=MARKUP, pretty_exceptions_enable=False)
-        app.command(self.name, cls=Command)(_callback(declared, self._work))
-        return get_command(app)
+        app.command(self.name)(_callback(declared, self._work))
+        made = get_command(app)
+        made.params += _GLOBAL
+        return made
 
     def make_context(self, *arguments: Any, **more: Any) -> Any:
         """Return the context of the command itself."""
@@ -154,19 +140,6 @@ class Group(TyperGroup):
         super().__init__(**about)
         self.params += _GLOBAL
         self.commands = {**{name: LateCommand(name, *of) for name, of in self.late.items()}, **self.commands}
-
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return the command that the words name, with the words behind its name."""
-        try:
-            return super().resolve_command(ctx, args)
-        except Exception as error:  # its class is not public
-            _hint_of_removed(error, ctx, args[0])
-            raise
-
-
-def _hint_of_removed(error: Exception, ctx: Any, word: str) -> None:
-    """Add to the error for an unknown command or option what to use, if there was one of that name."""
-    error.suggestion = REMOVED.get(f"{ctx.command_path} {word}")  # type: ignore[attr-defined]
 
 
 def _group(commands: Mapping[str, tuple[str, ...]], sentence: str, **about: Any) -> typer.Typer:
@@ -274,42 +247,3 @@ def main() -> None:
     atexit.register(gc.freeze)
     terminal = console.Console()
     sys.exit(terminal.run(lambda: app(prog_name="pc2grid", standalone_mode=False, obj=terminal)))
-
-
-REMOVED = {
-    "pc2grid diff": "`pc2grid db join --plot OUT.png` draws the walls of joined sessions over each other",
-    **dict.fromkeys(
-        ("pc2grid convert --rerun", "pc2grid export --rerun"),
-        "`pc2grid export --mcap OUT.mcap` writes the map, `rerun OUT.mcap` shows it",
-    ),
-    "pc2grid relocalize --rerun": "`--output OUT.mcap` writes the answer, `rerun OUT.mcap` shows it",
-    **dict.fromkeys(
-        ("pc2grid db join --journal", "pc2grid db join --dask", "pc2grid db join --jobs"),
-        "one process compares every two sessions, some seconds a pair",
-    ),
-    "pc2grid compare floors": "a recording is one floor: cut it with `--start` and `--duration`",
-    **dict.fromkeys(
-        ("pc2grid simulate --floors", "pc2grid simulate --ride", "pc2grid simulate --slope"),
-        "a recording is one floor: `pc2grid simulate` makes one for each `--seed`",
-    ),
-    **dict.fromkeys(
-        ("pc2grid simulate --change", "pc2grid simulate --walkers", "pc2grid simulate --relief"),
-        "another `--seed` and `--clutter` place other objects in the same building",
-    ),
-    **dict.fromkeys(
-        ("pc2grid simulate --glass", "pc2grid simulate --mirrors"),
-        "all walls of a simulated building are opaque",
-    ),
-    "pc2grid simulate --alike": "a recording is one floor: the same `--seed` places the same objects",
-    **dict.fromkeys(
-        ("pc2grid compare log", "pc2grid compare maps"),
-        "`pc2grid compare recordings FOLDER`, with true poses in NAME.tum beside NAME.mcap",
-    ),
-    "pc2grid compare signatures": "`pc2grid relocalize --set relocalize.shortlist_by=shuffled`: without them",
-    "pc2grid compare real": "its rows are those of `pc2grid compare recordings DATA --only 'other sensor'`",
-    "pc2grid watch --last": "a finished recording is followed whole, and ws://ROBOT:8765 while it runs",
-    "pc2grid watch --keep": "`pc2grid watch` goes on to the end; `--first` stops when it is located",
-    "pc2grid db update": "`pc2grid db join` puts sessions into one frame, `pc2grid export --map` draws them",
-    "pc2grid convert --update": "`--join` puts what is new into the frame of the other sessions",
-}
-"""By command, or by command and option: what to use instead."""
