@@ -189,13 +189,13 @@ def test_compiling_is_noted_once(capsys: pytest.CaptureFixture[str]) -> None:
 
     terminal = console.Console()
     for _ in range(2):
-        with terminal.observer().step("work"):
+        with terminal.step("work"):
             assert numba.njit(lambda x: x + 1)(1) == 2
             assert numba.njit(lambda x: x + 2)(1) == 3
     assert capsys.readouterr().err.count("compiling what") == 1
 
 
-@pytest.mark.parametrize("observer", [console.Console().observer(), ProgressBars()])
+@pytest.mark.parametrize("observer", [console.Console(), ProgressBars()])
 def test_progress_is_updated_ten_times_a_second(observer: Observer, monkeypatch: pytest.MonkeyPatch) -> None:
     """However often it is reported: for a laser that is converted, at each scan."""
     clock, updated = [0.0], []

@@ -33,8 +33,10 @@ _SENT_AGAIN_S = 0.05
 _COMPILING = "compiling what runs for the first time here; later runs do not wait for it"
 
 
-class Console:
+class Console(Observer):
     """The terminal of one run of the program, with what the global options say.
+
+    As an observer it shows the news of some work on stderr: progress, warnings, and notes with -v.
 
     verbose : how often -v was given. quiet : -q. debug : --debug, or PC2GRID_DEBUG is set.
     compiling : whether the user knows that functions are compiled.
@@ -45,6 +47,7 @@ class Console:
         self.quiet = False
         self.debug = bool(os.environ.get("PC2GRID_DEBUG"))
         self.compiling = False
+        self._update: Callable[[float], None] | None = None
 
     def note(self, message: str, *, level: int = 0) -> None:
         """Print a line for the user, unless -q is given; one of level 1 only with -v."""
@@ -84,9 +87,25 @@ class Console:
             self.compiling = True
             self.note(_COMPILING)
 
-    def observer(self) -> ConsoleObserver:
-        """Return an observer that shows the news of some work on this console."""
-        return ConsoleObserver(self)
+    @contextlib.contextmanager
+    def step(self, what: str, recorded_s: float | None = None) -> Iterator[None]:
+        """Show the progress of a step."""
+        with self.progress(what, recorded_s) as self._update, _compiling_noted(self):
+            yield
+        self._update = None
+
+    def on_progress(self, share: float) -> None:
+        """See `Observer.on_progress`."""
+        if self._update is not None:
+            self._update(share)
+
+    def on_note(self, text: str) -> None:
+        """See `Observer.on_note`."""
+        self.note(text, level=1)
+
+    def on_warning(self, text: str) -> None:
+        """See `Observer.on_warning`."""
+        warn(text)
 
     def report_error(self, error: BaseException) -> int:
         """Print what went wrong in one line, and what to do next in another; returns the exit code."""
@@ -185,34 +204,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [_finite(inner) for inner in value]
     return value
-
-
-class ConsoleObserver(Observer):
-    """Shows the news of some work on stderr: progress, warnings, and notes with -v."""
-
-    def __init__(self, console: Console) -> None:
-        self._console = console
-        self._update: Callable[[float], None] | None = None
-
-    @contextlib.contextmanager
-    def step(self, what: str, recorded_s: float | None = None) -> Iterator[None]:
-        """Show the progress of a step."""
-        with self._console.progress(what, recorded_s) as self._update, _compiling_noted(self._console):
-            yield
-        self._update = None
-
-    def on_progress(self, share: float) -> None:
-        """See `Observer.on_progress`."""
-        if self._update is not None:
-            self._update(share)
-
-    def on_note(self, text: str) -> None:
-        """See `Observer.on_note`."""
-        self._console.note(text, level=1)
-
-    def on_warning(self, text: str) -> None:
-        """See `Observer.on_warning`."""
-        warn(text)
 
 
 @contextlib.contextmanager

@@ -125,7 +125,7 @@ def _convert_all(
         if len(jobs) > 1:
             stack.enter_context(_note_stored(terminal, done, len(jobs)))
         # If this block is left early, the cluster ends before anything is printed about it.
-        for outcome in stack.enter_context(_outcomes(jobs, given, terminal.observer())):
+        for outcome in stack.enter_context(_outcomes(jobs, given, terminal)):
             error = _store(outcome, given, keep=keep)
             if error is not None and len(jobs) == 1:
                 raise error
@@ -206,7 +206,7 @@ def _join_added(done: ConvertedInputs, given: options.Convert, terminal: console
     with open_database(given.output) as opened:
         if given.join is None and not opened.frames():
             return
-        found = join_sessions(opened, only=names, observer=terminal.observer())
+        found = join_sessions(opened, only=names, observer=terminal)
     maintenance.place(given.output, found.frames)
     done.joined = [joined_document(name, found.frames[name]) for name in names if name in found.frames]
     for document in done.joined:

@@ -61,13 +61,13 @@ def run(given: options.Demo, terminal: console.Console) -> int:
 
     terminal.note("2/4 convert the lidar's recording into a database")
     config = Config()
-    session, origin = build_session(lidar, "lidar", config, observer=terminal.observer())
+    session, origin = build_session(lidar, "lidar", config, observer=terminal)
     add_sessions(database, [(session, origin)], config, keep=False)
 
     terminal.note("3/4 relocalize the depth camera's recording in it")
     truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
     with open_database(database) as opened:
-        answer = find(depth, opened, config, observer=terminal.observer())
+        answer = find(depth, opened, config, observer=terminal)
         # The frame of the database is the first pose of the lidar robot; the truth is in that of the plan.
         T_map_plan = next(truth_map.poses()).inverse()
         true_poses = [T_map_plan @ pose for pose in truth_query.poses()]

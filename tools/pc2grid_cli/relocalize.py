@@ -57,11 +57,11 @@ def run(given: options.Relocalize, terminal: console.Console) -> int:
     is_check = given.check is not None or given.check_topic is not None
     several = given.every is not None or len(given.logs) > 1
     _check(given, outputs, is_check=is_check, several=several)
-    settings, observer = given.settings(), terminal.observer()
+    settings = given.settings()
     windows = _windows(given, settings)
     with known_pose.searched(given) as (opened, left_out):
         if is_check:
-            checked, document = known_pose.check_log(given, opened, settings, observer)
+            checked, document = known_pose.check_log(given, opened, settings, terminal)
             console.print_result(plain(document) if given.json else known_pose.as_text(checked))
             for warning in document["query"].warnings:
                 console.warn(warning)
@@ -69,8 +69,8 @@ def run(given: options.Relocalize, terminal: console.Console) -> int:
         frames = opened.frames() if given.frame == "building" else {}
         said = Said(given, outputs, opened, frames, left_out, terminal)
         if several:
-            return said.all(_found(windows, given, opened, settings, observer))
-        return said.one(windows[0], _find(windows[0], given, opened, settings, observer))
+            return said.all(_found(windows, given, opened, settings, terminal))
+        return said.one(windows[0], _find(windows[0], given, opened, settings, terminal))
 
 
 def _check(given: options.Relocalize, outputs: Mapping[str, Path], *, is_check: bool, several: bool) -> None:

@@ -94,7 +94,7 @@ class Following:
     @property
     def index(self) -> MapIndex:
         """Return the maps, prepared for searches."""
-        return MapIndex.of(self.database, self.config, self.terminal.observer())
+        return MapIndex.of(self.database, self.config, self.terminal)
 
     def run(self, searcher: Any, use: Callable[[EstimateT, threading.Lock], bool]) -> None:
         """Search after each metre.
@@ -116,7 +116,7 @@ class Following:
             drive.on_poll = poll  # a robot may be silent from the beginning
             choice = drive.choose()
             self.terminal.note(f"{drive.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
-            feed(drive, follower, self.config, poll, observer=self.terminal.observer())
+            feed(drive, follower, self.config, poll, observer=self.terminal)
 
 
 def _search(following: Following, robot: _Robot, prior: Prior | None) -> bool:
