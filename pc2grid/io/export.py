@@ -228,7 +228,7 @@ class LogWriter:
         fields = [field(name, 4 * k, field.FLOAT32, 1) for k, name in enumerate(names)]
         count, step = len(columns), 4 * len(names)
         cloud = (1, count, fields, False, step, step * count, _bytes_of(columns, "<f4"), True)
-        self._add(topic, stamp_ns, new("sensor_msgs/PointCloud2", header(stamp_ns, frame), *cloud))
+        self.write(topic, stamp_ns, new("sensor_msgs/PointCloud2", header(stamp_ns, frame), *cloud))
 
     def laser_scan(
         self,
@@ -249,7 +249,7 @@ class LogWriter:
         times = (time_increment, time_increment * len(values))
         intensities = np.empty(0, np.float32)
         scan = (*angles, *times, range_min, range_max, values, intensities)
-        self._add(topic, stamp_ns, new("sensor_msgs/LaserScan", header(stamp_ns, frame), *scan))
+        self.write(topic, stamp_ns, new("sensor_msgs/LaserScan", header(stamp_ns, frame), *scan))
 
     def depth_image(self, topic: str, stamp_ns: int, frame: str, depth_m: ArrayLike) -> None:
         """Write a sensor_msgs/Image of encoding 16UC1: millimetres, 0 without a return or beyond 65 m."""
@@ -259,7 +259,7 @@ class LogWriter:
         millimetres[good] = np.rint(depth[good] * 1000.0).astype(np.uint16)
         height, width = depth.shape
         image = (height, width, "16UC1", 0, 2 * width, _bytes_of(millimetres, "<u2"))
-        self._add(topic, stamp_ns, new("sensor_msgs/Image", header(stamp_ns, frame), *image))
+        self.write(topic, stamp_ns, new("sensor_msgs/Image", header(stamp_ns, frame), *image))
 
     def camera_info(self, topic: str, stamp_ns: int, frame: str, K: ArrayLike, W: int, H: int) -> None:
         """Write a sensor_msgs/CameraInfo of an undistorted camera with intrinsics K (3, 3) and W x H
@@ -269,7 +269,7 @@ class LogWriter:
         projection = np.column_stack((k, np.zeros(3))).reshape(-1)
         whole_image = new("sensor_msgs/RegionOfInterest", 0, 0, 0, 0, False)
         camera = (H, W, "plumb_bob", distortion, k.reshape(-1), rectification, projection, 0, 0, whole_image)
-        self._add(topic, stamp_ns, new("sensor_msgs/CameraInfo", header(stamp_ns, frame), *camera))
+        self.write(topic, stamp_ns, new("sensor_msgs/CameraInfo", header(stamp_ns, frame), *camera))
 
     # --- poses ----------------------------------------------------------------------------------------
 
@@ -282,15 +282,15 @@ class LogWriter:
         zero = vector(0.0, 0.0, 0.0)
         twist = new("geometry_msgs/TwistWithCovariance", new("geometry_msgs/Twist", zero, zero), unknown)
         head = header(stamp_ns, frame)
-        self._add(topic, stamp_ns, new("nav_msgs/Odometry", head, child, uncertain, twist))
+        self.write(topic, stamp_ns, new("nav_msgs/Odometry", head, child, uncertain, twist))
 
     def tf(self, stamp_ns: int, parent: str, child: str, T_parent_child: F64) -> None:
         """Write one transform (4, 4) on /tf."""
-        self._transforms("/tf", stamp_ns, [(parent, child, T_parent_child)])
+        self.write("/tf", stamp_ns, transforms(stamp_ns, [(parent, child, T_parent_child)]))
 
     def tf_static(self, stamp_ns: int, parent: str, child: str, T_parent_child: F64) -> None:
         """Write one transform (4, 4) on /tf_static: valid at all times."""
-        self._transforms("/tf_static", stamp_ns, [(parent, child, T_parent_child)])
+        self.write("/tf_static", stamp_ns, transforms(stamp_ns, [(parent, child, T_parent_child)]))
 
     def path(
         self, topic: str, trajectory: Trajectory, frame: str = "map", *, stamp_ns: int | None = None
@@ -307,46 +307,26 @@ class LogWriter:
             new("geometry_msgs/PoseStamped", header(int(pose_ns), frame), pose(T))
             for pose_ns, T in zip(trajectory.stamps_ns, trajectory.T_session_base, strict=True)
         ]
-        self._add(topic, at_ns, new("nav_msgs/Path", header(at_ns, frame), poses))
-
-    def pose_with_covariance(
-        self, topic: str, stamp_ns: int, pose: SE2, covariance: ArrayLike, frame: str = "map"
-    ) -> None:
-        """Write a geometry_msgs/PoseWithCovarianceStamped of a planar pose; covariance (3, 3) of x, y,
-        yaw."""
-        self._add(topic, stamp_ns, pose_with_covariance(stamp_ns, pose, covariance, frame))
-
-    def initialpose(self, stamp_ns: int, pose: SE2, covariance: ArrayLike, frame: str = "map") -> None:
-        """Write the same on /initialpose, with variances alone for nav2."""
-        self._add("/initialpose", stamp_ns, initialpose(stamp_ns, pose, covariance, frame))
+        self.write(topic, at_ns, new("nav_msgs/Path", header(at_ns, frame), poses))
 
     # --- maps and metadata ----------------------------------------------------------------------------
-
-    def occupancy_grid(
-        self, topic: str, stamp_ns: int, grid: OccupancyGrid, frame: str = "map", of: MapOf = "everything"
-    ) -> None:
-        """Write a nav_msgs/OccupancyGrid; row 0 has the smallest y, as in `OccupancyGrid`. of : see its
-        `told`."""
-        self._add(topic, stamp_ns, occupancy_grid(stamp_ns, grid, frame, of))
 
     def markers(self, topic: str, stamp_ns: int, markers: Sequence[Marker], frame: str = "map") -> None:
         """Write a visualization_msgs/MarkerArray in the layout since ROS 2 Humble; shown until replaced."""
         drawn = [_marker(number, marker, header(stamp_ns, frame)) for number, marker in enumerate(markers)]
-        self._add(topic, stamp_ns, new("visualization_msgs/MarkerArray", drawn))
+        self.write(topic, stamp_ns, new("visualization_msgs/MarkerArray", drawn))
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """Write an MCAP metadata record: the configuration, the digest of the input, and the like."""
         self._open().add_metadata(name, values)
-
-    def _transforms(self, topic: str, stamp_ns: int, edges: Sequence[tuple[str, str, F64]]) -> None:
-        self._add(topic, stamp_ns, transforms(stamp_ns, edges))
 
     def _open(self) -> Writer:
         if self._writer is None:
             raise RuntimeError("LogWriter is used outside of its with block")
         return self._writer
 
-    def _add(self, topic: str, stamp_ns: int, message: Any) -> None:
+    def write(self, topic: str, stamp_ns: int, message: Any) -> None:
+        """Write a message, such as `pose_with_covariance` makes."""
         writer = self._open()
         type_name: str = message.__msgtype__
         if type_name not in self._schemas:

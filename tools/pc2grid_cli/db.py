@@ -67,8 +67,8 @@ def check(given: options.DbCheck, terminal: console.Console) -> int | None:
 
 def merge(given: options.DbMerge, terminal: console.Console) -> None:
     """Store the sessions of several databases in a new one."""
-    count = maintenance.merge(given.databases, given.output, overwrite=given.force)
-    _print(given.output, f"{shown(given.output)}: {counted(count, 'session')}", given.json)
+    maintenance.merge(given.databases, given.output, overwrite=given.force)
+    _print(given.output, given.json)
 
 
 def copy(given: options.DbCopy, terminal: console.Console) -> int | None:
@@ -77,22 +77,21 @@ def copy(given: options.DbCopy, terminal: console.Console) -> int | None:
     problems = maintenance.copy(given.database, made, recover=given.recover, overwrite=given.force)
     for problem in problems:
         console.warn(f"left out: {problem.where}: {problem.what}")
-    size = f"{path.stat().st_size / 1e6:.1f} MB" if path.is_file() else _sessions_in(made)
-    _print(made, f"{shown(made)}: {size}", given.json, problems)
+    size = f"{path.stat().st_size / 1e6:.1f} MB" if path.is_file() else None
+    _print(made, given.json, size, left_out=problems)
     return console.LOSSY if problems else None
 
 
 def split(given: options.DbSplit, terminal: console.Console) -> None:
     """Copy sessions of a database into a new one."""
-    count = maintenance.split(given.database, given.sessions, given.output, overwrite=given.force)
-    _print(given.output, f"{shown(given.output)}: {counted(count, 'session')}", given.json)
+    maintenance.split(given.database, given.sessions, given.output, overwrite=given.force)
+    _print(given.output, given.json)
 
 
 def rename(given: options.DbRename, terminal: console.Console) -> None:
     """Give a session another name."""
     maintenance.rename(given.database, given.old, given.new)
-    said = one_line(f"{shown(given.database)}: {given.old} is now {given.new}")
-    _print(given.database, said, given.json)
+    _print(given.database, given.json, f"{given.old} is now {given.new}")
 
 
 def remove(given: options.DbRemove, terminal: console.Console) -> None:
@@ -105,20 +104,19 @@ def remove(given: options.DbRemove, terminal: console.Console) -> None:
                 hint="--force removes them all the same; `pc2grid db copy` keeps a copy",
             )
     maintenance.remove(given.database, given.sessions)
-    left = f"{shown(given.database)}: {_sessions_in(given.database)} left"
-    _print(given.database, left, given.json)
+    _print(given.database, given.json, behind=" left")
 
 
-def _sessions_in(database: str) -> str:
-    """Return how many sessions are in a database, with the noun."""
-    with open_database(database) as opened:
-        return counted(len(opened.sessions()), "session")
+def _print(
+    database: str, json: bool, said: str | None = None, *, behind: str = "", left_out: Sequence[Problem] = ()
+) -> None:
+    """Print what a database is now that it was written, or the document about it.
 
-
-def _print(database: str, text: str, json: bool, left_out: Sequence[Problem] = ()) -> None:
-    """Print a text or the document about a database that was written."""
+    said : None: how many sessions it holds. behind : ends the text.
+    """
     with open_database(database) as opened:
         number, where = len(opened.sessions()), opened.location
+    text = one_line(f"{shown(database)}: {said or counted(number, 'session')}{behind}")
     about = {"database": where, "sessions": number, "left_out": list(left_out)}
     console.print_result(plain(about) if json else text)
 
@@ -138,7 +136,7 @@ def join(given: options.DbJoin, terminal: console.Console) -> None:
                 f"{opened.location}: holds {counted(len(names), 'session')}, and two can be joined",
                 hint="`pc2grid convert LOG --add` adds one, `pc2grid db merge` puts databases together",
             )
-        found = join_sessions(opened, frame=given.frame, observer=terminal.observer())
+        found = join_sessions(opened, frame=given.frame, observer=terminal)
         if given.plot is not None:
             _draw(given.plot, opened, found)
     if not given.dry_run:  # those that lie in no building are no longer in one

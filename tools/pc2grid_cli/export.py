@@ -18,6 +18,7 @@ from pc2grid._version import __version__
 from pc2grid.display import plain
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid.geometry import F64
+from pc2grid.io import export
 from pc2grid.io.export import LogWriter, Marker, write_cloud, write_g2o, write_graph
 from pc2grid.io.maps import is_map_file, save_map
 from pc2grid.io.trajectory import write_trajectory
@@ -59,14 +60,15 @@ def run(given: options.Export, terminal: console.Console) -> None:
             opened.keep_only(building=given.building, floor=given.floor)
         frames = opened.frames() if given.frame == "building" else {}
         floors, of_sessions = floors_of(opened, frames), outputs.keys() - {"report"}
-        name, whole = None, given.session is None and of_sessions <= _OF_FLOORS and len(floors) == 1
-        if of_sessions and whole:
-            _write_building(outputs, given, opened, floors[0], frames, terminal)
-        elif of_sessions:
+        whole = given.session is None and of_sessions <= _OF_FLOORS and len(floors) == 1
+        name = None
+        if of_sessions and not whole:
             name = given.session or _only_session(
                 opened, sorted(of_sessions - _OF_FLOORS), joined=bool(floors)
             )
-            _write_session(outputs, given, opened, name, frames.get(name), terminal)
+        if of_sessions:
+            names = floors[0] if name is None else [name]
+            _write(outputs, given, opened, names, frames, terminal, whole=name is None)
         if "report" in outputs:
             write_report(outputs["report"], opened)
         written = output.written_files(outputs)
@@ -112,49 +114,45 @@ def _only_session(database: SubmapDatabase, of_one: Sequence[str], *, joined: bo
     )
 
 
-def _write_building(
+def _write(
     outputs: Mapping[str, Path],
     given: options.Export,
     database: SubmapDatabase,
     names: Sequence[str],
     frames: BuildingFrames,
     terminal: console.Console,
+    *,
+    whole: bool,
 ) -> None:
-    """Write the map, the cloud and the picture of the sessions of a floor, in the frame of their building."""
-    others = [info.name for info in database.sessions() if info.name not in frames]
-    if others:
+    """Write all files of a session, or with `whole` those that show all sessions of a floor.
+
+    They are in the frame of the building; of a session that is not joined, in its own.
+    """
+    if whole and (others := [info.name for info in database.sessions() if info.name not in frames]):
         console.warn(f"not joined, and left out: {', '.join(others)}")
-    if "map" in outputs:
-        _write_map(outputs["map"], database, names, frames, given.map_of)
-    if "cloud" in outputs:
-        _write_cloud(outputs["cloud"], database, names, frames, terminal)
-    if "plot" in outputs:
-        maps = {name: (database.grid(name), frames[name]) for name in names}
-        draw_building(outputs["plot"], frames[names[0]].name, maps)
-
-
-def _write_session(
-    outputs: Mapping[str, Path],
-    given: options.Export,
-    database: SubmapDatabase,
-    name: str,
-    frame: BuildingFrame | None,
-    terminal: console.Console,
-) -> None:
-    """Write all files of a session. frame : of its building; None: its own map frame."""
     # A session without a trajectory is refused before anything is written.
-    poses = database.trajectory(name)
+    name, poses = names[0], database.trajectory(names[0])
     if not len(poses) and {"trajectory", "g2o"} & outputs.keys():
         raise DatabaseError(f"{database.location}: session {name!r} is an imported map and has no trajectory")
-    frames = {} if frame is None else {name: frame}
+    placed = {session: frames[session] for session in names if session in frames}
+
+    def draw(path: Path) -> None:
+        if whole:
+            maps = {session: (database.grid(session), at) for session, at in placed.items()}
+            draw_building(path, frames[name].name, maps)
+        else:
+            draw_session(path, database, name)
+
     writers: dict[str, Callable[[Path], object]] = {
-        "trajectory": lambda path: write_trajectory(path, _in_building(poses, frame), given.format),
-        "cloud": lambda path: _write_cloud(path, database, [name], frames, terminal),
+        "trajectory": lambda path: write_trajectory(
+            path, _in_building(poses, frames.get(name)), given.format
+        ),
+        "cloud": lambda path: _write_cloud(path, database, names, placed, terminal),
         "graph": lambda path: write_graph(path, database.graph(name)),
         "g2o": lambda path: write_g2o(path, poses, database.loops(name)),
         "mcap": lambda path: _write_mcap(path, database, name, given),
-        "plot": lambda path: draw_session(path, database, name),
-        "map": lambda stem: _write_map(stem, database, [name], frames, given.map_of),
+        "plot": draw,
+        "map": lambda stem: _write_map(stem, database, names, placed, given.map_of),
     }
     for option, write in writers.items():
         if option in outputs:
@@ -257,8 +255,9 @@ def write_answer(
             writer.tf(int(stamp_ns), "map", "odom", T_map_odom)
             writer.tf(int(stamp_ns), "odom", "base_link", T_odom_map @ T_map_base)
         writer.markers("/hypotheses", last, [_hypotheses(answer)])
-        writer.pose_with_covariance("/pose", last, answer.T_map_base, answer.covariance)
-        writer.initialpose(last, answer.T_map_base, answer.covariance)
+        pose = last, answer.T_map_base, answer.covariance
+        writer.write("/pose", last, export.pose_with_covariance(*pose))
+        writer.write("/initialpose", last, export.initialpose(*pose))
 
 
 def write_located_map(
@@ -270,17 +269,17 @@ def write_located_map(
     assert answer.covariance is not None
     with LogWriter(path, overwrite=force) as writer:
         _write_map_message(writer, database, answer.session, 0)
-        writer.occupancy_grid("/query_map", 0, query, frame="query_map")
+        writer.write("/query_map", 0, export.occupancy_grid(0, query, "query_map"))
         writer.tf_static(0, "map", "query_map", answer.T_map_odom.lift())
         writer.markers("/hypotheses", 0, [_hypotheses(answer)])
-        writer.pose_with_covariance("/pose", 0, answer.T_map_odom, answer.covariance)
+        writer.write("/pose", 0, export.pose_with_covariance(0, answer.T_map_odom, answer.covariance))
 
 
 def _write_map_message(
     writer: LogWriter, database: SubmapDatabase, session: str, stamp_ns: int, of: MapOf = "everything"
 ) -> None:
     """Write the map of a session, its points and its submaps. of : what the map shows."""
-    writer.occupancy_grid("/map", stamp_ns, database.grid(session), of=of)
+    writer.write("/map", stamp_ns, export.occupancy_grid(stamp_ns, database.grid(session), of=of))
     points = database.points(session)
     if points is not None:
         writer.point_cloud("/points", stamp_ns, "map", points.points_m().astype(np.float32))

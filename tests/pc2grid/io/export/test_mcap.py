@@ -13,7 +13,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2, pose_from_rotation_vector, pose_from_xyz_quat
-from pc2grid.io.export import LogWriter, Marker
+from pc2grid.io.export import LogWriter, Marker, occupancy_grid, pose_with_covariance
 from pc2grid.model import OccupancyGrid, Trajectory
 
 STAMP = 1_700_000_000_123_456_789
@@ -42,8 +42,8 @@ def test_every_message_survives_the_reference_decoder(tmp_path: Path) -> None:
         out.tf(STAMP, "odom", "base_link", pose)
         out.tf_static(STAMP, "base_link", "lidar", np.eye(4))
         out.path("/path", trajectory)
-        out.pose_with_covariance("/pose", STAMP, SE2(1, 2, 0.5), np.diag([1.0, 2.0, 3.0]))
-        out.occupancy_grid("/map", STAMP, grid)
+        out.write("/pose", STAMP, pose_with_covariance(STAMP, SE2(1, 2, 0.5), np.diag([1.0, 2.0, 3.0])))
+        out.write("/map", STAMP, occupancy_grid(STAMP, grid))
         marks = np.arange(12.0).reshape(4, 3)
         out.markers(
             "/marks",
