@@ -27,7 +27,7 @@ from typing_extensions import Self
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import F64, BoolGrid, hand_over
 from pc2grid.io.atomic import replace_file
-from pc2grid.io.messages.types import FARTHEST_M
+from pc2grid.io.messages.types import EDGES_M, FARTHEST_M
 from pc2grid.io.sensors.depth import MAGIC as PNG_MAGIC
 from pc2grid.io.sensors.depth import read_header
 from pc2grid.io.source import LFS_HINT, is_lfs_pointer
@@ -36,8 +36,6 @@ from pc2grid.model import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_FROM, UNKNOWN, Ma
 MapMode = Literal["trinary", "scale", "raw"]
 
 _MAX_YAML_BYTES = 65_536
-# Metres per pixel outside of this range are a typing error: submaps are some metres wide.
-_RESOLUTION_M = (1e-3, 100.0)
 # Defaults of nav2_map_server for a written map. 0.196 and not 0.25: an unknown pixel, grey 205, has the
 # occupancy 0.196078, which a free_thresh of 0.25 would read as free.
 _OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
@@ -326,7 +324,7 @@ class _Keys(BaseModel):
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)
     image: str = Field(pattern=r"^[^\x00]+$")
-    resolution: float = Field(ge=_RESOLUTION_M[0], le=_RESOLUTION_M[1])
+    resolution: float = Field(ge=EDGES_M[0], le=EDGES_M[1])
     origin: tuple[_Coordinate, _Coordinate, float]
     negate: bool
     occupied_thresh: float = Field(ge=0, le=1)

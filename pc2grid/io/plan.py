@@ -132,8 +132,9 @@ def published_once(topic: TopicInfo) -> bool:
 
 # --- the sensors --------------------------------------------------------------------------------------
 
-_FIRST_SCANS = 20
-"""So many scans of a topic are looked at, so that each of several sensors on it is among them. By hand."""
+FIRST_SCANS = 20
+"""So many scans of a topic are looked at, so that each of several sensors on it is among them; nor are there
+more sensors beside the first one, against hostile files. By hand."""
 
 
 class Sensor(NamedTuple):
@@ -221,8 +222,8 @@ def find_sensors(config: ReadConfig, first: FirstMessages) -> FoundSensors:
     frames = [str(s.frame) for s in sensors if s.topic == lead.topic and not s.silent]
     if len(frames) > 1:
         reason += f", of {len(frames)} sensors by their frames: {', '.join(frames)}"
-    left_out = {(t, scan.frame) for t in found for scan in first.of(t, _FIRST_SCANS)} - used
-    scans = [s for s in first.of(lead.topic, _FIRST_SCANS) if s.frame == lead.frame]
+    left_out = {(t, scan.frame) for t in found for scan in first.of(t, FIRST_SCANS)} - used
+    scans = [s for s in first.of(lead.topic, FIRST_SCANS) if s.frame == lead.frame]
     return FoundSensors(tuple(sensors), frozenset(left_out), tuple(scans[:FIRST]), reason)
 
 
@@ -316,7 +317,7 @@ def _of_frames(sensor: Sensor, config: ReadConfig, first: FirstMessages) -> list
 
     sensor : that of the topic, as long as its frame is not known.
     """
-    scans = first.of(sensor.topic, _FIRST_SCANS)
+    scans = first.of(sensor.topic, FIRST_SCANS)
     names = list(dict.fromkeys(scan.frame for scan in scans))
     if len(names) < 2:
         return [sensor._replace(frame=name) for name in names] or [sensor]
@@ -346,7 +347,7 @@ def _shown(sensor: Sensor, config: ReadConfig, name: str, scans: Sequence[First]
 
 def _calibration(sensor: Sensor, frame: str, first: FirstMessages) -> CameraInfo | None:
     """Return the first calibration in the frame of the images, else the first one."""
-    infos = [] if sensor.camera is None else first.of(sensor.camera, _FIRST_SCANS)
+    infos = [] if sensor.camera is None else first.of(sensor.camera, FIRST_SCANS)
     return next((info.content for info in infos if info.frame == frame), sensor.calibration)
 
 

@@ -10,8 +10,8 @@ a user gets one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, NamedTuple, Protocol, TypeVar, cast
@@ -23,6 +23,8 @@ from pc2grid.model import ReadReport, SensorKind
 
 GAP_NS = 5_000_000_000
 """A longer time without messages, and clocks that differ by more, are reported; chosen by hand."""
+LIDAR_PERIOD_NS = 100_000_000
+"""Between two scans of most lidars, and of KITTI: 10 Hz."""
 SQLITE = b"SQLite format 3\0"
 """How an SQLite file begins."""
 SUBMAPS_ID = b"pcsm"
@@ -46,6 +48,32 @@ class TopicInfo:
     schema_encoding: Annotated[str, Field(exclude=True)] = field(default="", compare=False)
     schema: Annotated[bytes, Field(exclude=True)] = field(default=b"", repr=False, compare=False)
     message_count: int | None = field(default=None, compare=False)
+
+
+K = TypeVar("K")
+
+
+def counted(topics: Mapping[K, TopicInfo]) -> dict[K, TopicInfo]:
+    """Return topics by the same keys, each with the messages of all that are equal to it.
+
+    Several programs may publish one topic, and a recording may have several files.
+    """
+    groups: dict[TopicInfo, list[TopicInfo]] = {}
+    for topic in topics.values():
+        groups.setdefault(topic, []).append(topic)
+    whole = {
+        topic: replace(
+            next((t for t in group if t.schema), topic), message_count=total(t.message_count for t in group)
+        )
+        for topic, group in groups.items()
+    }
+    return {key: whole[topic] for key, topic in topics.items()}
+
+
+def total(counts: Iterable[int | None]) -> int | None:
+    """Return the sum; None if one is unknown."""
+    known = list(counts)
+    return None if None in known else sum(count for count in known if count is not None)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

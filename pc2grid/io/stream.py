@@ -31,10 +31,10 @@ from pc2grid.io.frames import PARAMETERS as FRAMES
 from pc2grid.io.frames import Attitude, FrameTree, PoseTrack
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import CameraInfo, Imu, Odometry, ScanMessage, Transform
-from pc2grid.io.plan import Plan, Sensor, registered
-from pc2grid.io.sensors.decode import ScanDecoder
+from pc2grid.io.plan import FIRST_SCANS, Plan, Sensor, registered
+from pc2grid.io.sensors.decode import MOST_TURNS, ScanDecoder
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
-from pc2grid.io.source import GAP_NS, MessageSource, RawMessage, Tally, TopicInfo
+from pc2grid.io.source import GAP_NS, LIDAR_PERIOD_NS, MessageSource, RawMessage, Tally, TopicInfo
 from pc2grid.io.topics import tolerant
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ReadConfig
@@ -60,12 +60,9 @@ class StreamParameters:
 
 
 PARAMETERS = StreamParameters()
-_MOST_FURTHER = 20
-"""Sensors beside the first one, against hostile files; chosen by hand."""
 _FLOOR_BELOW_M, _FLOOR_SHARE = 0.05, 0.01
 """At least this share of the points lies so far below the sensor, unless the floor is at its height; by
 hand."""
-_MOST_PERIODS = 1.1  # that the beams of a laser's scan take; stamps jitter
 _UP = math.cos(math.radians(45.0))  # an axis that points more upwards than this
 _EMPTY_HINT = (
     "is the sensor covered, or the unit of its ranges wrong? metres are expected; another topic: --topic"
@@ -213,8 +210,8 @@ class Stream:
     def _take_further(self, sensor: _Of, scan: Received) -> None:
         """Keep a scan for the first sensor's; if that has none for long, this sensor takes its place."""
         if sensor not in self._further:
-            if len(self._further) >= _MOST_FURTHER:
-                raise PointCloudError(f"scans in more than {_MOST_FURTHER + 1} frames")
+            if len(self._further) >= FIRST_SCANS:
+                raise PointCloudError(f"scans in more than {FIRST_SCANS + 1} frames")
             name = self._add(sensor).name
             if sensor not in ((s.topic, s.frame) for s in self._plan.sensors):
                 self._source.tally.warn(f"{name}: scans that began later are of a further sensor")
@@ -253,7 +250,7 @@ class Stream:
                 self._config,
                 depth_unit_m=self._plan.depth_unit_m,
                 fixed_frame=self._plan.mounted is not None,
-                longest_s=_MOST_PERIODS * self._plan.period_ns * 1e-9 or math.inf,
+                longest_s=MOST_TURNS * self._plan.period_ns * 1e-9 or math.inf,
             )
         return self._decoders[of]
 
@@ -611,8 +608,6 @@ class _Poses:
 
 # --- scans of further sensors -------------------------------------------------------------------------
 
-_MOST_APART_NS = 100_000_000
-"""Stamps of scans that are put together differ by no more: a period of a usual lidar."""
 _KEPT = 50
 """Messages of a topic that wait for the first sensor's; chosen by hand."""
 
@@ -655,14 +650,15 @@ class FurtherScans:
         pose_of: Callable[[str, int], F64],
         odometry_at: Callable[[int], F64 | None],
     ) -> Scan | None:
-        """Return the scan nearest to a stamp; None if there is none of a silent sensor.
+        """Return the scan nearest to a stamp, within the period of a usual lidar; None if there is none of a
+        silent sensor.
 
         pose_of : `T_base_sensor` of a frame at a time.
 
         Raises PointCloudError if none is near, Pc2GridError if it cannot be decoded.
         """
         nearest = min(self._received, key=lambda r: abs(r.stamp_ns - stamp_ns), default=None)
-        if nearest is None or abs(nearest.stamp_ns - stamp_ns) > _MOST_APART_NS:
+        if nearest is None or abs(nearest.stamp_ns - stamp_ns) > LIDAR_PERIOD_NS:
             if self.silent:
                 return None
             raise PointCloudError("no scan near the first sensor's")

@@ -45,8 +45,6 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.settings import Config, ProjectionConfig, ReadConfig
 
-_SPARSE_M = 0.15
-"""Spacing of points above which walls have gaps in a grid of 5 cm. Chosen by hand."""
 _SPACING_NEIGHBOUR = 3
 """On a surface the third neighbour is as far away as a voxel filter is wide; the first may be much nearer."""
 
@@ -186,6 +184,8 @@ def _doubts(level: F64, T_map_file: F64, read: ReadConfig, *, dense: bool) -> It
 
 # --- from a cloud to a grid ---------------------------------------------------------------------------
 
+PROJECTION = ProjectionConfig()
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CloudMapParameters:
@@ -217,9 +217,9 @@ class CloudMapParameters:
     small_m : the least width and depth of a building.
     """
 
-    resolution_m: float = 0.05
+    resolution_m: float = PROJECTION.resolution_m
     floor_m: float = 0.15
-    refine_m: float = 0.05
+    refine_m: float = resolution_m
     refine_points: int = 20_000
     passage_m: tuple[float, float] = (0.2, 1.6)
     obstacle_voxels: int = 2
@@ -227,11 +227,11 @@ class CloudMapParameters:
     margin_m: float = 0.5
     max_cells: int = MAX_CELLS
 
-    tile_m: float = 16.0
     spacing_m: float = 1.0
     clearance_m: float = 0.15
     height_m: float = 1.0
     sight_m: float = 8.0
+    tile_m: float = 2.0 * sight_m
     hidden_m: float = 0.5
     ceiling_m: float = 4.0
     tall_m: float = 60.0
@@ -239,7 +239,8 @@ class CloudMapParameters:
 
 
 CLOUD_MAP = CloudMapParameters()
-PROJECTION = ProjectionConfig()
+_SPARSE_M = 3.0 * CLOUD_MAP.resolution_m
+"""Spacing of points above which walls have gaps. Chosen by hand."""
 _SCANS_OF_A_VIEW = 2
 """Scans of the same that make a cell free in a `GridBuilder`."""
 
@@ -336,8 +337,7 @@ class _Tiles:
         points = np.concatenate([self._points[found] for found in rows if found is not None])
         low_m = self.corner_m(tile) - margin_m
         inside = (points[:, :2] >= low_m) & (points[:, :2] < low_m + self._edge_m + 2.0 * margin_m)
-        chosen: F64 = points[inside.all(axis=1)]
-        return chosen
+        return np.asarray(points[inside.all(axis=1)])
 
 
 def _without_noise(points: F64, projection: ProjectionConfig, p: CloudMapParameters) -> F64:
@@ -347,8 +347,7 @@ def _without_noise(points: F64, projection: ProjectionConfig, p: CloudMapParamet
     _, column = np.unique((cell[:, 0] << 32) + cell[:, 1], return_inverse=True)
     band = (points[:, 2] > projection.band_min_m) & (points[:, 2] < projection.band_max_m)
     obstacles = np.bincount(column, band)
-    kept: F64 = points[~band | (obstacles[column] >= p.obstacle_voxels)]
-    return kept
+    return np.asarray(points[~band | (obstacles[column] >= p.obstacle_voxels)])
 
 
 def _viewpoints(near: F64, corner_m: F64, projection: ProjectionConfig, p: CloudMapParameters) -> F64:
@@ -489,8 +488,7 @@ def drivable_plan(
 def _voxels(points: F64, p: CloudMapParameters) -> I64:
     """Return the indices (V, 3) of the voxels with points at the heights of a robot, each once."""
     chosen = points[(points[:, 2] > -p.floor_m) & (points[:, 2] < p.passage_m[1])]
-    voxels: I64 = np.unique(np.floor(chosen / p.resolution_m).astype(np.int64), axis=0)
-    return voxels
+    return np.asarray(np.unique(np.floor(chosen / p.resolution_m).astype(np.int64), axis=0))
 
 
 def check_plausible(points_m: NDArray[np.floating], parameters: CloudMapParameters = CLOUD_MAP) -> None:
@@ -749,8 +747,7 @@ def _ceiling_m(points: F64) -> float | None:
 def _cells(points: F64) -> I64:
     """Return the cell (V, 2) of each point, from (0, 0)."""
     cells = np.floor(points[:, :2] / _CELL_M).astype(np.int64)
-    first: I64 = cells - cells.min(axis=0)
-    return first
+    return np.asarray(cells - cells.min(axis=0))
 
 
 def _mask(cells: I64, chosen: NDArray[np.bool_]) -> BoolGrid:

@@ -34,7 +34,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, Pc2GridError
 from pc2grid.geometry import F32, F64, I64, frozen_arrays
-from pc2grid.io.messages.types import FARTHEST_M
+from pc2grid.io.messages.types import EDGES_M, FARTHEST_M
 from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid.submaps.submaps import divide
@@ -427,8 +427,6 @@ def explained(location: Path | str, where: str) -> Iterator[None]:
 # All chosen by hand: wide enough for every real session.
 MOST_VOXELS = 1 << 21
 """Voxels along an axis; 104 km of 5 cm."""
-EDGES_M = (1e-3, 100.0)
-"""Least and largest edge of a cell or voxel."""
 _ROUNDING = 1e-4
 """Largest deviation of R R^T from the identity, and of the sum of a histogram, which is float32, from 1."""
 

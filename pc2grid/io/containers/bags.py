@@ -9,8 +9,7 @@ from __future__ import annotations
 
 import functools
 import io
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import quote
@@ -20,7 +19,17 @@ import yaml
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogNotFound, LogTruncated, NotALog
 from pc2grid.io.containers.mcap import BoundedFile, plain_message, unpacked
 from pc2grid.io.messages.ros import short_name
-from pc2grid.io.source import LogInfo, MessageSource, RawMessage, Tally, TopicInfo, guarded, guarded_stream
+from pc2grid.io.source import (
+    LogInfo,
+    MessageSource,
+    RawMessage,
+    Tally,
+    TopicInfo,
+    counted,
+    guarded,
+    guarded_stream,
+    total,
+)
 from pc2grid.model import MISSING_FILES
 from pc2grid.settings import ReadConfig
 
@@ -125,37 +134,17 @@ class SplitSource:
 def _info(path: Path, infos: Sequence[LogInfo], tally: Tally) -> LogInfo:
     """Return the facts about the whole recording, from those about its parts."""
     spans = [info for info in infos if info.message_count != 0]
-    topics = _merged([t for info in infos for t in info.topics])
+    topics = set(counted(dict(enumerate(t for info in infos for t in info.topics))).values())
     return LogInfo(
         path=path,
         format=next((info.format for info in infos if info.topics), infos[0].format),
         size_bytes=sum(info.size_bytes for info in infos),
         start_ns=min((s.start_ns for s in spans), default=0),
         end_ns=max((s.end_ns for s in spans), default=0),
-        message_count=_total(info.message_count for info in infos),
+        message_count=total(info.message_count for info in infos),
         topics=tuple(sorted(topics, key=lambda t: (t.topic, t.type))),
         warnings=tuple(tally.warnings),
     )
-
-
-def _merged(topics: Iterable[TopicInfo]) -> list[TopicInfo]:
-    """Return the topics of the whole recording, with all messages counted."""
-    groups: dict[TopicInfo, list[TopicInfo]] = {}
-    for topic in topics:
-        groups.setdefault(topic, []).append(topic)
-    return [
-        replace(
-            next((t for t in group if t.schema), group[0]),
-            message_count=_total(t.message_count for t in group),
-        )
-        for group in groups.values()
-    ]
-
-
-def _total(counts: Iterable[int | None]) -> int | None:
-    """Return the sum; None if one is unknown."""
-    known = list(counts)
-    return None if None in known else sum(count for count in known if count is not None)
 
 
 _MENDS_BAG = "`rosbag reindex {name}` mends it; --recover is for MCAP files"
@@ -208,22 +197,19 @@ class RosbagsFile:
 
     def _topics(self) -> dict[int, TopicInfo]:
         """Return the topic of each connection; a topic of ROS 1 has one for each publisher."""
-        groups: dict[tuple[str, str], list[Any]] = {}
-        for connection in self._reader.connections:
-            groups.setdefault((connection.topic, connection.msgtype), []).append(connection)
         found: dict[int, TopicInfo] = {}
-        for (topic, kind), group in groups.items():
-            encoding = "ros2idl" if group[0].msgdef.format.name == "IDL" else "ros2msg"
-            info = TopicInfo(
-                topic=topic,
-                type=short_name(kind),
+        for connection in self._reader.connections:
+            definition = connection.msgdef
+            encoding = "ros2idl" if definition.format.name == "IDL" else "ros2msg"
+            found[connection.id] = TopicInfo(
+                topic=connection.topic,
+                type=short_name(connection.msgtype),
                 encoding="ros1" if self._is_bag else "cdr",
                 schema_encoding="ros1msg" if self._is_bag else encoding,
-                schema=group[0].msgdef.data.encode(),
-                message_count=sum(c.msgcount for c in group),
+                schema=definition.data.encode(),
+                message_count=connection.msgcount,
             )
-            found.update((c.id, info) for c in group)
-        return found
+        return counted(found)
 
     def _describe(self) -> LogInfo:
         span = self._reader if self._is_bag else self._reader.metadata

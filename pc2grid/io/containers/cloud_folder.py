@@ -16,14 +16,13 @@ from typing import Any
 
 from pc2grid.errors import LimitExceeded, LogCorrupt, TrajectoryFileError
 from pc2grid.io.messages.clouds import pack_cloud, pack_pose
-from pc2grid.io.source import LFS_HINT, LogInfo, RawMessage, Tally, TopicInfo, is_lfs_pointer
+from pc2grid.io.source import LFS_HINT, LIDAR_PERIOD_NS, LogInfo, RawMessage, Tally, TopicInfo, is_lfs_pointer
 from pc2grid.io.trajectory import lines_of, read_tum, stamp_ns_from_text
 from pc2grid.model import Trajectory
 from pc2grid.settings import ReadConfig
 
 SUFFIXES = (".pcd", ".ply", ".bin")
 CLOUDS, POSES = "clouds", "poses"
-_ASSUMED_PERIOD_NS = 100_000_000  # 10 Hz, of most lidars and of KITTI
 
 
 class CloudFolder:
@@ -135,7 +134,7 @@ def _stamps_of(clouds: list[Path], times: Path | None, poses: Trajectory | None,
         stamps = poses.stamps_ns.tolist()
     if stamps is None:
         tally.warn("neither a file nor the names of the clouds tell the time: 10 clouds a second are assumed")
-        return [(i + 10) * _ASSUMED_PERIOD_NS for i in range(count)]
+        return [(i + 10) * LIDAR_PERIOD_NS for i in range(count)]
     if stamps[0] <= 0:  # KITTI counts from zero, but a stamp of zero means that there is none
         stamps = [t - stamps[0] + 1_000_000_000 for t in stamps]
     return stamps

@@ -34,7 +34,7 @@ from mcap.stream_reader import CRCValidationError, StreamReader, breakup_chunk
 
 from pc2grid.errors import LimitExceeded, LogCorrupt, LogError, LogTruncated, UnsupportedSchema
 from pc2grid.io.messages.ros import short_name
-from pc2grid.io.source import RECOVER_HINT, LogInfo, RawMessage, Tally, TopicInfo
+from pc2grid.io.source import RECOVER_HINT, LogInfo, RawMessage, Tally, TopicInfo, counted
 from pc2grid.settings import ReadConfig
 
 _LAST_NS = 1 << 64
@@ -114,14 +114,14 @@ class McapSource:
     def _topics(self) -> dict[int, TopicInfo]:
         """Return the topic of each channel; one that several programs publish may have several channels."""
         index = self._index
-        of_channel = {key: index.topic(channel) for key, channel in index.channels.items()}
-        groups: dict[tuple[str, str, str], list[int]] = {}
-        for key, topic in of_channel.items():
-            groups.setdefault((topic.topic, topic.type, topic.encoding), []).append(key)
-        for group in groups.values():
-            total = sum(index.counts.get(key, 0) for key in group) if index.counted else None
-            of_channel.update(dict.fromkeys(group, replace(of_channel[group[0]], message_count=total)))
-        return of_channel
+        return counted(
+            {
+                key: replace(
+                    index.topic(channel), message_count=index.counts.get(key, 0) if index.counted else None
+                )
+                for key, channel in index.channels.items()
+            }
+        )
 
     def _describe(self) -> LogInfo:
         index = self._index

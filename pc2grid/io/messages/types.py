@@ -21,6 +21,8 @@ Seven = tuple[float, float, float, float, float, float, float]
 # Coordinates beyond this are a mistake: it is twice the circumference of the earth, and floats are far from
 # overflowing.
 FARTHEST_M = 1e8
+# Least and largest edge of a cell or voxel: submaps are some metres wide.
+EDGES_M = (1e-3, 100.0)
 # The squared length of a quaternion within which it has a direction; writers do not always normalise it.
 _QUATERNION_SQUARED = (1e-12, 1e12)
 

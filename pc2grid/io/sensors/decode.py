@@ -152,15 +152,14 @@ def _to_base(xyz: F32 | F64, T_base_sensor: F64) -> F32:
     # float32 is kept: half the memory, and a rounding of micrometres.
     kind: type = np.float32 if xyz.dtype == np.float32 else np.float64
     T: NDArray[Any] = T_base_sensor.astype(kind)
-    points: F32 = (xyz @ T[:3, :3].T + T[:3, 3]).astype(np.float32, copy=False)
-    return points
+    return np.asarray((xyz @ T[:3, :3].T + T[:3, 3]).astype(np.float32, copy=False))
 
 
 # --- LaserScan ----------------------------------------------------------------------------------------
 
 # Drivers round the angles: so many ranges more or less than the angles make are accepted. Chosen by hand.
 _EXTRA_BEAMS, _EXTRA_SHARE = 2.0, 0.02
-_MOST_TURNS = 1.1  # that one scan covers
+MOST_TURNS = 1.1  # that one scan covers, or lasts: stamps jitter
 _LEAST_INCREMENT_S = 1e-9  # a smaller time_increment is one that was not set
 
 
@@ -219,7 +218,7 @@ def _check_beams(scan: LaserScan, most: int) -> list[str]:
     if step == 0:
         raise PointCloudError("field angle_increment: 0")
     span = (count - 1) * abs(step)
-    if span > _MOST_TURNS * 2 * math.pi:
+    if span > MOST_TURNS * 2 * math.pi:
         raise PointCloudError(
             f"{count} beams {step:g} rad apart span {span:.4g} rad, more than a turn",
             hint="angles of a LaserScan are in radians: correct the driver, and record again",

@@ -185,8 +185,7 @@ def _timed(values: NDArray[Any]) -> NDArray[np.bool_] | slice:
     least, most = (float(values.min()), float(values.max())) if len(values) else (0.0, 0.0)
     if low <= least and most <= high and math.isfinite(most - least):
         return slice(None)
-    timed: NDArray[np.bool_] = np.isfinite(values) & (values >= low) & (values <= high)
-    return timed
+    return np.asarray(np.isfinite(values) & (values >= low) & (values <= high))
 
 
 def _scale(span: float, unit: str, name: str) -> float:
