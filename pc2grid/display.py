@@ -56,10 +56,7 @@ def map_png(
 
     def pixels(points_m: F64) -> NDArray[np.int32]:
         columns, rows = ((points_m - origin_m) / resolution_m - (c0, r0)).T
-        nearest: NDArray[np.int32] = np.rint(np.column_stack((columns, height - rows)) * scale).astype(
-            np.int32
-        )
-        return nearest
+        return np.asarray(np.rint(np.column_stack((columns, height - rows)) * scale).astype(np.int32))
 
     if centers_m is not None:
         for x, y in pixels(centers_m):

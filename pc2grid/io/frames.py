@@ -64,7 +64,7 @@ class PoseTrack:
     """
 
     def __init__(self, *, lasting: bool = False) -> None:
-        self._lasting = lasting
+        self.lasting = lasting
         self._stamps: list[int] = []
         self._poses: list[Seven] = []
 
@@ -84,10 +84,6 @@ class PoseTrack:
             del self._stamps[oldest], self._poses[oldest]
         return True
 
-    def emptied(self) -> PoseTrack:
-        """Return a track of the same kind without samples."""
-        return PoseTrack(lasting=self._lasting)
-
     def __len__(self) -> int:
         return len(self._stamps)
 
@@ -106,7 +102,7 @@ class PoseTrack:
         if 0 < after < len(stamps) and stamps[after] - stamps[after - 1] <= PARAMETERS.max_gap_ns:
             fraction = (stamp_ns - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
             return interpolate_pose(self._pose(after - 1), self._pose(after), fraction)
-        if self._lasting and stamps and (after or len(stamps) == 1):
+        if self.lasting and stamps and (after or len(stamps) == 1):
             return self._pose(max(after - 1, 0))
         near = [i for i in (after - 1, after) if 0 <= i < len(stamps)]
         nearest = min(near, key=lambda i: abs(stamps[i] - stamp_ns), default=None)
@@ -148,7 +144,7 @@ class FrameTree:
     def forget_moving(self) -> None:
         """Forget the poses that depend on time: the clock was set. The tree stays."""
         for child, track in self._moving.items():
-            self._moving[child] = track.emptied()
+            self._moving[child] = PoseTrack(lasting=track.lasting)
 
     def add_all(
         self, edges: tuple[Transform, ...] | None, *, static: bool = False, log_time_ns: int = 0

@@ -7,9 +7,9 @@ import functools
 import hashlib
 import re
 from collections.abc import Collection, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 
 import numpy as np
 
@@ -64,7 +64,7 @@ def open_log(path: str | Path, config: ReadConfig | None = None, *, recover: boo
     return Log(source, config)
 
 
-class Log:
+class Log(AbstractContextManager["Log"]):
     """An open recording. Use as a context manager."""
 
     def __init__(self, source: MessageSource, config: ReadConfig) -> None:
@@ -94,12 +94,7 @@ class Log:
         title = f"{self.info.path.name}: {self.info.format}, {self.info.duration_s:.1f} s"
         return html_table(title, rows, ("topic", "type", "messages"))
 
-    def __enter__(self) -> Log:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self.close()
 
     def close(self) -> None:

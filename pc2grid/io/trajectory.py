@@ -74,7 +74,8 @@ def read_tum(path: str | Path) -> Trajectory:
         except (ValueError, ArithmeticError) as error:
             raise TrajectoryFileError(f"{path}, line {number}: {error}") from error
         stamps.append(stamp)
-    return _trajectory(stamps, poses)
+    matrices = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
+    return Trajectory(stamps_ns=np.array(stamps, dtype=np.int64), T_session_base=matrices)
 
 
 def write_tum(path: str | Path, trajectory: Trajectory) -> None:
@@ -131,8 +132,3 @@ def lines_of(path: str | Path) -> list[str]:
         raise TrajectoryFileError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise TrajectoryFileError(f"{path}: not a text file") from error
-
-
-def _trajectory(stamps: list[int], poses: list[F64]) -> Trajectory:
-    matrices = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
-    return Trajectory(stamps_ns=np.array(stamps, dtype=np.int64), T_session_base=matrices)

@@ -62,8 +62,7 @@ class Drive:
         low = np.minimum(position.astype(np.int64), max(len(self.poses) - 2, 0))
         high = np.minimum(low + 1, len(self.poses) - 1)
         part = (position - low)[..., None]
-        poses: F64 = (1 - part) * self.poses[low] + part * self.poses[high]
-        return poses
+        return np.asarray((1 - part) * self.poses[low] + part * self.poses[high])
 
     def pose(self, time_s: float) -> SE2:
         """Return T_map_base at a time."""

@@ -515,5 +515,4 @@ def _distance_m(free: BoolGrid, resolution_m: float) -> F32:
     """Return the distance to cells that are not free, without an assumption about cells outside of the
     grid."""
     cells = cv2.distanceTransform(free.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    distance: F32 = np.maximum(cells - np.float32(0.5), 0).astype(np.float32) * np.float32(resolution_m)
-    return distance
+    return np.asarray(np.maximum(cells - np.float32(0.5), 0).astype(np.float32) * np.float32(resolution_m))

@@ -139,8 +139,7 @@ class Scene:
 
         Returns (N,) multiples of the direction until the first hit, inf without one.
         """
-        hits: F32 = self._scene.cast_rays(self._tensor.from_numpy(rays))["t_hit"].numpy()
-        return hits
+        return np.asarray(self._scene.cast_rays(self._tensor.from_numpy(rays))["t_hit"].numpy())
 
 
 # --- buildings ----------------------------------------------------------------------------------------

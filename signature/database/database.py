@@ -30,13 +30,12 @@ from signature.paper import SignatureTable
 
 if TYPE_CHECKING:
     import networkx as nx
-    from typing_extensions import Self
 
     from signature.paper import Signature
     from signature.visible import SeenPlaces
 
 
-class SubmapDatabase:
+class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
     """Sessions and their submaps. Reading never changes it; `add` changes all or nothing.
 
     A handle shows the database as it was when it was opened; after `add` its own handle shows the new state.
@@ -52,9 +51,6 @@ class SubmapDatabase:
         self._labelled: dict[str, str] = {}
 
     # --- what is in it --------------------------------------------------------------------------------
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: Any) -> None:
         self.close()

@@ -343,8 +343,7 @@ def _heaviest(agree: NDArray[np.bool_], weights: NDArray[np.float64]) -> NDArray
     """Return the clues that agree with the one whose agreeing clues weigh most; of equals, the first."""
     if not len(weights):
         return np.zeros(0, bool)
-    best: NDArray[np.bool_] = agree[int(np.argmax(agree @ weights))]
-    return best
+    return np.asarray(agree[int(np.argmax(agree @ weights))])
 
 
 def _places(clues: Sequence[Clue]) -> int:

@@ -11,6 +11,7 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -88,7 +89,7 @@ STREAM = StreamParameters(wait_ns=200_000_000, eager=True)
 """Scans wait for odometry, but not for scans with earlier stamps; and less long than in a recording."""
 
 
-class LiveLog:
+class LiveLog(AbstractContextManager["LiveLog"]):
     """Scans from a feed. Use as a context manager.
 
     feed : source of the messages. name, counts, news : of the feed. realtime : True if scans are lost that
@@ -118,9 +119,6 @@ class LiveLog:
         self._newest = (0, clock())  # log time of the newest scan, and when it arrived
         self._pose: BelievedPose | None = None
         self._begun_s = self._heard_s = clock()
-
-    def __enter__(self) -> LiveLog:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.close()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -46,7 +47,7 @@ class Outlet(Protocol):
         ...
 
 
-class Nav2Publisher:
+class Nav2Publisher(AbstractContextManager["Nav2Publisher"]):
     """Publishes the place of the robot to nav2. Use as a context manager: leaving it ends the broadcast.
 
     outlet : target of the messages. map_frame : the frame of nav2's map.
@@ -59,9 +60,6 @@ class Nav2Publisher:
         self._advertised: set[str] = set()
         self._stop: threading.Event | None = None
         self._thread: threading.Thread | None = None
-
-    def __enter__(self) -> Nav2Publisher:
-        return self
 
     def __exit__(self, *error: object) -> None:
         self.stop_tf()

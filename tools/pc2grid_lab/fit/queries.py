@@ -226,7 +226,8 @@ def _asked(
     """Return the evidence of each place that is found, and how far it is from the truth."""
     *_, (found, _) = index.search(query)
     evidence = evidence_of([h.fit for h in found], query)
-    errors = [error_of(index, query, h, truth) for h in found]
+    bases = [h.fit.T_map_query @ query.T_odom_base for h in found]
+    errors = [_error(index, h.session_index, T, truth) for h, T in zip(found, bases, strict=True)]
     row = {"evidence": list(map(asdict, evidence)), "errors": errors}
     if in_space is None or not in_space.views or index.surface_of is None:
         return row
@@ -249,17 +250,11 @@ def _in_space(
     return {"terms": terms_in_space(fit), "error": _error(index, place.session_index, T_map_base, truth)}
 
 
-def error_of(
-    index: MapIndex, query: QueryMap, place: Hypothesis, truth: Mapping[str, SE2]
-) -> tuple[float, float]:
-    """Return metres and radians of a place from the truth, of which there is none in the sessions without a
-    pose."""
-    return _error(index, place.session_index, place.fit.T_map_query @ query.T_odom_base, truth)
-
-
 def _error(
     index: MapIndex, session_index: int, T_map_base: SE2, truth: Mapping[str, SE2]
 ) -> tuple[float, float]:
+    """Return metres and radians of a base from the truth, of which there is none in the sessions without a
+    pose."""
     expected = truth.get(index.sessions[session_index])
     return (math.inf, math.pi) if expected is None else apart(expected, T_map_base)
 

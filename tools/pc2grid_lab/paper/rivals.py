@@ -350,8 +350,8 @@ def sift(image: NDArray[np.uint8]) -> F32:
 
 
 def surf(image: NDArray[np.uint8]) -> F32:
-    """Return up to 300 SURF descriptors (K, 64), those of the strongest response."""
-    return surf_descriptors(image, MAX_FEATURES)
+    """Return up to 300 SURF descriptors (K, 64) of length 1, of the points with the strongest response."""
+    return describe_points(image, interest_points(image, MAX_FEATURES))
 
 
 @dataclass(slots=True)
@@ -440,12 +440,6 @@ def _unit(rows: F64) -> F64:
     0."""
     lengths = np.linalg.norm(rows, axis=-1, keepdims=True)
     return np.asarray(rows / np.where(lengths > 0, lengths, 1.0))
-
-
-def surf_descriptors(image: NDArray[np.uint8], max_points: int) -> F32:
-    """Return up to `max_points` SURF descriptors (K, 64) of length 1, of the points with the strongest
-    response."""
-    return describe_points(image, interest_points(image, max_points))
 
 
 def interest_points(image: NDArray[np.uint8], max_points: int) -> F64:

@@ -186,17 +186,6 @@ def _kidnap(name: str, file: str, *, quick: bool = False) -> Recording:
     return _laser(name, "kidnap", file=f"laser/kidnap/{file}", quick=quick)
 
 
-def _kitchen(name: str) -> Recording:
-    return Recording(
-        name=name,
-        file="depth/kitchen.mcap",
-        building="kitchen",
-        sensor="depth",
-        truth="depth/kitchen.tum",
-        poses="depth/kitchen.tum",
-    )
-
-
 def _corridor(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
     poses = "depth/corridor_phone/corridor.tum"
     return Recording(
@@ -273,7 +262,14 @@ RECORDINGS: tuple[Recording, ...] = (
     _phone("room_a", odometry=False),
     _phone("room_b", quick=True),
     _phone("room_b", odometry=False, quick=True),
-    _kitchen("kitchen"),
+    Recording(
+        name="kitchen",
+        file="depth/kitchen.mcap",
+        building="kitchen",
+        sensor="depth",
+        truth="depth/kitchen.tum",
+        poses="depth/kitchen.tum",
+    ),
     _corridor("corridor", quick=True),
     _corridor("corridor without odometry", odometry=False),
     _corrected("fr079", "fr079"),
