@@ -18,7 +18,7 @@ from signature.config import Config
 from signature.database import Label
 from signature.database.protocol import BuildingFrame
 from signature.localization.map_index import MapIndex
-from signature.paper import SignatureTable, describe
+from signature.paper import Signature, SignatureTable, describe
 
 RESOLUTION_M = 0.05
 
@@ -132,6 +132,20 @@ def look(grid: OccupancyGrid, truth: SE2, stamp_ns: int, field_rad: float, reach
     )
 
 
+_DESCRIBED: dict[tuple[object, ...], list[tuple[Signature, tuple[float, float], int]]] = {}
+
+
+def _described(grid: OccupancyGrid, config: Config) -> list[tuple[Signature, tuple[float, float], int]]:
+    """The signatures of a map with centre and number; most tests ask the same office."""
+    heights = None if grid.heights is None else grid.heights.tobytes()
+    about = grid.cells.tobytes(), heights, grid.cells.shape, grid.resolution_m, grid.origin_m
+    key = (*about, config.partition, config.signature)
+    if key not in _DESCRIBED:
+        submaps = partition(grid, config.partition)
+        _DESCRIBED[key] = [(describe(s, config.signature), s.center_m, s.submap_id) for s in submaps]
+    return _DESCRIBED[key]
+
+
 def building(
     grids: dict[str, OccupancyGrid],
     config: Config | None = None,
@@ -141,13 +155,10 @@ def building(
 ) -> MapIndex:
     """A database in memory. joined : where sessions lie in their building. drawn : see `MapIndex`."""
     config = config or Config()
-    signatures, centers, sessions, ids = [], [], [], []
-    for index, grid in enumerate(grids.values()):
-        for submap in partition(grid, config.partition):
-            signatures.append(describe(submap, config.signature))
-            centers.append(submap.center_m)
-            sessions.append(index)
-            ids.append(submap.submap_id)
+    rows = [(*row, index) for index, grid in enumerate(grids.values()) for row in _described(grid, config)]
+    signatures, centers, ids, sessions = (
+        (list(column) for column in zip(*rows, strict=True)) if rows else ([],) * 4
+    )
     table = SignatureTable.of(signatures, centers, submap_id=ids, session_index=sessions)
     exact = ((0.0, 0.0, 0.0),) * 3
     frames = {

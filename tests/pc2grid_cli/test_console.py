@@ -329,7 +329,7 @@ COMMANDS = (
     "info drive.mcap",
     "info office.yaml --json",
     "convert drive.mcap -o out.submaps",
-    "convert drive.mcap office.yaml -o out.submaps --jobs 2",
+    "convert office.yaml part.yaml -o out.submaps --jobs 2",
     "convert office.yaml part.yaml -o out.submaps --join --json",
     "relocalize drive.mcap -d b.submaps",
     "relocalize drive.mcap -d b.submaps --check 99 99 0 --json",

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pc2grid.geometry import F64
 from pc2grid_lab.fit.posterior import Compared, compared_of, fit_factor_in_space, left_out, main, shuffled
 from signature.localization.in_space import masses_in_space
 from signature.localization.posterior import Evidence
@@ -46,15 +48,20 @@ def test_the_fit_recovers_what_each_kind_of_ray_tells() -> None:
 
 def test_a_query_is_judged_without_its_building() -> None:
     """In building c the rays tell the opposite, which the others do not show."""
-    some = [replace(q, terms=-q.terms) if q.building == "c" else q for q in queries(120)]
-    of_others = fit_factor_in_space([q for q in some if q.building != "c"])
-    judged = [q.masses(x) for q, x in zip(some, left_out(some, fit_factor_in_space), strict=True)]
+    some = [replace(q, terms=-q.terms) if q.building == "c" else q for q in queries(30)]
+
+    def fitted(some: Sequence[Compared]) -> F64:
+        """Fit in no time; what is left out shows as well as with a minimizer."""
+        return np.asarray(np.concatenate([q.terms for q in some]).mean(axis=0))
+
+    of_others = fitted([q for q in some if q.building != "c"])
+    judged = [q.masses(x) for q, x in zip(some, left_out(some, fitted), strict=True)]
     assert all(
         masses == pytest.approx(q.masses(of_others))
         for q, masses in zip(some, judged, strict=True)
         if q.building == "c"
     )
-    assert np.abs(fit_factor_in_space(some) - of_others).max() > 1.0
+    assert np.abs(fitted(some) - of_others).max() > 0.1
 
 
 def test_shuffled_rays_do_not_tell_places_apart() -> None:

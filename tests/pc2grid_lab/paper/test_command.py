@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from functools import partialmethod
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,12 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("maps")
     save_map(grid_of(np.hstack([cross(6.0, 2.0), rectangle(8.0, 5.0), l_shape()])), folder / "intel")
     return folder
+
+
+@pytest.fixture(autouse=True)
+def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Intervals take most of the time of a small run; one test below looks at them."""
+    monkeypatch.setattr(BestMatches, "half_widths", partialmethod(BestMatches.half_widths, resamples=4))
 
 
 def test_published_tables_are_whole() -> None:
@@ -177,7 +184,7 @@ def test_intervals_shrink_with_more_queries() -> None:
     widths = []
     for count in (100, 1600):
         correct = rng.random(count) < 0.8
-        half = BestMatches(similarity=rng.normal(correct, 0.7), correct=correct).half_widths()
+        half = BestMatches(similarity=rng.normal(correct, 0.7), correct=correct).half_widths(resamples=300)
         assert 0.0 < half.auc < 0.1
         widths.append(half.r_at_1)
     # A share of n draws has the standard deviation sqrt(p (1 - p) / n): a quarter with 16 times as many.

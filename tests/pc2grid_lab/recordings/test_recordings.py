@@ -20,6 +20,7 @@ from pc2grid_cli.main import app
 from pc2grid_lab.recordings import catalogue, run
 from pc2grid_lab.recordings.catalogue import Pair, Recording, SimulatedDrive
 from pc2grid_lab.recordings.run import Followed
+from pc2grid_lab.runner import Finished
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.shared_folders import shared_folder
 from tests.helpers.simulated_drives import plan
@@ -93,6 +94,14 @@ def compare(data: Path, out: Path, *options: str) -> Any:
     return done
 
 
+def in_this_process(*arguments: str | Path) -> Finished:
+    """What `pc2grid_lab.runner.pc2grid` does, without a process for each command."""
+    done = CliRunner().invoke(app, [*map(str, arguments)])
+    said = json.loads(done.stdout) if done.stdout else None
+    code = done.exit_code if isinstance(done.exception, SystemExit | None) else 1
+    return Finished(code=code, cpu_s=1.0, document=said, error=str(done.exception or ""))
+
+
 @pytest.mark.nightly  # the tests below run parts of it
 @pytest.mark.usefixtures("small")
 def test_a_small_run(data: Path, tmp_path: Path) -> None:
@@ -150,14 +159,17 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("small")
-def test_ones_own_recordings_need_no_catalogue(data: Path, tmp_path: Path) -> None:
+def test_ones_own_recordings_need_no_catalogue(
+    data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Later parts of a drive are located in the map of its beginning, and judged by the poses beside it."""
+    monkeypatch.setattr(run, "pc2grid", in_this_process)  # the next test starts processes
     own = tmp_path / "own"
     own.mkdir()
     for suffix in (".mcap", ".tum"):
         shutil.copy(data / f"b{suffix}", own / f"mine{suffix}")
     (own / "torn.mcap").write_bytes(b"no recording")
-    compare(own, tmp_path / "out", "--of-base")
+    compare(own, tmp_path / "out", "--of-base", "--jobs", "1")
     document = json.loads((tmp_path / "out" / "real.json").read_text())
     mine, torn = document["maps"]
     assert (mine["name"], mine["building"], mine["truth"]) == ("mine.mcap", "own", "poses")
