@@ -154,6 +154,26 @@ def test_the_page_shows_each_row() -> None:
     assert widths == {18}
 
 
+def test_disturbed_recordings_are_compared_and_counted_once() -> None:
+    rows = (
+        map_row("room", error_m=0.02),
+        map_row("room, disturbed 1", error_m=0.05),
+        map_row("hall"),
+        pair_row("right", "refused", "right", map="room 0..10 s"),
+        pair_row("wrong", "right", "right", map="room, disturbed 1 0..10 s", kind="disturbed"),
+        pair_row("wrong", map="hall"),
+    )
+    text = markdown_page(table(*rows))
+    told = "0.020 to 0.050 m, 2.50 times; windows located rightly and wrongly in its maps: 1"
+    assert [line for line in text.splitlines() if "times;" in line] == [f"- room, disturbed: {told}"]
+    assert "| all queries | 1 | 4 | 4 | 2 of 4" in text
+    worse = table(*rows[:-2], pair_row(*["refused"] * 9, map="room, disturbed 1 0..10 s", kind="disturbed"))
+    better = replace(
+        worse, pairs=(*worse.pairs[:-1], replace(worse.pairs[-1], queries=pair_row(*["right"] * 9).queries))
+    )
+    assert not any(change.worse for change in changes(better, worse))
+
+
 def test_intervals_are_exact() -> None:
     low, high = clopper_pearson(5, 10)
     assert (low, high) == pytest.approx((0.187, 0.813), abs=1e-3)

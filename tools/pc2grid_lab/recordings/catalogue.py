@@ -30,10 +30,18 @@ from pc2grid.simulate import Building, SimulationConfig, load_building, simulate
 from pc2grid_lab.runner import digest_of_sources
 
 PairKind = Literal[
-    "later part", "fewer scans", "same recording", "other day", "other sensor", "published map", "elsewhere"
+    "later part",
+    "fewer scans",
+    "same recording",
+    "other day",
+    "other sensor",
+    "published map",
+    "disturbed",
+    "elsewhere",
 ]
 """How the query of a pair differs from what its map was made from. "same recording": all of it is the map,
-and the query may lack odometry. "elsewhere": it is of another building."""
+and the query may lack odometry. "disturbed": the map of another pair, of a `Recording.disturbed`.
+"elsewhere": it is of another building."""
 PAIR_KINDS: tuple[PairKind, ...] = get_args(PairKind)
 
 Source = Literal["lidar", "depth", "laser", "map", "unknown"]
@@ -56,7 +64,8 @@ class Recording:
     file : below the data folder. building : recordings of one building are one group of the statistics.
     drive : what is recorded in the 3D scan `file`; None: the file is the recording.
     options : of `convert` and of `relocalize`. every : only every nth of
-        its scans is used. mapped : whether all of it becomes a map, which is a row of the page.
+        its scans is used. disturbed : seed of the numbers by which it is moved, see `write_disturbed`; 0: as
+        it is. mapped : whether all of it becomes a map, which is a row of the page.
     truth : what its trajectory is compared with, relations or poses; None: there is none.
     same_place : numbers of scans between which the sensor came back to where it was.
     poses : true poses that place its windows, in one frame for all recordings that name the same `poses`.
@@ -74,6 +83,7 @@ class Recording:
     drive: SimulatedDrive | None = None
     options: tuple[str, ...] = ()
     every: int = 1
+    disturbed: int = 0
     mapped: bool = True
     truth: str | None = None
     same_place: tuple[int, ...] = ()
@@ -321,6 +331,15 @@ RECORDINGS: tuple[Recording, ...] = (
     _map("lgfloor.yaml", "laser/birmingham/lgfloor.yaml", "birmingham"),
 )
 """Everything that becomes a map or is asked in one, in the order of the page."""
+_DISTURBED = (1, 2)
+"""Seeds. All maps and answers of one take some five minutes of processor time."""
+_CARRIED = ("e1r_office_a", "room_a", "room_b", "kitchen", "corridor")
+RECORDINGS += tuple(
+    replace(recording, name=f"{recording.name}, disturbed {seed}", disturbed=seed, quick=False)
+    for recording in RECORDINGS
+    for seed in _DISTURBED
+    if recording.name in _CARRIED
+)
 
 
 def _later(name: str, until_s: float, window_s: float, windows: int, *, quick: bool = False) -> Pair:
@@ -437,6 +456,17 @@ PAIRS: tuple[Pair, ...] = (
     _under_nav("birmingham", 15.0),
 )
 """All pairs, in the order of the page."""
+PAIRS += tuple(
+    replace(
+        pair,
+        kind="disturbed",
+        map=f"{pair.map}, disturbed {seed}",
+        quick=pair.quick and seed == _DISTURBED[0],
+    )
+    for pair in PAIRS
+    for seed in _DISTURBED
+    if pair.map in _CARRIED and pair.query in _CARRIED and pair.kind != "elsewhere"
+)
 
 
 NOT_ALIKE = (("fr079", "wean.yaml"),)
@@ -536,8 +566,7 @@ class Catalogue:
         They begin at whole milliseconds, as commands are told: else the last scan might be another one.
         """
         first_s, last_s = pair.within_s or (0.0, length_s)
-        if pair.map == pair.query and pair.until_s is not None:
-            first_s = pair.until_s
+        first_s = first_s if pair.until_s is None else pair.until_s
         spans = evenly_spaced(first_s, last_s, pair.windows, pair.window_s)
         numbered = [(k, replace(span, start_s=round(span.start_s, 3))) for k, span in enumerate(spans)]
         return numbered[:: _QUICK_EVERY if self.quick else 1]

@@ -62,7 +62,7 @@ class Folder:
     work: Path
 
     def source(self, recording: Recording) -> Path:
-        """Return the file that the commands read; if it is thinned or driven, `_make` makes it.
+        """Return the file that the commands read; if it is thinned, disturbed or driven, `_make` makes it.
 
         Drives are kept beside the work of all versions: they are made again when they would differ.
         """
@@ -70,8 +70,8 @@ class Folder:
         if recording.drive is not None:
             made = f"{as_file_name(recording.name)}.{digest_of_drive(file, recording.drive)}.mcap"
             return self.work.parents[1] / "drives" / made
-        if recording.every > 1:
-            return self.work / "thinned" / f"{file.stem}_{recording.every}{file.suffix}"
+        if recording.every > 1 or recording.disturbed:
+            return self.work / "made" / f"{as_file_name(recording.name)}{file.suffix}"
         return file
 
     def true(self, recording: Recording, file: str | None) -> Path | None:
@@ -272,15 +272,17 @@ def _maps(
 
 
 def _make(folder: Folder, recording: Recording) -> None:
-    """Make a recording that is thinned or driven."""
+    """Make a recording that is thinned, disturbed or driven."""
     file, target = folder.data / recording.file, folder.source(recording)
+    target.parent.mkdir(parents=True, exist_ok=True)
     if recording.drive is not None:
         for old in target.parent.glob(f"{as_file_name(recording.name)}.*"):
             old.unlink()
         write_drive(file, target, recording.drive)
     elif recording.every > 1:
-        target.parent.mkdir(parents=True, exist_ok=True)
         write_thinned(file, target, recording.every)
+    elif recording.disturbed:
+        write_disturbed(file, target, recording.disturbed)
 
 
 def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[Task]:
@@ -409,6 +411,35 @@ def write_thinned(source: Path, target: Path, every: int) -> None:
             counts[topic] += 1
 
     write_messages(target, few())
+
+
+_DISTURBED = 1e-5
+"""Metres of a coordinate, and share of a focal length: far below what a sensor measures."""
+
+
+def write_disturbed(source: Path, target: Path, seed: int) -> None:
+    """Write the MCAP file `target`: `source` with points that are moved by at most `_DISTURBED`, those of a
+    depth image by its focal length.
+
+    What changes with that hangs on the last bit. Raises OSError, and the errors of the `mcap` library.
+    """
+    draw = np.random.default_rng(seed)
+
+    def moved(message: Stored) -> Stored:
+        """Return a message with other numbers, if it has such."""
+        if not message.schema.name.endswith(("/CameraInfo", "/PointCloud2")):
+            return message
+        content = _decoded(message)
+        if message.schema.name.endswith("/CameraInfo"):
+            focal = 1.0 + draw.uniform(-_DISTURBED, _DISTURBED)
+            content.k, content.p = (np.append(m[0] * focal, m[1:]) for m in (content.k, content.p))
+        else:
+            points = content.data.copy().view(np.float32).reshape(-1, content.point_step // 4)
+            points[:, :3] += draw.uniform(-_DISTURBED, _DISTURBED, (len(points), 3))
+            content.data = points.view(np.uint8).ravel()
+        return message._replace(data=bytes(_TYPES.serialize_cdr(content, message.schema.name)))
+
+    write_messages(target, map(moved, stored_messages(source)))
 
 
 _CARRIED_NS = 1_000_000_000

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from statistics import median
 from textwrap import wrap
 from typing import Any, Literal
@@ -288,6 +289,8 @@ class Table:
         return TypeAdapter(Table).validate_python(document)
 
 
+_DISTURBED = ", disturbed "
+"""In the name of a recording that is disturbed."""
 _MARKS = {"right": "", "false": " (false)", "unknown": " (?)"}
 _READING = ("no tf", "gaps", "empty scans")
 """Warnings about the file, that say nothing of the map."""
@@ -295,6 +298,7 @@ _READING = ("no tf", "gaps", "empty scans")
 
 def markdown_page(table: Table, changed: Sequence[RowChange] = ()) -> str:
     """Return the page in Markdown. changed : against the run before."""
+    as_recorded = replace(table, pairs=tuple(row for row in table.pairs if row.kind != "disturbed"))
     return "\n".join(
         [
             "# Real recordings",
@@ -307,6 +311,8 @@ def markdown_page(table: Table, changed: Sequence[RowChange] = ()) -> str:
             "",
             *_notes_on_maps(table),
             "",
+            *_disturbed(table),
+            "",
             "## Places",
             "",
             *_places(table),
@@ -315,15 +321,15 @@ def markdown_page(table: Table, changed: Sequence[RowChange] = ()) -> str:
             *_joined(table),
             "## By sensor",
             "",
-            *sensor_matrix(table),
+            *sensor_matrix(as_recorded),
             "",
             "## By building",
             "",
-            *_by_building(table),
+            *_by_building(as_recorded),
             "",
             "## By confidence",
             "",
-            *_by_confidence(table),
+            *_by_confidence(as_recorded),
             "",
             *_failures(table),
             *_changed(changed),
@@ -394,9 +400,28 @@ def _notes_on_maps(table: Table) -> list[str]:
         "of loops the mean distance between scans at one place, to which a hand came back to decimetres;",
         "a recording in parts by each part. bare KISS-ICP: with its own settings. over KISS-ICP: `convert`",
         "from start to end over `register_frame` alone at the same voxel. truth: the share of it that could",
-        "be compared, if not all. lost: scans that are in no map.",
+        "be compared, if not all. lost: scans that are in no map. disturbed: points moved by 1e-5 m.",
         f"Of {len(warnings)} warnings {verdicts.count('right')} are right, {verdicts.count('false')} false;",
         f"of {verdicts.count('unknown')} (?) that is not known.",
+    ]
+
+
+def _disturbed(table: Table) -> list[str]:
+    """Return how far maps and answers hang on the last bit: a line for each disturbed recording."""
+    errors: dict[str, list[float]] = {}
+    for row in table.maps:
+        errors.setdefault(row.name.partition(_DISTURBED)[0], []).append(row.error_m or math.nan)
+    verdicts: dict[tuple[str, str, int], set[bool | None]] = {}
+    for pair in table.pairs:
+        map_ = re.sub(rf"{_DISTURBED}\d+| 0\.\..*", "", pair.map)
+        for query in filter(lambda query: query.located, pair.queries):
+            verdicts.setdefault((map_, pair.query, query.window), set()).add(query.right)
+    return [
+        f"- {name}, disturbed: {min(found):.3f} to {max(found):.3f} m, {max(found) / min(found):.2f} times;"
+        f" windows located rightly and wrongly in its maps:"
+        f" {sum(at[0] == name and right >= {True, False} for at, right in verdicts.items())}"
+        for name, found in errors.items()
+        if len(found) > 1
     ]
 
 
@@ -786,7 +811,7 @@ def show(table: Table) -> None:
         for row in cells:
             lines.add_row(*(row[k].replace("*", "") for k in shown))
         tables += [lines] if cells else []
-    output.show(*tables, *_failures(table))
+    output.show(*tables, *_disturbed(table), *_failures(table))
 
 
 def _changed(changed: Sequence[RowChange]) -> list[str]:
@@ -833,7 +858,8 @@ def changes(before: Table, after: Table) -> list[RowChange]:
     """Return what changed in the rows that both runs have; times relative to the change that half of them
     exceed."""
     maps = [(old, new) for new in after.maps for old in before.maps if old.name == new.name]
-    pairs = [(old, new) for new in after.pairs for old in before.pairs if _key(old) == _key(new)]
+    recorded = filter(lambda row: row.kind != "disturbed", after.pairs)  # the others ask the same again
+    pairs = [(old, new) for new in recorded for old in before.pairs if _key(old) == _key(new)]
     pace = _pace(maps)
     same_form = before.quick == after.quick
     found = [change for old, new in maps for change in _map_changes(old, new, pace)]
