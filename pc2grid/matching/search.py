@@ -181,18 +181,43 @@ class Tiles:
         high = np.ceil((boxes[:, 1::-1] + half_t) / SQUARE).astype(np.int64)
         squares = low[:, None] + np.indices((high - low).max(axis=0)).reshape(2, -1).T
         box, step = np.nonzero((squares < high[:, None]).all(axis=2))
-        first = np.full((len(yaws), 2), np.iinfo(np.int64).max)
-        np.minimum.at(first, group, low)
-        squares, group = squares[box, step], group[box]
-        beyond = squares - first[group]
-        of = np.column_stack((group, beyond // TILE)).T
-        shape = tuple((of.max(axis=1) + 1).tolist())
-        keys, tile = np.unique(np.ravel_multi_index(tuple(of), shape), return_inverse=True)
-        group, down, across = np.unravel_index(keys, shape)
-        row, column = (beyond % TILE).T
-        inside = np.zeros((len(keys), *TILE), np.uint16)
-        inside[tile, row, column] = np.iinfo(np.uint16).max
-        return Tiles(first[group] + np.column_stack((down, across)) * TILE, yaws[group], inside)
+        found = np.column_stack((group[box], squares[box, step])).T
+        first = found.min(axis=1, keepdims=True)
+        shape = tuple((found - first).max(axis=1) + 1)
+        keys = np.unique(np.ravel_multi_index(tuple(found - first), shape))
+        covered = np.column_stack(np.unravel_index(keys, shape)) + first.T
+        number = _tile_numbers(covered)
+        corner = np.full((number.max() + 1, 2), np.iinfo(np.int64).max)
+        np.minimum.at(corner, number, covered[:, 1:])
+        row, column = (covered[:, 1:] - corner[number]).T
+        inside = np.zeros((len(corner), *TILE), np.uint16)
+        inside[number, row, column] = np.iinfo(np.uint16).max
+        yaw_rad = np.empty(len(corner))
+        yaw_rad[number] = yaws[covered[:, 0]]
+        return Tiles(corner, yaw_rad, inside)
+
+
+def _tile_numbers(squares: I64) -> I64:
+    """Return the number (N,) of the tile of each square, (N, 3) heading, row and column in this order.
+
+    A tile begins at the first square that is in none, by rows and then by columns, so that much of it is
+    covered.
+    """
+    number = np.empty(len(squares), np.int64)
+    count = 0
+    ends = np.flatnonzero(np.diff(squares[:, 0], append=-1)) + 1
+    for begin, end in pairwise([0, *ends.tolist()]):
+        while begin < end:
+            band_end = begin + int(np.searchsorted(squares[begin:end, 1], squares[begin, 1] + TILE[0]))
+            columns = squares[begin:band_end, 2]
+            order = np.argsort(columns, kind="stable")
+            at = 0
+            while at < len(order):
+                after = int(np.searchsorted(columns[order], columns[order[at]] + TILE[1]))
+                number[begin + order[at:after]] = count
+                at, count = after, count + 1
+            begin = band_end
+    return number
 
 
 def _best(
@@ -461,12 +486,14 @@ def _place(
 @compiled(nogil=True)
 def _sum_tile(flat: U8, at: I64, counted: I64, width: int, inside: U16, sums: U16) -> int:
     """Set `sums` (TILE) to the sums of a tile, 0 for squares that are not `inside`; returns the highest."""
-    top = 0
+    top, rows = 0, 0
     for r in range(_ROWS):
         for k in range(_COLUMNS):
             sums[r, k] = counted[1]
+            if inside[r, k]:
+                rows = r + 1  # a tile begins at its first square; those below the last one are not summed
     for p in range(counted[0]):
-        for r in range(_ROWS):
+        for r in range(rows):
             first = at[p] + r * width
             window, row = flat[first : first + _COLUMNS], sums[r]
             for k in range(_COLUMNS):
