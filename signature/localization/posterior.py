@@ -24,7 +24,8 @@
   tracking slips or the robot is carried away, the scans before fit and those after do not. s is the rate of
   slips, per scan, higher where its pose is not fine. As in a test by the least sum (Page 1954, "Continuous
   inspection schemes"), what has contradicted for long tells more; metres count, because neighbouring scans
-  see the same walls.
+  see the same walls. Where all scans contradict, as those of a camera in a laser's map, r_k is what these
+  contradict more: the score of the place has the rest.
 - A, what the scans since the likeliest slip can be: "nowhere" and each other place of the map, found for
   these scans alone. 1 as long as nothing contradicts the place. If that is likelier than not, what they say
   is the answer.
@@ -367,7 +368,7 @@ def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[flo
     """
     above = query.walls.facing(walls).only_explain
     likelihood = points = 0.0
-    told = []
+    levels, steps = [], []
     # Before the first scan there was nothing to slip from.
     for count, keyframe in enumerate(reversed(query.keyframes[1:]), start=1):
         hits_m = (fit.T_map_query @ keyframe.T_odom_base).apply(keyframe.planar_scan.hits_m)
@@ -375,9 +376,9 @@ def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[flo
         likelihood += float(values[known].sum())
         points += float(np.count_nonzero(known))
         mean = likelihood / points if points else 0.0
-        steps = (query.path_m - keyframe.path_m) / step_m
-        told.append(tempered(mean, points / count) * max(steps, 1.0))
-    tail = np.array(told)
+        levels.append(tempered(mean, points / count))
+        steps.append(max((query.path_m - keyframe.path_m) / step_m, 1.0))
+    tail = (np.array(levels) - min([*levels[-1:], 0.0])) * steps
     since = 1 + int(tail.argmin()) if tail.min(initial=0.0) < 0.0 else 0
     weak = [keyframe.weak for keyframe in reversed(query.keyframes[1:])]
     rates = np.where(weak, POSTERIOR.slip_weak, POSTERIOR.slip)

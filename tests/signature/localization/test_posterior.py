@@ -97,6 +97,31 @@ def test_scans_that_contradict_a_place_say_since_when_tracking_slipped(turned: i
     assert more == pytest.approx(odds * POSTERIOR.slip_weak / POSTERIOR.slip) and more > odds
 
 
+@pytest.mark.parametrize(("poor", "likely"), [(10, True), (1000, False)])
+def test_scans_that_all_fit_poorly_do_not_tell_of_a_slip(poor: int, likely: bool) -> None:
+    """So fit those of a camera in the map of a laser. If only the last ones do, that tells."""
+    index = building({"office": office()})
+    query = Query(index.made_with, index.config)
+    for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
+        query.add(registered, planar_scan)
+    seen = query.map()
+    fit = decide(index, seen)[0].hypotheses[0].fit
+    keyframes = [
+        k if n < len(seen.keyframes) - poor else replace(k, planar_scan=_blurred(k.planar_scan))
+        for n, k in enumerate(seen.keyframes)
+    ]
+    odds, _ = slip_of(
+        replace(seen, keyframes=tuple(keyframes)), fit, index.maps[0].walls, index.config.step_m
+    )
+    assert (odds > 0.1) is likely
+
+
+def _blurred(planar_scan: PlanarScan) -> PlanarScan:
+    """Return the scan with two of three hits beside the walls."""
+    beside_m = np.resize([0.0, 0.4, 0.4], len(planar_scan.hits_m))[:, None]
+    return replace(planar_scan, hits_m=(planar_scan.hits_m + beside_m).astype(np.float32))
+
+
 def test_what_neither_side_knows_says_nothing() -> None:
     assert tempered(0.9, 0.0) == 0.0
     assert mass(replace(USUAL, backward=1.0, looked_at=0.0)) == pytest.approx(
