@@ -66,6 +66,7 @@ def test_all_maps_of_one_building_are_compared_and_each_with_some_of_others() ->
     same = {pair for pair in joins if building[pair[0]] == building[pair[1]]}
     others = [name for pair in {*joins} - same for name in pair]
     assert len({frozenset(pair) for pair in joins}) == len(joins) and {*NOT_ALIKE} <= {*joins}
+    assert not any("disturbed" in name for name in names)
     assert len(same) == sum(building[a] == building[b] for a, b in combinations(names, 2))
     assert "wean.yaml" in names and not any("without" in name or "every" in name for name in names)
     assert min(others.count(name) for name in names) >= FOREIGN_MAPS

@@ -546,9 +546,9 @@ class Catalogue:
     def joins(self) -> tuple[tuple[str, str], ...]:
         """Return the maps that are compared to be joined, in pairs: all of one building, and some of others.
 
-        Maps of recordings as they are: not thinned, and with their odometry.
+        Maps of recordings as they are: not thinned nor disturbed, and with their odometry.
         """
-        maps = [r for r in self.mapped if r.every == 1 and "--odometry" not in r.options]
+        maps = [r for r in self.mapped if r.every == 1 and not r.disturbed and "--odometry" not in r.options]
         pairs: list[tuple[Recording, ...]] = []
         for k, one in enumerate(maps):
             after = [*maps[k + 1 :], *maps[:k]]

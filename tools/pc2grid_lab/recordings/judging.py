@@ -6,6 +6,7 @@ place after a kidnap is judged by what the robot said there when nobody had carr
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 import re
@@ -432,6 +433,7 @@ class Judge:
         self._windows: dict[Pair, list[LocatedWindow]] = {}
         self._followed: dict[tuple[str, str], Frame | None] = {}
         self._lie: dict[str, nx.Graph] = {}
+        self._by_clouds = functools.cache(self._registered)
 
     def row(self, pair: Pair) -> PairRow:
         """Return the row of a pair; what cannot be judged is a row that says why."""
@@ -601,7 +603,7 @@ class Judge:
         if building in self._lie:
             return self._lie[building]
         lie = self._lie[building] = nx.Graph()
-        known = [r for r in self._catalogue.mapped if r.building == building]
+        known = [r for r in self._catalogue.mapped if r.building == building and not r.disturbed]
         for query, map_ in itertools.permutations(known, 2):
             if lie.has_edge(query.name, map_.name) or query.sensor == "map":
                 continue
@@ -706,7 +708,7 @@ class Judge:
             turned = Clue(clue.T_map_base, clue.T_drive_base, clue.query, clue.weight)
             yield (parts.index(session), names[number]), turned
 
-    def _by_clouds(self, query: Recording, map_: Recording) -> Frame | None:
+    def _registered(self, query: Recording, map_: Recording) -> Frame | None:
         """Return the frame of a recording in the map of another one, by the clouds of both; None if they have
         none, or are not clear."""
         parts = [drive_of(one, self._folder).parts for one in (query, map_)]

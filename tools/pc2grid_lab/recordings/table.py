@@ -699,7 +699,7 @@ def _joined(table: Table) -> list[str]:
         f"{FOREIGN_MAPS} of other buildings. Of {len(same)} pairs of one building {count['right']} join "
         f"right, {count['wrong']} wrong; of {count['not judged']} that are joined nobody knows how they lie; "
         f"{count['not joined']} are not joined. Of {len(others)} pairs of two buildings {len(wrong)} are "
-        "joined, which is wrong. right: as answers are, in the middle of what agrees."
+        "joined; each would be wrong. right: as answers are, in the middle of what agrees."
     )
     return [
         "## Joined",
