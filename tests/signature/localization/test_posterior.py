@@ -75,15 +75,22 @@ def test_the_prior_decides_between_equal_places_and_not_what_is_certain() -> Non
     assert masses([USUAL], [0.5])[0] == pytest.approx(mass(USUAL) / (2.0 - mass(USUAL)))
 
 
-@pytest.mark.parametrize(("turned", "likely"), [(0, False), (1, False), (10, True)])
-def test_scans_that_contradict_a_place_say_since_when_tracking_slipped(turned: int, likely: bool) -> None:
-    """A single one that is seen from the same place may be a person who stands in the way."""
+@functools.cache
+def driven_through_the_office() -> tuple[MapIndex, QueryMap, Fit]:
+    """Return the index of the office, what a drive has seen there, and how it fits best."""
     index = building({"office": office()})
     query = Query(index.made_with, index.config)
     for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
         query.add(registered, planar_scan)
     seen = query.map()
     fit = decide(index, seen)[0].hypotheses[0].fit
+    return index, seen, fit
+
+
+@pytest.mark.parametrize(("turned", "likely"), [(0, False), (1, False), (10, True)])
+def test_scans_that_contradict_a_place_say_since_when_tracking_slipped(turned: int, likely: bool) -> None:
+    """A single one that is seen from the same place may be a person who stands in the way."""
+    index, seen, fit = driven_through_the_office()
     last = len(seen.keyframes) - turned
     keyframes = tuple(
         k if n < last else replace(k, T_odom_base=k.T_odom_base @ SE2(0.0, 0.0, 0.7))
@@ -100,12 +107,7 @@ def test_scans_that_contradict_a_place_say_since_when_tracking_slipped(turned: i
 @pytest.mark.parametrize(("poor", "likely"), [(10, True), (1000, False)])
 def test_scans_that_all_fit_poorly_do_not_tell_of_a_slip(poor: int, likely: bool) -> None:
     """So fit those of a camera in the map of a laser. If only the last ones do, that tells."""
-    index = building({"office": office()})
-    query = Query(index.made_with, index.config)
-    for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
-        query.add(registered, planar_scan)
-    seen = query.map()
-    fit = decide(index, seen)[0].hypotheses[0].fit
+    index, seen, fit = driven_through_the_office()
     keyframes = [
         k if n < len(seen.keyframes) - poor else replace(k, planar_scan=_blurred(k.planar_scan))
         for n, k in enumerate(seen.keyframes)
