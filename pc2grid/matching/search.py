@@ -181,11 +181,12 @@ class Tiles:
         high = np.ceil((boxes[:, 1::-1] + half_t) / SQUARE).astype(np.int64)
         squares = low[:, None] + np.indices((high - low).max(axis=0)).reshape(2, -1).T
         box, step = np.nonzero((squares < high[:, None]).all(axis=2))
-        found = np.column_stack((group[box], squares[box, step])).T
-        first = found.min(axis=1, keepdims=True)
-        shape = tuple((found - first).max(axis=1) + 1)
-        keys = np.unique(np.ravel_multi_index(tuple(found - first), shape))
-        covered = np.column_stack(np.unravel_index(keys, shape)) + first.T
+        touched = np.column_stack((group[box], squares[box, step]))
+        first = touched.min(axis=0)
+        beyond = tuple((touched - first).T)
+        shape = tuple(int(most.max()) + 1 for most in beyond)
+        keys = np.unique(np.ravel_multi_index(beyond, shape))  # each square once
+        covered = np.column_stack(np.unravel_index(keys, shape)) + first
         number = _tile_numbers(covered)
         corner = np.full((number.max() + 1, 2), np.iinfo(np.int64).max)
         np.minimum.at(corner, number, covered[:, 1:])
