@@ -15,7 +15,7 @@ from pc2grid.estimation.tracker import Tracker
 from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread, one_blas_thread_each
 from pc2grid.mapping.keyframes import Keyframe, KeyframePoints, Keyframes, Track, TrackRecord
-from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, HAND_LOCAL_MAPS, LOCAL_MAPS
+from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
 from pc2grid.mapping.loops import EXACT_TRACKING, LOOPS, LoopCloser
 from pc2grid.mapping.part_maps import (
     check_followed,
@@ -229,8 +229,6 @@ def _map(
     first = beginning.scans[:1]  # a recording has one kind of sensor
     narrow = any(SENSOR_MODELS[scan.sensor].narrow for scan in first)
     planar = any(SENSOR_MODELS[scan.sensor].planar for scan in first)
-    maps = HAND_LOCAL_MAPS if beginning.in_hand else LOCAL_MAPS
-    maps = CAMERA_LOCAL_MAPS if narrow else maps
     with ExitStack() as stack:
         keyframes = stack.enter_context(closing(Keyframes()))
         points = None
@@ -242,7 +240,7 @@ def _map(
             recognizer=recognizer,
             projection=projection,
             parameters=EXACT_TRACKING if narrow or beginning.in_hand else LOOPS,
-            local_map_parameters=maps,
+            local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
         tracker = Tracker(config.registration, config.projection, in_hand=beginning.in_hand)
         record = _track(chain(beginning.scans, rest), tracker, closer, points, observer)

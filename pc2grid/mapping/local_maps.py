@@ -14,7 +14,10 @@ from numpy.typing import NDArray
 from pc2grid.estimation.line_map import LineMatch, PointGrid, best_placements, evenly
 from pc2grid.geometry import F64, I64, SE2, SUBPIXEL_BITS, polygon_corners
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
-from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField
+from pc2grid.matching.evidence import LEFT, evidence_of, masses
+from pc2grid.matching.score import score_fit
+from pc2grid.matching.walls import Walls
+from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,50 +27,25 @@ class LocalMapParameters:
     range_m : hits farther from the sensor are left out: they are too sparse to match.
     cell_m : edge of a cell.
     margin_m : free border around the points, at least the widest neighbourhood of `radii_cells`.
-    wall_m : largest distance of a point that meets an obstacle.
     radii_cells : neighbourhoods of the refinement, see `PointGrid.match`.
     every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them add no new walls.
     cached : local maps that stay in memory.
-
-    Of two local maps that are compared with each other:
-
-    search_points : points of each that are compared.
-    min_observed : at least this share of the points of one of the two must lie in cells that the other one
-        observed.
-    min_agreement : share of those that must meet an obstacle instead of free space, in both directions.
-    edge : the weight of an overlap rises from 0 to 1 between so much below both limits and so much above.
-        With a step, the last bit of a number decides on a loop: most of those of a phone in a corridor
-        (depth/corridor_phone) are observed to 0.29 to 0.43.
+    search_points : points of a local map that are compared with another one.
     """
 
     range_m: float = 12.0
     cell_m: float = 0.1
     margin_m: float = 0.6
-    wall_m: float = 0.25
     radii_cells: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1)
     every_keyframe: int = 2
     cached: int = 24
     search_points: int = 400
-    min_observed: float = 0.35
-    min_agreement: float = 0.8
-    edge: float = 0.0
-
-    def counts(self, observed: float, agreement: float) -> float:
-        """Return the weight of an overlap, 0..1."""
-        if not self.edge:
-            return float(observed > self.min_observed and agreement >= self.min_agreement)
-        above = np.array((observed - self.min_observed, agreement - self.min_agreement))
-        return float(np.clip(0.5 + 0.5 * above / self.edge, 0.0, 1.0).prod())
 
 
 LOCAL_MAPS = LocalMapParameters()
-HAND_LOCAL_MAPS = LocalMapParameters(edge=0.1)
-"""For a lidar in the hand."""
-CAMERA_LOCAL_MAPS = LocalMapParameters(cell_m=0.05, radii_cells=(6, 4, 4, 2, 2, 2, 2, 2), edge=0.1)
+CAMERA_LOCAL_MAPS = LocalMapParameters(cell_m=0.05, radii_cells=(6, 4, 4, 2, 2, 2, 2, 2))
 """For a depth camera: cells as in `CAMERA_MATCHING`, for the same reason, neighbourhoods as wide in metres.
 Chosen on simulated drives (`docs/method.md`)."""
-
-_FREE, _HIT = 1, 2  # what a local map observed in a cell; 0: nothing
 
 
 def pose_at(poses: F64, index: int) -> SE2:
@@ -90,8 +68,8 @@ class Overlap(NamedTuple):
 class LocalMap:
     """The local map of a run of keyframes, in the frame of its anchor, the keyframe in the middle.
 
-    points_m : (N, 2) obstacle points, thinned to one a cell. normal_rad : (N,) direction of the surface
-        normal at each.
+    walls : as it is compared with another one. points_m : (N, 2) obstacle points, thinned to one a cell.
+    normal_rad : (N,) direction of the surface normal at each.
     """
 
     def __init__(
@@ -114,34 +92,23 @@ class LocalMap:
         self._low_m = everything.min(axis=0) - parameters.margin_m
         self._grid = PointGrid(self._low_m, everything.max(axis=0) + parameters.margin_m, parameters.cell_m)
         self._grid.add(points, normal_rad)
-        cells = self._cells(points)
-        field = self._likelihood(cells)
-        self._field = field.values.astype(np.float32) * np.float32(1.0 / 255.0)
-        near_wall = np.exp(-0.5 * (parameters.wall_m / LIKELIHOOD.sigma_m) ** 2)
-        self._observed = np.where(self._field > near_wall, _HIT, self._free(outlines))
+        cells: I64 = np.floor((points - self._low_m) / parameters.cell_m).astype(np.int64)[:, ::-1]
+        self.walls = Walls.of(self._drawn(cells, outlines))
+        self._field = self.walls.field.values.astype(np.float32) * np.float32(1.0 / 255.0)
         _, first = np.unique(cells @ (self._grid.shape[1], 1), return_index=True)
         self.points_m: F64 = points[first]
         self.normal_rad: F64 = normal_rad[first]
 
-    def _likelihood(self, cells: I64) -> LikelihoodField:
-        """Return the likelihood field of obstacles in cells (N, 2)."""
-        occupied = np.zeros(self._grid.shape, np.bool_)
-        occupied[cells[:, 0], cells[:, 1]] = True
+    def _drawn(self, cells: I64, outlines: Sequence[F64]) -> OccupancyGrid:
+        """Return the grid with obstacles in cells (N, 2), row and column, and free ground inside the outlines
+        (B, 2)."""
         low_x, low_y = self._low_m.tolist()
-        return LikelihoodField.around(
-            occupied,
-            np.ones_like(occupied),
-            self._parameters.cell_m,
-            (low_x, low_y),
-        )
-
-    def _free(self, outlines: Sequence[F64]) -> NDArray[np.uint8]:
-        """Return the cells (H, W) inside one of the outlines (B, 2) of free space."""
-        free = np.zeros(self._grid.shape, dtype=np.uint8)
+        drawn = np.full(self._grid.shape, UNKNOWN, np.int8)
         for outline in outlines:
             corners = polygon_corners((outline - self._low_m) / self._parameters.cell_m)
-            cv2.fillPoly(free, [corners], _FREE, shift=SUBPIXEL_BITS)
-        return free
+            cv2.fillPoly(drawn, [corners], FREE, shift=SUBPIXEL_BITS)
+        drawn[cells[:, 0], cells[:, 1]] = OCCUPIED
+        return OccupancyGrid(cells=drawn, resolution_m=self._parameters.cell_m, origin_m=(low_x, low_y))
 
     def match(self, points_m: F64, normal_rad: NDArray[np.floating], guess: SE2) -> LineMatch:
         """Refine the pose of points (N, 2) with normals (N,) in this local map, from the points alone."""
@@ -149,23 +116,6 @@ class LocalMap:
         return self._grid.match(
             points_m, normal_rad, guess, guess, no_prior, radii=self._parameters.radii_cells
         )
-
-    def agreement(self, points_m: F64, pose: SE2) -> tuple[float, float]:
-        """Return how well points (N, 2) at `pose` agree with the observations of this local map.
-
-        The first value is the share of the points in observed cells; the second, among those, the share in
-        cells at an obstacle (the others lie in free space).
-        """
-        cells = self._cells(pose.apply(points_m))
-        inside = ((cells >= 0) & (cells < self._observed.shape)).all(axis=1)
-        seen = self._observed[cells[inside, 0], cells[inside, 1]]
-        observed = int((seen > 0).sum())
-        return observed / max(len(points_m), 1), float((seen == _HIT).sum()) / max(observed, 1)
-
-    def _cells(self, points: F64) -> I64:
-        """Return points (N, 2) as cells (N, 2), row and column; they may lie outside."""
-        cells: I64 = np.floor((points - self._low_m) / self._parameters.cell_m)[:, ::-1].astype(np.int64)
-        return cells
 
     def sample(self) -> tuple[F64, F64]:
         """Return the points (S, 2) that are compared with another local map, and their normals (S,)."""
@@ -178,25 +128,22 @@ class LocalMap:
         return self.match(*newer.sample(), T_self_newer).information
 
     def overlap(self, newer: LocalMap, guess: SE2, window_m: float, window_rad: float) -> Overlap | None:
-        """Match a newer local map with this one near a guess; None if they do not overlap or agree.
+        """Match a newer local map with this one near a guess; None if they hardly show one place.
 
-        Correlative scan matching over the window proposes poses. A pose counts if enough of each local map
-        lies on ground that the other one observed; of those, the one with the best agreement is returned: a
-        wrong one contradicts the other loops in the pose graph.
+        Correlative scan matching over the window proposes poses. Of these the likeliest, by the evidence of
+        the walls of both, counts as much as it is likely (`pc2grid.matching.evidence`).
         """
-        p, fits = self._parameters, []
-        (points, normals), (points_back, _) = newer.sample(), self.sample()
-        for _, start in best_placements(
-            self._field, self._low_m, p.cell_m, points, guess, window_m, window_rad
-        ):
-            match = self.match(points, normals, start)
-            observed, agreement = self.agreement(points, match.pose)
-            observed_back, agreement_back = newer.agreement(points_back, match.pose.inverse())
-            agreement = min(agreement, agreement_back)
-            counts = p.counts(max(observed, observed_back), agreement)
-            fits.append((counts * agreement, Overlap(match.pose, counts * match.information, counts)))
-        quality, best = max(fits, key=lambda fit: fit[0], default=(0.0, None))
-        return best if quality > 0.0 else None
+        points, normals = newer.sample()
+        starts = best_placements(
+            self._field, self._low_m, self._parameters.cell_m, points, guess, window_m, window_rad
+        )
+        matches = [self.match(points, normals, start) for _, start in starts]
+        evidence = evidence_of([score_fit(self.walls, newer.walls, match.pose) for match in matches])
+        counts = [float(masses([one])[0]) for one in evidence]
+        if max(counts, default=0.0) < LEFT:
+            return None
+        best = int(np.argmax(counts))
+        return Overlap(matches[best].pose, counts[best] * matches[best].information, counts[best])
 
 
 class LocalMaps:

@@ -1,11 +1,11 @@
 """Loop closure: overlaps with places of earlier visits correct the drift of tracking.
 
 A session is cut into local maps of a few metres of travel. Each new local map is compared with older ones
-that it may overlap: correlative scan matching over the uncertainty of tracking proposes poses, and a pose is
-accepted if the free space and the obstacles of both local maps agree. A robust pose graph over the local maps
-gives the corrected poses (the scan-to-submap constraints of Hess et al., "Real-time loop closure in 2D lidar
-SLAM", 2016, between two submaps). Between the anchors of local maps the correction is interpolated, because
-the error of tracking grows gradually.
+that it may overlap: correlative scan matching over the uncertainty of tracking proposes poses, and a pose
+counts as much as it is likely by the walls and the free space of both (`pc2grid.matching.evidence`). A robust
+pose graph over the local maps gives the corrected poses (the scan-to-submap constraints of Hess et al.,
+"Real-time loop closure in 2D lidar SLAM", 2016, between two submaps). Between the anchors of local maps the
+correction is interpolated, because the error of tracking grows gradually.
 
 After a long way a loop may be farther off than this search reaches. For these a `PlaceRecognizer`, which a
 package above this one implements, compares the map of the last few local maps (`PlaceMap`) with those of all

@@ -84,8 +84,11 @@ class Fit:
         return min(self.known_agreement, self.backward)
 
 
-def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64) -> Fit:
-    """Score the query at a pose on the map `target`."""
+_EXACT = np.zeros((3, 3))
+
+
+def score_fit(target: Walls, query: Walls, T_map_query: SE2, covariance: F64 = _EXACT) -> Fit:
+    """Score the query at a pose on the map `target`. covariance : (3, 3) of the pose."""
     mine, theirs, T_query_map = query.facing(target), target.facing(query), T_map_query.inverse()
     seen, likelihood, behind = _sums(mine, target.field, T_map_query).tolist()
     looked_at, returned, _ = _sums(theirs, query.field, T_query_map).tolist()

@@ -22,10 +22,11 @@ from pydantic import Field
 
 from pc2grid.display import html_picture, html_table, map_png, plain, probability, short
 from pc2grid.geometry import F64, I64, SE2, frozen_arrays, wrap_angle
+from pc2grid.matching.evidence import Evidence
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
-from signature.localization.posterior import POSTERIOR, PRIOR, Evidence
+from signature.localization.posterior import POSTERIOR, PRIOR
 
 Status = Literal["located", "ambiguous", "not_found"]
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]

@@ -12,20 +12,14 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
+from pc2grid.matching.evidence import LEFT, NO_EVIDENCE, evidence_of, masses
 from pc2grid.matching.score import Fit
 from signature.localization.answer import Answer, OffMap, Status
 from signature.localization.hypotheses import Hypothesis, agree, more_exact, same_pose
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import (
-    NO_EVIDENCE,
-    evidence_of,
-    masses,
-)
 from signature.localization.query import QueryMap
 
 Place = tuple[Hypothesis, ...]
-LEFT = 0.05
-"""A search ends when what was not searched has less than this share of the mass."""
 PriorOf = Callable[[Place], float]
 """Prior of a place, relative to that of "not in this map"."""
 
@@ -62,7 +56,7 @@ def judge(
     certain.
     """
     places, rivals = _allowed(index, query, places_of(index, query, hypotheses))
-    evidence_for = evidence_of([place[0].fit for place in places], query, rivals)
+    evidence_for = evidence_of([place[0].fit for place in places], query.likeness, rivals)
     known = list(zip(places, map(prior_of, places), evidence_for, strict=True))
     known.sort(key=lambda each: -math.log(each[1]) - each[2].log_odds())
     mass = masses([each[2] for each in known], [each[1] for each in known]).tolist()

@@ -15,6 +15,7 @@ import numpy as np
 from pc2grid.errors import DatabaseCorrupt
 from pc2grid.geometry import I64
 from pc2grid.libraries import one_blas_thread
+from pc2grid.matching.evidence import EVIDENCE
 from pc2grid.matching.icp_in_space import MapSurface
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
@@ -23,7 +24,7 @@ from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import Hypothesis, align, best_around, distinct, fitted
 from signature.localization.in_space import SurfaceOf, surface_reader
-from signature.localization.posterior import POSTERIOR, Prior, Region
+from signature.localization.posterior import Prior, Region
 from signature.localization.query import QueryMap
 from signature.paper import SignatureTable
 from signature.retrieval.places import (
@@ -268,7 +269,7 @@ class MapIndex:
         """Return the new and the earlier hypotheses that score enough beside the best one to be reported
         (`PosteriorParameters.longest_lead`), best first, each the best around itself; those that a prior
         excludes are kept beside them."""
-        maps, share = self.maps_for(query), 1.0 - POSTERIOR.longest_lead
+        maps, share = self.maps_for(query), 1.0 - EVIDENCE.longest_lead
         worth: list[Hypothesis] = []
         for inside in (True, False):
             found = [h for h in kept if self.allows(query, h) is inside]

@@ -20,12 +20,11 @@ from functools import lru_cache
 import numpy as np
 
 from pc2grid.mapping.loops import PlaceMap, Recognition
+from pc2grid.matching.evidence import LEFT, evidence_of
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
-from signature.localization.decision import LEFT
 from signature.localization.hypotheses import align, best_around, distinct
-from signature.localization.posterior import evidence_of
 from signature.localization.query import QueryMap, query_of
 from signature.paper import SignatureTable
 from signature.retrieval.places import LazySequence, Places
@@ -83,7 +82,7 @@ class SessionRecognizer:
         rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
         maps = LazySequence(self._map, len(self._stored), most=0)
         found = distinct(query, next(align(query, [places.areas(rows)], places, maps, self._config)))
-        odds = [evidence.log_odds() for evidence in evidence_of([h.fit for h in found], query)]
+        odds = [evidence.log_odds() for evidence in evidence_of([h.fit for h in found], query.likeness)]
         return [
             Recognition(
                 older=h.session_index,

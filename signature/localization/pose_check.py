@@ -28,6 +28,7 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.map_pose import MapPose
 from pc2grid.libraries import one_blas_thread
+from pc2grid.matching.evidence import log_likelihood
 from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
@@ -35,7 +36,7 @@ from signature.localization.belief import kept
 from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import Prior, log_likelihood
+from signature.localization.posterior import Prior
 
 CheckStatus = Literal["fine", "lost", "unsure"]
 

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
+from pc2grid.matching.evidence import NO_EVIDENCE
 from pc2grid.matching.score import Fit
 from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
 from signature.database.maintenance import store
 from signature.localization.answer import Answer
 from signature.localization.hypotheses import Hypothesis
-from signature.localization.posterior import NO_EVIDENCE
 from tests.helpers.databases import make_entry
 
 LONGEST_LINE = 200

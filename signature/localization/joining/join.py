@@ -26,6 +26,7 @@ import cv2
 import numpy as np
 
 from pc2grid.geometry import F32, F64, SE2, frozen_arrays, wrap_angle
+from pc2grid.matching.evidence import EVIDENCE, NO_EVIDENCE, Evidence, evidence_of, masses
 from pc2grid.matching.score import Fit, refine, score_fit, self_similarity
 from pc2grid.matching.search import SearchMap
 from pc2grid.matching.walls import LIKELIHOOD, Walls
@@ -34,7 +35,6 @@ from pc2grid.observer import Observer
 from signature.database.protocol import SessionInfo
 from signature.localization.hypotheses import HYPOTHESES, moved_to_origin, same_pose
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import NO_EVIDENCE, POSTERIOR, Evidence, evidence_of, masses
 from signature.localization.query import QueryMap, map_as_query
 
 if TYPE_CHECKING:
@@ -307,7 +307,7 @@ def _evidence(source: JoinableMap, candidate: _ExactTransform, number: int, fits
         )
         for score in scores.tolist()
     ]
-    return evidence_of(whole, source.query)[number]
+    return evidence_of(whole, source.query.likeness)[number]
 
 
 def _bound(evidence: Evidence, prior: float) -> float:
@@ -342,7 +342,7 @@ def _judged(
     share = min(common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9), 1.0)
     odds = prior * max(share, 1e-9)
     # Transforms that fit equally well share the mass.
-    equal = int(np.count_nonzero(np.abs(scores - scores[number]) <= POSTERIOR.alike))
+    equal = int(np.count_nonzero(np.abs(scores - scores[number]) <= EVIDENCE.alike))
     probability = float(masses([evidence] * equal, odds)[0])
     # Of thousands of wall points a small lead is much, even where walls fit as wrong places do.
     enough = common_m2 >= parameters.least_m2 and min(forward, backward) >= JOIN.follows
@@ -408,7 +408,7 @@ def _places_of(target: MapIndex, piece: Piece) -> list[Proposal]:
     fits = [hypothesis.fit for hypothesis in found]
     return [
         Proposal(T_target_source=fit.T_map_query, at_m=piece.center_m, log_odds=evidence.log_odds())
-        for fit, evidence in zip(fits, evidence_of(fits, piece.query), strict=True)
+        for fit, evidence in zip(fits, evidence_of(fits, piece.query.likeness), strict=True)
     ]
 
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import F64
+from pc2grid.matching.evidence import Evidence
 from pc2grid_lab.fit.posterior import Compared, compared_of, fit_factor_in_space, left_out, main, shuffled
 from signature.localization.in_space import masses_in_space
-from signature.localization.posterior import Evidence
 
 TRUTH = np.array([6.0, -15.0, -60.0, -2.0])
 FITS = Evidence(forward=0.9, walls=80.0, backward=0.8, looked_at=80.0, lead=0.1, likeness=0.3)

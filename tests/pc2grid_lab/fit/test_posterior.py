@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from pc2grid.matching.evidence import EVIDENCE, Evidence, masses
 from pc2grid_lab.fit import posterior
 from pc2grid_lab.fit.posterior import Known, fit, known_of, left_out, log_loss
-from signature.localization.posterior import POSTERIOR, Evidence, masses
 
-TRUTH = replace(POSTERIOR, bias=-4.0, fit=2.0, lead=4.0)
+TRUTH = replace(EVIDENCE, bias=-4.0, fit=2.0, lead=4.0)
 
 
 def place(rng: np.random.Generator, lead: float) -> Evidence:
@@ -107,4 +107,4 @@ def test_one_command_fits_and_judges(tmp_path: Path, capsys: pytest.CaptureFixtu
         run(rows)
     said = run([*rows, row("b", good, [0.1, 0.01]), row("b", poor, [7.0, 0.0])])
     assert "in use, in its own building: of 6 located 3 of 3 right ones, 0 wrong ones" in said
-    assert "fitted without the building: log loss" in said and "PosteriorParameters(bias=" in said
+    assert "fitted without the building: log loss" in said and "EvidenceParameters(bias=" in said

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, invert_pose
+from pc2grid.matching.evidence import NO_EVIDENCE
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_space
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, PointMap
@@ -20,7 +21,6 @@ from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.in_space import SPACE, log_odds_in_space, masses_of, settle_in_space
 from signature.localization.localizer import Estimate, Follower, Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import NO_EVIDENCE
 from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
 from tests.helpers.simulated_drives import building, office

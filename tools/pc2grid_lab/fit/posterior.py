@@ -30,10 +30,10 @@ from scipy.optimize import minimize
 from sklearn.metrics import roc_auc_score
 
 from pc2grid.geometry import F64
+from pc2grid.matching.evidence import EVIDENCE, Evidence, EvidenceParameters, masses
 from pc2grid_lab.pages import clopper_pearson
 from signature.config import Config
 from signature.localization.in_space import SPACE, masses_in_space
-from signature.localization.posterior import POSTERIOR, Evidence, PosteriorParameters, masses
 
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
 """Errors of answers to real logs at the right place. How precise they are is not the question here; the poses
@@ -74,7 +74,7 @@ class Known:
         """Return whether the best place is where the query truly was."""
         return self.first == 0
 
-    def probability(self, p: PosteriorParameters) -> float:
+    def probability(self, p: EvidenceParameters) -> float:
         """Return the mass of the best place."""
         return float(masses(self.places, p=p)[0]) if self.places else 0.0
 
@@ -104,7 +104,7 @@ def is_near(error: Sequence[float]) -> bool:
     return error[0] <= RIGHT_M and error[1] <= RIGHT_RAD
 
 
-def fit(answers: Sequence[Known]) -> PosteriorParameters:
+def fit(answers: Sequence[Known]) -> EvidenceParameters:
     """Fit the parameters bias, fit and lead under which the truth is likeliest; only the bias may be
     negative.
 
@@ -120,10 +120,10 @@ def fit(answers: Sequence[Known]) -> PosteriorParameters:
         p = (1.0 - LAPSE) * likelihood.of_truth(x) + LAPSE
         return float(-weights @ np.log(p) + 0.5 * PENALTY * x @ x)
 
-    start = np.array([POSTERIOR.bias, POSTERIOR.fit, POSTERIOR.lead])
+    start = np.array([EVIDENCE.bias, EVIDENCE.fit, EVIDENCE.lead])
     bounds = [(None, None), (0.0, None), (0.0, None)]
     bias, fit_, lead = minimize(loss, start, bounds=bounds, method="L-BFGS-B").x.tolist()
-    return replace(POSTERIOR, bias=bias, fit=fit_, lead=lead)
+    return replace(EVIDENCE, bias=bias, fit=fit_, lead=lead)
 
 
 @dataclass(frozen=True, slots=True)
@@ -288,7 +288,7 @@ def print_plane(rows: Sequence[dict[str, Any]]) -> None:
                 "the fit is judged by leaving buildings out, and without"
                 f" {' and '.join(sorted(buildings))} not both kinds of queries are left: found and not"
             )
-    in_use = np.array([k.probability(POSTERIOR) for k in known])
+    in_use = np.array([k.probability(EVIDENCE) for k in known])
     judged_by = [k.probability(p) for k, p in zip(known, left_out(known, fit), strict=True)]
     for name, probabilities in (("in use", in_use), ("fitted without the building", np.array(judged_by))):
         print_judged(known, name, probabilities)

@@ -37,6 +37,7 @@ from pc2grid.errors import Pc2GridError
 from pc2grid.geometry import F32, F64, SE2
 from pc2grid.io.maps import load_map
 from pc2grid.io.recording import open_log
+from pc2grid.matching.evidence import evidence_of
 from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.observer import TimeSpan
 from pc2grid.pipeline import follow
@@ -55,7 +56,6 @@ from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import SPACE, fit_in_space, terms_in_space
 from signature.localization.joining.join import JOIN
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import evidence_of
 from signature.localization.query import Query, QueryInSpace, QueryMap, best_observed
 from signature.visible import PROFILE_BEARINGS, seen_signatures, viewpoints_of
 from signature.weights import Pairs, SeenStatistics
@@ -225,7 +225,7 @@ def _asked(
 ) -> dict[str, Any]:
     """Return the evidence of each place that is found, and how far it is from the truth."""
     *_, (found, _) = index.search(query)
-    evidence = evidence_of([h.fit for h in found], query)
+    evidence = evidence_of([h.fit for h in found], query.likeness)
     bases = [h.fit.T_map_query @ query.T_odom_base for h in found]
     errors = [_error(index, h.session_index, T, truth) for h, T in zip(found, bases, strict=True)]
     row = {"evidence": list(map(asdict, evidence)), "errors": errors}

@@ -1,0 +1,165 @@
+"""The evidence that two sets of walls show one place: one equation for loops, answers and joins.
+
+    z_h = b + c (f_h + g_h) + d t_h                          log-odds of a place over "none of these"
+    f = l(a_f) n_f / (n_f + few),    g = l(a_b) n_b / (n_b + few),    l(a) = ln a - ln(1.2 - a)
+    t = min(score - rival, q score) sqrt(n_f (1 - like^2))
+
+- f and g are the log-likelihood of the wall points of the query on ground that the map knows, and of the
+  map's on ground that the query knows, as log-odds against a wrong place, where 0.6 agree. Divided by
+  (n + few) instead of 1, because neighbouring points repeat each other and all share what has been moved in
+  the building (`n_eff`). Ground that one side does not know says nothing.
+- t is what wrong places tell. However well a place fits, "not in this map" explains the query as well if
+  another place fits nearly so well: then such a fit is nothing special. The score (`score_fit`) is a
+  mean, which varies by chance as 1 / sqrt(n). No lead counts as longer than the share q of the score: what
+  scores less is not searched for, so there may always be a rival so near. Places that fit equally well are
+  no examples of it: they get the evidence of the best of them, and their priors divide the mass.
+- like, how well the query fits onto itself, slid along (`pc2grid.matching.score`): the walls of a
+  bare corridor tell no place along it from another.
+
+`pc2grid_lab.fit.posterior` fits b, c and d to queries whose truth is known, and judges them on buildings that
+were left out. They are fitted to fr079, intel, csail, aces, killian, wean, kidnap, workshop, birmingham, the
+hall, jarvis, the room and the kitchen of the catalogue of recordings. Loops (`pc2grid.mapping.loops`) had no
+part in it: on all pairs of local maps that csail and fr079 compare, it tells right from wrong ones as well as
+limits that were chosen for them did.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import compress
+
+import numpy as np
+
+from pc2grid.geometry import F64
+from pc2grid.matching.score import Fit
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvidenceParameters:
+    """What the equation above is made of.
+
+    bias, fit, lead : b, c and d.
+    few : wall points (0.1 m apart, by weight). Chosen among 3 to 100 by what is judged without the building;
+        from half to twice of it the likelihood is as high.
+    longest_lead : q. By hand; searches report what is nearer.
+    slack, least_agreement : keep the log-odds finite at an agreement of 1 and of 0.
+    alike : places whose scores differ by less fit equally well: twice the spread of the score between two
+        equal places (simulated twin rooms, which differ by the paths that they were seen from).
+    """
+
+    bias: float = -7.33
+    fit: float = 2.55
+    lead: float = 4.19
+    few: float = 10.0
+    longest_lead: float = 0.2
+    slack: float = 0.2
+    least_agreement: float = 0.01
+    alike: float = 0.02
+
+
+EVIDENCE = EvidenceParameters()
+LEFT = 0.05
+"""What has less than this share of the mass does not matter: a search ends, a loop is none."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Evidence:
+    """What tells for one place.
+
+    forward : `pc2grid.matching.score.Fit.known_agreement`. walls : wall points of the query that lie
+    on ground known to the map and were seen from a side that it knows, weighted by
+    `pc2grid.matching.walls.permanence`. backward, looked_at : the other way round, from whichever side.
+    lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
+    likeness : `pc2grid.matching.score` of the query.
+    """
+
+    forward: float
+    walls: float
+    backward: float
+    looked_at: float
+    lead: float
+    likeness: float
+
+    @property
+    def agreement(self) -> float:
+        """Return the better agreement of the two directions, 0..1."""
+        return max(self.forward, self.backward)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Return f + g: below 0 the place fits less than wrong places do."""
+        return tempered(self.forward, self.walls) + tempered(self.backward, self.looked_at)
+
+    @property
+    def terms(self) -> tuple[float, float, float]:
+        """Return the factors of b, c and d."""
+        sharpness = math.sqrt(self.walls * (1.0 - self.likeness**2))
+        return 1.0, self.log_likelihood, self.lead * sharpness
+
+    def log_odds(self, p: EvidenceParameters = EVIDENCE) -> float:
+        """Return z, the logarithm of the mass of the place over that of "nowhere"; minus infinity without
+        walls."""
+        if not self.walls:
+            return -math.inf
+        return float(np.dot((p.bias, p.fit, p.lead), self.terms))
+
+
+NO_EVIDENCE = Evidence(forward=0.0, walls=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
+
+
+def evidence_of(
+    fits: Sequence[Fit], likeness: float = 0.0, rivals: Sequence[Fit] = ()
+) -> tuple[Evidence, ...]:
+    """Return the evidence of places, one fit each.
+
+    likeness : `pc2grid.matching.score.self_similarity` of the query. rivals : of places that are no answers,
+    but examples of what wrong places score as well.
+    """
+    scores = np.array([fit.score for fit in (*fits, *rivals)])
+    alike = np.abs(scores[: len(fits), None] - scores) <= EVIDENCE.alike
+    each = [
+        Evidence(
+            forward=fit.known_agreement,
+            walls=fit.compared,
+            backward=fit.backward,
+            looked_at=fit.looked_at,
+            lead=min(
+                EVIDENCE.longest_lead * fit.score,
+                fit.score - float(np.max(scores[~equal], initial=-math.inf)),
+            ),
+            likeness=likeness,
+        )
+        for fit, equal in zip(fits, alike, strict=True)
+    ]
+    return tuple(max(compress(each, equal), key=Evidence.log_odds) for equal in alike)
+
+
+def masses(
+    evidence: Sequence[Evidence], prior: float | Sequence[float] = 1.0, p: EvidenceParameters = EVIDENCE
+) -> F64:
+    """(H,) probability of each place; what is missing to 1 is "nowhere".
+
+    prior : of each place, relative to that of "nowhere".
+    """
+    log_odds = np.array([e.log_odds(p) for e in evidence]) + np.log(prior)
+    highest = max(0.0, *log_odds, 0.0)
+    odds = np.exp(log_odds - highest)
+    return np.asarray(odds / (math.exp(-highest) + odds.sum()))
+
+
+def log_likelihood(fit: Fit) -> float:
+    """Return f + g of a fit: below 0 the two sides contradict each other; 0 where they share nothing."""
+    return tempered(fit.known_agreement, fit.compared) + tempered(fit.backward, fit.looked_at)
+
+
+def tempered(agreement: float, points: float) -> float:
+    """Return the log-likelihood of wall points that agree so well, tempered by their number."""
+    return log_likelihood_ratio(agreement) * points / (points + EVIDENCE.few)
+
+
+def log_likelihood_ratio(agreement: float) -> float:
+    """Return l of an agreement, 0..1: 0 at what wrong places reach."""
+    a = min(max(agreement, EVIDENCE.least_agreement), 1.0)
+    return math.log(a) - math.log(1.0 + EVIDENCE.slack - a)
