@@ -135,7 +135,7 @@ def test_a_small_run(data: Path, tmp_path: Path) -> None:
     free, carried = document["followed"]
     assert free["judged"] == free["located"] > 10 and free["wrong"] == free["alarms"] == 0
     assert free["noticed_s"] is None and carried["knew"] and carried["shown"]
-    assert 0.0 <= carried["noticed_s"] <= carried["again_s"] < 15.0 and carried["again_m"] < 6.0
+    assert 0.0 <= carried["noticed_s"] <= carried["located_s"] < 15.0 and carried["located_m"] < 6.0
     assert carried["wrong"] == carried["alarms"] == 0
     assert "nothing to compare with" in first.stdout
 

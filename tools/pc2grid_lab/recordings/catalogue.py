@@ -137,7 +137,12 @@ class Pair:
     @property
     def map_name(self) -> str:
         """Return the map, with the part of the recording that it is made from."""
-        return self.map if self.until_s is None else f"{self.map} 0..{self.until_s:g} s"
+        return beginning_of(self.map, self.until_s)
+
+
+def beginning_of(name: str, until_s: float | None) -> str:
+    """Return the name of the map of a recording, or of its first seconds."""
+    return name if until_s is None else f"{name} 0..{until_s:g} s"
 
 
 def _laser(name: str, building: str, *, file: str | None = None, **known: object) -> Recording:

@@ -431,7 +431,7 @@ class Judge:
     def __init__(self, catalogue: Catalogue, folder: Folder) -> None:
         self._catalogue, self._folder = catalogue, folder
         self._windows: dict[Pair, list[LocatedWindow]] = {}
-        self._followed: dict[tuple[str, str], Frame | None] = {}
+        self._followed: dict[Followed, Frame | None] = {}
         self._lie: dict[str, nx.Graph] = {}
         self._by_clouds = functools.cache(self._registered)
 
@@ -516,16 +516,13 @@ class Judge:
     def followed_row(self, one: Followed) -> FollowedRow:
         """Return the row of a recording that was followed; where there is no result, one that says why."""
         building = self._catalogue.recordings[one.map].building
-        row = FollowedRow(before=one.before, after=one.after, map=one.map, building=building)
+        row = FollowedRow(before=one.before, after=one.after, map=one.map_name, building=building)
         done = kept_result(self._folder.followed(one))
         if done is None or done.failed:
             return replace(row, problem=NOT_RUN if done is None else done.error or MISSING)
         if one.after is not None:
             begin_ns = done.document["put_down_ns"] - done.document["shift_ns"]
-            shown = self._shows(
-                one.after, self._followed_place(one.after, one.map, begin_ns), one.map, begin_ns
-            )
-            row = replace(row, shown=shown is True)
+            row = replace(row, shown=self._shows(one, one.after, begin_ns) is True)
         return followed_row(row, self._looks(one, done))
 
     def _looks(self, one: Followed, done: Finished) -> list[Look]:
@@ -536,43 +533,45 @@ class Judge:
             carried = put_down_ns is not None and said["stamp_ns"] >= put_down_ns
             name = one.after if carried and one.after is not None else one.before
             own_ns = said["stamp_ns"] - (shift_ns if carried else 0)
-            place, right = self._followed_place(name, one.map, own_ns), None
+            place, right = self._followed_place(one, name, own_ns), None
             if said["pose"] is not None and place is not None:
                 right = is_right(_pose(said), *place)[0]
-            since_s = since_m = None
-            if carried:
-                begin_ns = put_down_ns - shift_ns
-                parts = drive_of(self._catalogue.recordings[name], self._folder).parts
-                ways = [np.interp((begin_ns, own_ns), part.stamps_ns, part.path_m()) for part in parts]
-                since_s, since_m = (own_ns - begin_ns) * 1e-9, float(sum(np.ptp(way) for way in ways))
+            parts = drive_of(self._catalogue.recordings[name], self._folder).parts
+            begin_ns = int(parts[0].stamps_ns[0]) + round((one.until_s or 0.0) * 1e9)
+            begin_ns = put_down_ns - shift_ns if carried else begin_ns
+            ways = [np.interp((begin_ns, own_ns), part.stamps_ns, part.path_m()) for part in parts]
+            since_s, since_m = (own_ns - begin_ns) * 1e-9, float(sum(np.ptp(way) for way in ways))
             given_up = said["state"] in NOTICED and _was_right(looks)
-            alarm = given_up and self._shows(name, place, one.map, own_ns) is not False
-            looks.append(Look(said["state"], right, since_s, since_m, alarm))
+            alarm = given_up and self._shows(one, name, own_ns) is not False
+            looks.append(Look(said["state"], right, since_s, since_m, carried=carried, alarm=alarm))
         return looks
 
-    def _shows(self, name: str, place: tuple[SE2, float] | None, map_: str, stamp_ns: int) -> bool | None:
+    def _shows(self, one: Followed, name: str, stamp_ns: int) -> bool | None:
         """Return whether the map knows what the robot sees; None if nobody knows where that is."""
+        place = self._followed_place(one, name, stamp_ns)
         if place is None:
             return None
         hits_m = hits_at(self._folder, self._catalogue.recordings[name], stamp_ns)
-        return known_share(grids(self._folder, map_)[_SESSION], place[0].apply(hits_m)) >= JUDGEMENT.mapped
+        grid = grids(self._folder, one.map_name)[_SESSION]
+        return known_share(grid, place[0].apply(hits_m)) >= JUDGEMENT.mapped
 
-    def _followed_place(self, name: str, map_: str, stamp_ns: int) -> tuple[SE2, float] | None:
+    def _followed_place(self, one: Followed, name: str, stamp_ns: int) -> tuple[SE2, float] | None:
         """Return T_map_base at a scan of a recording, and how far a right answer may be from there, metres.
 
         By the looks at the recording as it is; None if they do not tell how it lies in the map.
         """
         drive = drive_of(self._catalogue.recordings[name], self._folder)
-        if (name, map_) not in self._followed:
-            done = kept_result(self._folder.followed(Followed(before=name, map=map_)))
+        alone = replace(one, before=name, after=None)
+        if alone not in self._followed:
+            done = kept_result(self._folder.followed(alone))
             looks = [] if done is None or done.failed else done.document["looks"]
             clues = [
                 Clue(own[1], _pose(said), (name, number), said["confidence"])
                 for number, said in enumerate(looks)
                 if said["pose"] is not None and (own := drive.own_pose(said["stamp_ns"])) is not None
             ]
-            self._followed[name, map_] = agreed_frame(clues) if clues else None
-        frame, at = self._followed[name, map_], drive.own_pose(stamp_ns)
+            self._followed[alone] = agreed_frame(clues) if clues else None
+        frame, at = self._followed[alone], drive.own_pose(stamp_ns)
         return None if frame is None or at is None else frame.place(at[1])
 
     def join_row(self, target: str, source: str) -> JoinRow:
@@ -632,7 +631,7 @@ class Judge:
         be: by the answers to its windows, which give `frames`, or else to its scans; None if these were not
         asked, or do not tell."""
         if not frames:
-            return self._followed_place(query.name, map_.name, stamp_ns)
+            return self._followed_place(Followed(before=query.name, map=map_.name), query.name, stamp_ns)
         drive = drive_of(query, self._folder)
         places = [where for where in (drive.where(stamp_ns), drive.own_pose(stamp_ns)) if where is not None]
         found = (frames[n, _SESSION].place(pose) for n, pose in places if (n, _SESSION) in frames)
@@ -881,14 +880,16 @@ class Look:
     """What `watch` said after a scan.
 
     right : None if no place was told, or it cannot be judged. since_s, since_m : time and travel since the
-        robot was put down; None before. alarm : whether the robot is given up where it was located, though
-        that was not wrong, and the map shows what it sees.
+        robot was put down, or of one that is not carried away, since its drive began. carried : whether it
+        has been carried away. alarm : whether the robot is given up where it was located, though that was not
+        wrong, and the map shows what it sees.
     """
 
     state: str
     right: bool | None
-    since_s: float | None = None
-    since_m: float | None = None
+    since_s: float = 0.0
+    since_m: float = 0.0
+    carried: bool = False
     alarm: bool = False
 
     @property
@@ -909,7 +910,7 @@ def _pose(said: dict[str, Any]) -> SE2:
 
 def followed_row(row: FollowedRow, looks: Sequence[Look]) -> FollowedRow:
     """Return what a row holds of its looks."""
-    before = [look for look in looks if look.since_s is None]
+    before = [look for look in looks if not look.carried]
     after = looks[len(before) :]
     knew = bool(before) and before[-1].state in ("located", "recovered", "off_map", "doubtful")
     if knew:  # until it is noticed, the old place is told
@@ -919,17 +920,23 @@ def followed_row(row: FollowedRow, looks: Sequence[Look]) -> FollowedRow:
     rights = [look.right for look in told]
     row = replace(
         row,
+        looks=len(looks),
         located=len(told),
         judged=len(told) - rights.count(None),
         wrong=rights.count(False),
         alarms=sum(look.alarm for look in before),
         knew=knew,
     )
-    return _with_times(row, after) if knew and after else row
+    if row.after is None:
+        return _located(row, before)
+    return (
+        _located(replace(row, noticed_s=after[0].since_s, noticed_m=after[0].since_m), after)
+        if knew and after
+        else row
+    )
 
 
-def _with_times(row: FollowedRow, after: Sequence[Look]) -> FollowedRow:
-    """Add to a row when the robot noticed that it had been carried away, and was located again."""
-    row = replace(row, noticed_s=after[0].since_s, noticed_m=after[0].since_m)
-    again = next((look for look in after if look.tells and look.right is not False), None)
-    return row if again is None else replace(row, again_s=again.since_s, again_m=again.since_m)
+def _located(row: FollowedRow, looks: Iterable[Look]) -> FollowedRow:
+    """Add to a row when the robot was located where it is."""
+    first = next((look for look in looks if look.tells and look.right is not False), None)
+    return row if first is None else replace(row, located_s=first.since_s, located_m=first.since_m)

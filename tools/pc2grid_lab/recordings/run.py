@@ -39,7 +39,14 @@ from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Scan, Trajectory
 from pc2grid.observer import TimeSpan
-from pc2grid_lab.recordings.catalogue import Catalogue, Pair, Recording, digest_of_drive, write_drive
+from pc2grid_lab.recordings.catalogue import (
+    Catalogue,
+    Pair,
+    Recording,
+    beginning_of,
+    digest_of_drive,
+    write_drive,
+)
 from pc2grid_lab.runner import Finished, Task, in_processes, kept_result, pc2grid, run, run_tasks
 from pc2grid_lab.truth import trajectory_error
 from signature.database import open_database
@@ -104,7 +111,7 @@ class Folder:
 
     def followed(self, one: Followed) -> Path:
         """Return the result of `watch` for a row."""
-        return self.work / "followed" / f"{as_file_name(one.name)}.in.{as_file_name(one.map)}.json"
+        return self.work / "followed" / f"{as_file_name(one.name)}.in.{as_file_name(one.map_name)}.json"
 
     def join(self, target: str, source: str) -> Path:
         """Return the result of comparing two maps."""
@@ -144,17 +151,24 @@ class Followed:
     """A recording that is followed in the map of another session.
 
     after : what the robot is carried to; if that is the same recording, from its later half to its earlier
-        one. None: it is not carried away.
+        one. None: it is not carried away. until_s : the first so many seconds of `map` become the map, and
+        what comes after them is followed; None: all of it.
     """
 
     before: str
     map: str
     after: str | None = None
+    until_s: float | None = None
 
     @property
     def name(self) -> str:
         """Return of the row."""
         return self.before if self.after is None else f"{self.before}, {self.after}"
+
+    @property
+    def map_name(self) -> str:
+        """Return the map, with the part of the recording that it is made from."""
+        return beginning_of(self.map, self.until_s)
 
 
 def _in(map_: str, *others: str) -> Iterator[Followed]:
@@ -182,6 +196,11 @@ FOLLOWED: tuple[Followed, ...] = (
     *_in("hallway2", "hallway"),
     *_in("workshop_1", "workshop_1_changed"),
     *_in("workshop_1_changed", "workshop_1"),
+    *(Followed(before="fr079", map=name) for name in ("fr079 lidar", "fr079 depth", "fr079_floor.ply")),
+    *(
+        Followed(before=name, map=name, until_s=until_s)
+        for name, until_s in (("fr079", 600.0), ("intel", 900.0), ("csail", 250.0), ("aces", 700.0))
+    ),
 )
 """All rows, in the order of the page."""
 
@@ -212,14 +231,18 @@ def _watched(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
     def do() -> Finished:
         put_down_ns = shift_ns = None
         source = folder.source(catalogue.recordings[one.before])
-        if one.after is not None:
-            source = folder.work / "carried" / f"{as_file_name(one.name)}.mcap"
-            source.parent.mkdir(parents=True, exist_ok=True)
+        made = folder.work / "carried" / f"{as_file_name(one.name)}.mcap"
+        made.parent.mkdir(parents=True, exist_ok=True)
+        if one.until_s is not None:
+            source = made
+            write_part(McapPart(folder.source(catalogue.recordings[one.before]), begin_s=one.until_s), source)
+        elif one.after is not None:
+            source = made
             before, after = (folder.source(catalogue.recordings[name]) for name in (one.before, one.after))
             half_s = 0.5 * folder.length_s(catalogue.recordings[one.before]) if before == after else None
             parts = McapPart(before, begin_s=half_s or 0.0), McapPart(after, end_s=half_s)
             put_down_ns, shift_ns = write_joined(*parts, source)
-        done = pc2grid("-q", "watch", source, "-d", folder.map(one.map), "--json")
+        done = pc2grid("-q", "watch", source, "-d", folder.map(one.map_name), "--json")
         looks = done.document if isinstance(done.document, list) else [done.document]
         document = {"looks": looks, "put_down_ns": put_down_ns, "shift_ns": shift_ns}
         return done if done.failed else replace(done, document=document)
@@ -241,7 +264,9 @@ def run_all(
     """
     pairs = [p for p in catalogue.pairs if not folder.gaps(catalogue, p)]
     maps = _maps(catalogue, folder, pairs)
-    maps |= {name: (catalogue.recordings[name], None) for one in followed for name in (one.before, one.map)}
+    for one in followed:
+        maps[one.before] = (catalogue.recordings[one.before], None)
+        maps[one.map_name] = (catalogue.recordings[one.map], one.until_s)
     further = [_watched(catalogue, folder, one) for one in followed]
     read = {recording.name: recording for recording, _ in maps.values()}
     read |= {pair.query: catalogue.recordings[pair.query] for pair in pairs}
@@ -457,6 +482,15 @@ class McapPart:
     end_s: float | None = None
 
 
+def write_part(part: McapPart, target: Path) -> None:
+    """Write the MCAP file `target`: scans and odometry of a part of a recording, and static transforms.
+
+    Raises OSError, and the errors of `mcap` and `rosbags`.
+    """
+    messages = _messages(part)
+    write_messages(target, chain(_static(part, messages[0].log_time_ns), messages))
+
+
 def write_joined(before: McapPart, after: McapPart, target: Path) -> tuple[int, int]:
     """Write the MCAP file `target`: the scans and odometry of `before`, then those of `after`.
 
@@ -467,13 +501,18 @@ def write_joined(before: McapPart, after: McapPart, target: Path) -> tuple[int, 
     """
     first, second = _messages(before), _messages(after)
     shift_ns = first[-1].log_time_ns + _CARRIED_NS - second[0].log_time_ns
-    static = [m for m in stored_messages(before.path) if m.channel.topic == _STATIC]
     last, next_ = (next((m for m in some if _is_odometry(m)), None) for some in (first[::-1], second))
     T = None if last is None or next_ is None else _pose_of(last) @ _pose_of(next_).inverse()
     moved = (_moved(message, shift_ns, T) for message in second)
-    earlier = (message._replace(log_time_ns=first[0].log_time_ns) for message in static)
-    write_messages(target, chain(earlier, first, moved))
+    write_messages(target, chain(_static(before, first[0].log_time_ns), first, moved))
     return second[0].log_time_ns + shift_ns, shift_ns
+
+
+def _static(part: McapPart, time_ns: int) -> Iterator[Stored]:
+    """Yield the static transforms of a recording, as if stored at a time."""
+    for message in stored_messages(part.path):
+        if message.channel.topic == _STATIC:
+            yield message._replace(log_time_ns=time_ns)
 
 
 def _messages(part: McapPart) -> list[Stored]:

@@ -193,13 +193,15 @@ class FollowedRow:
     """A recording that `watch` followed in the map of another session.
 
     after : the recording that the robot was carried to; None: it was not carried away. problem : why there is
-        no result. located, judged, wrong : looks that told a place, of them those that can be judged, and
-        wrong ones; without those between the kidnap and its notice, which tell the old place. alarms : how
+        no result. looks : all. located, judged, wrong : of them those that told a place, of these those that
+        can be judged, and wrong ones; without those between the kidnap and its notice, which tell the old
+        place. alarms : how
         often a right place was given up before it was carried away, though the map shows what it saw.
     shown : whether the map shows what the robot sees where it is put down. knew : whether it was located
         until it was carried away.
-    noticed_s, noticed_m : time and travel until the first look that it is not where it was; again_s, again_m
-        until it is located where it is; None: never.
+    noticed_s, noticed_m : time and travel since it was put down until the first look that it is not where it
+        was; located_s, located_m : until it is located where it is, of a robot that is not carried away since
+        its drive began; None: never.
     """
 
     before: str
@@ -208,6 +210,7 @@ class FollowedRow:
     building: str
     problem: str = ""
     shown: bool = False
+    looks: int = 0
     located: int = 0
     judged: int = 0
     wrong: int = 0
@@ -215,8 +218,8 @@ class FollowedRow:
     knew: bool = False
     noticed_s: float | None = None
     noticed_m: float | None = None
-    again_s: float | None = None
-    again_m: float | None = None
+    located_s: float | None = None
+    located_m: float | None = None
 
     @property
     def name(self) -> str:
@@ -641,7 +644,12 @@ def _by_confidence(table: Table) -> list[str]:
     ]
 
 
-_FOLLOWED = (
+_DRIVES = (
+    ("map", "recording"),
+    ("located first, s", "m", "looks", "told", "judged", "wrong", "false alarms"),
+    ("",),
+)
+_CARRIED = (
     ("map", "recording", "carried to"),
     ("noticed, s", "m", "located again, s", "m", "told", "judged", "wrong", "false alarms"),
     ("",),
@@ -649,34 +657,57 @@ _FOLLOWED = (
 
 
 def _followed(table: Table) -> list[str]:
-    """Return the recordings that were followed, carried away and not."""
-    rows = table.followed
-    if not rows:
-        return []
-    return [
-        "## Carried away",
-        "",
-        *markdown(_FOLLOWED, [_followed_cells(row) for row in rows]),
-        "",
-        *wrap(_about_followed(rows), 105),
-        "",
-    ]
+    """Return the recordings that were followed, and those that were followed as one robot that is carried."""
+    drives, carried = _drives(table), _carried(table)
+    page = []
+    if drives:
+        shown = markdown(_DRIVES, [_drive_cells(row) for row in drives])
+        page += ["## Along drives", "", *shown, "", *wrap(_about_drives(drives), 105), ""]
+    if carried:
+        shown = markdown(_CARRIED, [_carried_cells(row) for row in carried])
+        page += ["## Carried away", "", *shown, "", *wrap(_about_carried(carried), 105), ""]
+    return page
 
 
-def _about_followed(rows: Sequence[FollowedRow]) -> str:
-    knew = [row for row in rows if row.after is not None and row.knew]
+def _drives(table: Table) -> list[FollowedRow]:
+    return [row for row in table.followed if row.after is None]
+
+
+def _carried(table: Table) -> list[FollowedRow]:
+    return [row for row in table.followed if row.after is not None]
+
+
+def _about_drives(rows: Sequence[FollowedRow]) -> str:
+    looks, told = sum(row.looks for row in rows), sum(row.located for row in rows)
+    return (
+        "`watch` follows a recording from its beginning on, as a robot that does not know where it is, and "
+        "looks after each metre. The map is of another session, or of the time before. "
+        f"{_count('located_s', rows)} of {len(rows)} robots are located, {_middle('located_s', rows)} s and "
+        f"{_middle('located_m', rows)} m after they began, in the median; what never happens counts as "
+        f"longest. Of {looks} looks, also where the map shows nothing, {told} tell a place. {_wrong(rows)}"
+    )
+
+
+def _about_carried(rows: Sequence[FollowedRow]) -> str:
+    knew = [row for row in rows if row.knew]
     shown = [row for row in knew if row.shown]
     return (
         "`watch` follows two recordings as one, the second a second after the first, with wheels that did "
-        "not turn in between; without a second one, nobody carries the robot. The map is of another session. "
-        f"Of {len(knew)} kidnaps of a robot that knew where it was, {_count('noticed_s', knew)} are noticed, "
+        f"not turn in between. Of {len(knew)} kidnaps of a robot that knew where it was, "
+        f"{_count('noticed_s', knew)} are noticed, "
         f"{_middle('noticed_s', knew)} s and {_middle('noticed_m', knew)} m after it was put down, in the "
         f"median. In {len(shown)} of them the map shows what it sees there; it is located again "
-        f"{_count('again_s', shown)} times, {_middle('again_s', shown)} s and {_middle('again_m', shown)} m "
-        "after, in the median; what never happens counts as longest. A false alarm gives up a "
-        "right place though nobody carried the robot and the map shows what it sees: "
-        f"{sum(row.alarms for row in rows)} in {len(rows)} rows. Of {sum(row.judged for row in rows)} places "
-        f"that can be judged, {sum(row.wrong for row in rows)} are wrong."
+        f"{_count('located_s', shown)} times, {_middle('located_s', shown)} s and "
+        f"{_middle('located_m', shown)} m after, in the median. {_wrong(rows)}"
+    )
+
+
+def _wrong(rows: Sequence[FollowedRow]) -> str:
+    judged, wrong = sum(row.judged for row in rows), sum(row.wrong for row in rows)
+    return (
+        f"Of {judged} places that can be judged, {wrong} are wrong, in {sum(row.wrong > 0 for row in rows)} "
+        f"of {len(rows)} rows. A false alarm gives up a right place though nobody carried the robot and the "
+        f"map shows what it sees: {sum(row.alarms for row in rows)}."
     )
 
 
@@ -737,22 +768,26 @@ def _middle(name: str, rows: Sequence[FollowedRow]) -> str:
     return f"{middle:.1f}" if math.isfinite(middle) else "no"
 
 
-def _followed_cells(row: FollowedRow) -> list[str]:
+def _drive_cells(row: FollowedRow) -> list[str]:
+    if row.problem:
+        return [row.map, row.before, *[""] * 7, row.problem]
+    times = (number(value, 1) for value in (row.located_s, row.located_m))
+    return [row.map, row.before, *times, str(row.looks), *_told(row), ""]
+
+
+def _carried_cells(row: FollowedRow) -> list[str]:
     names = [row.map, row.before, row.after or ""]
     if row.problem:
         return [*names, *[""] * 8, row.problem]
-    times = (row.noticed_s, row.noticed_m, row.again_s, row.again_m)
-    note = "" if row.after is None or row.knew else "was not located before"
-    if row.after is not None and row.knew and not row.shown:
+    times = (row.noticed_s, row.noticed_m, row.located_s, row.located_m)
+    note = "" if row.knew else "was not located before"
+    if row.knew and not row.shown:
         note = "the map does not show where it was put down"
-    return [
-        *names,
-        *(number(value, 1) for value in times),
-        *(str(count) for count in (row.located, row.judged)),
-        strong(row.wrong),
-        strong(row.alarms),
-        note,
-    ]
+    return [*names, *(number(value, 1) for value in times), *_told(row), note]
+
+
+def _told(row: FollowedRow) -> list[str]:
+    return [str(row.located), str(row.judged), strong(row.wrong), strong(row.alarms)]
 
 
 def _failures(table: Table) -> list[str]:
@@ -801,7 +836,8 @@ def show(table: Table) -> None:
     for title, heads, cells in (
         ("Maps", _MAPS, [_map_cells(row) for row in table.maps]),
         ("Places", _PLACES, [_pair_cells(row) for row in table.pairs]),
-        ("Carried away", _FOLLOWED, [_followed_cells(row) for row in table.followed]),
+        ("Along drives", _DRIVES, [_drive_cells(row) for row in _drives(table)]),
+        ("Carried away", _CARRIED, [_carried_cells(row) for row in _carried(table)]),
         ("Joined", _JOINS, [_join_cells(row) for row in table.joins]),
     ):
         names = [name for side in heads for name in side]
