@@ -1,7 +1,7 @@
 """Compare your own descriptor of a submap with the paper's, on your own floor plan, as the paper does.
 
-A descriptor is a `Method`: `fit` takes the submaps of a map and returns an object whose `similarities`
-compares a query with each of them. Queries are cut near a submap's centre and turned at random, with
+A descriptor is a `Method`, a function that takes the submaps of a map and returns a function that compares a
+query with each of them. Queries are cut near a submap's centre and turned at random, with
 obstacles that are not in the map. `pc2grid compare paper` runs the same experiment on the paper's maps. Both
 need the package `pc2grid_lab`, which only a clone of the repository has: `pip install -e .` there.
 
@@ -17,36 +17,31 @@ import typer
 
 import pc2grid
 from pc2grid.settings import PartitionConfig
-from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, evaluate
+from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, Matcher, evaluate
 from pc2grid_lab.paper.methods import make_methods
 
 
-class WallDistances:
+def wall_distances(submaps: Sequence[pc2grid.Submap]) -> Matcher:
     """Histogram of the distances of the walls from the centre; it does not depend on the rotation."""
+    table = np.array([describe(submap) for submap in submaps])
+    # (N,), larger is more similar.
+    return lambda query: -np.abs(table - describe(query)).sum(axis=1)
 
-    def fit(self, submaps: Sequence[pc2grid.Submap]) -> WallDistances:
-        """Describe every submap."""
-        self.table = np.array([self.describe(submap) for submap in submaps])
-        return self
 
-    def describe(self, submap: pc2grid.Submap) -> np.ndarray:
-        """(B,) shares of the walls by distance, 0.25 m a bin."""
-        grid = submap.grid
-        middle = (np.array(grid.cells.shape) - 1) / 2
-        distances = np.linalg.norm(np.argwhere(grid.occupied) - middle, axis=1) * grid.resolution_m
-        counts, _ = np.histogram(distances, bins=np.arange(0.0, submap.radius_m + 0.25, 0.25))
-        return counts / max(counts.sum(), 1)
-
-    def similarities(self, query: pc2grid.Submap) -> np.ndarray:
-        """(N,), larger is more similar."""
-        return -np.abs(self.table - self.describe(query)).sum(axis=1)
+def describe(submap: pc2grid.Submap) -> np.ndarray:
+    """(B,) shares of the walls by distance, 0.25 m a bin."""
+    grid = submap.grid
+    middle = (np.array(grid.cells.shape) - 1) / 2
+    distances = np.linalg.norm(np.argwhere(grid.occupied) - middle, axis=1) * grid.resolution_m
+    counts, _ = np.histogram(distances, bins=np.arange(0.0, submap.radius_m + 0.25, 0.25))
+    return counts / max(counts.sum(), 1)
 
 
 def main(map_yaml: str, queries: int = 200) -> None:
     """Print the area under the precision-recall curve of three methods at the paper's noise levels."""
     grid = pc2grid.load_map(map_yaml)
     submaps = pc2grid.submaps_of(grid, PartitionConfig.paper())
-    methods = {**make_methods(["proposed", "shape_context"]), "wall distances": WallDistances()}
+    methods = {**make_methods(["proposed", "shape_context"]), "wall distances": wall_distances}
     experiment = Experiment(queries=queries)
     print(f"{len(submaps)} submaps, {queries} queries; area under the curve, share recognised")
     for level, noise in enumerate(NOISE_LEVELS):

@@ -28,7 +28,7 @@ from pc2grid_cli.console import Console
 from pc2grid_cli.output import show, table
 from pc2grid_cli.view import ViewServer
 from pc2grid_lab import sensors
-from pc2grid_lab.paper import scale
+from pc2grid_lab.paper import tables
 from tests.helpers.interruptible import interruptible
 from tests.helpers.rooms import grid_of, rectangle
 from tests.helpers.shared_folders import shared_folder
@@ -421,7 +421,7 @@ def work(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setattr(demo, "QUERY_LENGTH_M", 1.0)
     monkeypatch.setattr(ViewServer, "serve_forever", lambda server: None)
     monkeypatch.setattr(ViewServer, "url", "http://localhost/")
-    monkeypatch.setattr(scale, "FLOORS", 0)
+    monkeypatch.setattr(tables, "FLOORS", 0)
     monkeypatch.setattr(sensors, "SENSORS", ("laser",))
     return shutil.copytree(folder, tmp_path / "work")
 

@@ -196,7 +196,7 @@ COMPARE = {
         "The paper's tables and figures 9 and 10.", "ComparePaper", "paper.tables:compare_paper"
     ),
     "scale": _experiment(
-        "The paper's recall in larger databases.", "CompareScale", "paper.scale:compare_scale"
+        "The paper's recall in larger databases.", "CompareScale", "paper.tables:compare_scale"
     ),
 }
 

@@ -150,10 +150,10 @@ def test_queries_are_drawn_once_a_level_and_databases_fitted_once(
         fitted.append(self)
         return fit(self, submaps)
 
-    fit = DistanceFeatures.fit
+    fit = DistanceFeatures.__call__
     with monkeypatch.context() as patched:
         patched.setattr(experiment, "draw_queries", drawing)
-        patched.setattr(DistanceFeatures, "fit", fitting)
+        patched.setattr(DistanceFeatures, "__call__", fitting)
         found = computed_cells(groups[0], tmp_path)
     assert (len(fitted), len(drawn)) == (1, 3)
     grid = read_map(maps / "intel.yaml")

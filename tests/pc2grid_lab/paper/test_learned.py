@@ -14,7 +14,7 @@ from pc2grid.io.maps import save_map
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
 from pc2grid_lab.paper import methods
-from pc2grid_lab.paper.methods import COLUMNS, CONFIG, Learned, Unlearned, Vectors, submap_vector, weight
+from pc2grid_lab.paper.methods import COLUMNS, CONFIG, learned, submap_vector, unlearned, weight
 from pc2grid_lab.paper.tables import computed_cells, paper_tasks, read_map
 from signature.boundary import boundary_edges, boundary_points
 from signature.paper import describe
@@ -80,13 +80,13 @@ def test_the_distance_is_that_of_mahalanobis_with_a_shrunk_covariance() -> None:
         submap_vector(query)[None, columns],
     )
     plain = cdist(wanted, rows, "mahalanobis", VI=np.linalg.inv(covariance))[0]
-    found = Learned(Vectors(), parts, within).fit(rooms).similarities(query)
+    found = learned(submap_vector, parts, within, rooms)(query)
     np.testing.assert_allclose(-found, plain, rtol=1e-4)
 
 
 def test_without_learning_the_distances_of_the_parts_are_added() -> None:
     rooms, query = [submap_of(rectangle(8.0, 5.0)), submap_of(l_shape())], submap_of(random_rooms(1))
-    found = Unlearned(Vectors(), {"boundary": 0.7, "radial": 0.3}).fit(rooms).similarities(query)
+    found = unlearned(submap_vector, {"boundary": 0.7, "radial": 0.3}, rooms)(query)
     asked = submap_vector(query)
     for room, similarity in zip(rooms, found, strict=True):
         bc = [(asked * submap_vector(room))[COLUMNS[part]].sum() for part in ("boundary", "radial")]

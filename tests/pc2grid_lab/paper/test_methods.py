@@ -9,10 +9,9 @@ import pytest
 
 from pc2grid.geometry import F64
 from pc2grid.model import Submap
-from pc2grid_lab.paper.experiment import Matcher, Method, rotated_submap
-from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, Proposed, make_methods, submap_vector
-from pc2grid_lab.paper.rivals import DistanceFeatures, ShapeContext
-from signature.config import SignatureConfig
+from pc2grid_lab.paper.experiment import Matcher, rotated_submap
+from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods, submap_vector
+from pc2grid_lab.paper.rivals import DistanceFeatures, context
 from signature.freespace import freespace_paths
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
@@ -34,7 +33,7 @@ def rooms() -> list[Submap]:
 def matchers() -> dict[str, Matcher]:
     pytest.importorskip("mahotas")
     submaps = rooms()
-    return {name: method.fit(submaps) for name, method in make_methods(ALL, within()).items()}
+    return {name: method(submaps) for name, method in make_methods(ALL, within()).items()}
 
 
 def within() -> F64:
@@ -47,7 +46,7 @@ def within() -> F64:
 @pytest.mark.parametrize("name", ALL)
 def test_every_method_finds_a_submap_itself(name: str, matchers: dict[str, Matcher]) -> None:
     for i, submap in enumerate(rooms()):
-        scores = matchers[name].similarities(submap)
+        scores = matchers[name](submap)
         assert scores.shape == (8,)
         assert scores[i] == pytest.approx(scores.max())
 
@@ -65,27 +64,26 @@ def test_methods_on_geometry_find_a_turned_bare_shape(name: str, matchers: dict[
 
 def found_turned(matcher: Matcher, submaps: list[Submap]) -> int:
     """How many submaps are the most similar to themselves after a turn."""
-    similarities = (matcher.similarities(rotated_submap(s.grid, s.center_m, 8.0, 0.7)) for s in submaps)
+    similarities = (matcher(rotated_submap(s.grid, s.center_m, 8.0, 0.7)) for s in submaps)
     return sum(int(np.argmax(scores)) == i for i, scores in enumerate(similarities))
 
 
 @pytest.mark.parametrize("name", ALL)
 def test_degenerate_submaps_have_finite_scores(name: str, matchers: dict[str, Matcher]) -> None:
     for query_name, query in degenerate().items():
-        assert np.isfinite(matchers[name].similarities(query)).all(), query_name
+        assert np.isfinite(matchers[name](query)).all(), query_name
 
 
 @pytest.mark.parametrize("name", ["shape_context", "sdf", "sift_bow", "sift_tfidf", "proposed"])
 def test_a_map_of_empty_submaps_can_be_fitted(name: str) -> None:
     empty = [degenerate()["unknown"], degenerate()["free"]]
-    scores = make_methods([name])[name].fit(empty).similarities(rooms()[0])
+    scores = make_methods([name])[name](empty)(rooms()[0])
     assert scores.shape == (2,) and np.isfinite(scores).all()
 
 
 def test_unknown_methods_are_named() -> None:
     with pytest.raises(KeyError, match="orb"):
         make_methods(["orb_bow"])
-    assert all(isinstance(method, Method) for method in make_methods(METHOD_NAMES).values())
 
 
 def test_methods_that_differ_in_comparing_share_the_description_of_a_query(
@@ -93,34 +91,28 @@ def test_methods_that_differ_in_comparing_share_the_description_of_a_query(
 ) -> None:
     """The two readings of the distance do; other signatures are not mistaken for these."""
     submaps, query = rooms()[:3], submap_of(random_rooms(5))
-    names = ("proposed", "proposed_ln_bc")
-    shared = make_methods(names)
-    coarse = Proposed(
-        SignatureConfig.paper().model_copy(update={"boundary_bin_m": 0.4}), shared["proposed"].signatures
-    )
-    matchers = [method.fit(submaps) for method in (*shared.values(), coarse)]
+    names = ("proposed", "proposed_ln_bc", "as_used_here")
+    matchers = [method(submaps) for method in make_methods(names).values()]
     described = []
     monkeypatch.setattr(
         "pc2grid_lab.paper.methods.freespace_paths",
         lambda *of: described.append(of) or freespace_paths(*of),
     )
-    found = [matcher.similarities(query) for matcher in matchers]
+    found = [matcher(query) for matcher in matchers]
     assert len(described) == 2
-    for matcher, method in zip(found, (*shared.values(), coarse), strict=True):
-        alone = Proposed(method.config).fit(submaps).similarities(query)
-        assert np.array_equal(matcher, alone)
+    for name, similarities in zip(names, found, strict=True):
+        assert np.array_equal(similarities, make_methods([name])[name](submaps)(query))
 
 
 def test_shape_context_of_one_wall_by_hand() -> None:
-    method = ShapeContext()
     cells = np.full((321, 321), 0, np.int8)
     cells[160, 240] = 100  # 4 m at +x: sector 0
     cells[240, 160] = 100  # 4 m at +y: sector 6 of 24
-    context = method.context(submap_of(cells))
+    found = context(submap_of(cells))
     rings = np.geomspace(0.5, 8.0, 12)
     ring = int(np.searchsorted(rings, 4.0))
-    assert np.argwhere(context > 0).tolist() == [[ring, 0], [ring, 6]]
-    assert context.sum() == pytest.approx(1.0)
+    assert np.argwhere(found > 0).tolist() == [[ring, 0], [ring, 6]]
+    assert found.sum() == pytest.approx(1.0)
 
 
 def test_descriptors_turn_with_the_room() -> None:
@@ -135,6 +127,6 @@ def test_descriptors_turn_with_the_room() -> None:
     error = np.linalg.norm(there.places_m[costs.argmin(axis=1)] - moved, axis=1)
     # By chance it were one in a hundred; along bare walls the places are as alike as they look.
     assert (error < 0.3).mean() > 0.2
-    found = DistanceFeatures().fit([submap_of(polygon(corners)), submap_of(l_shape())])
-    scores = found.similarities(submap_of(polygon([(c * x - s * y, s * x + c * y) for x, y in corners])))
+    found = DistanceFeatures()([submap_of(polygon(corners)), submap_of(l_shape())])
+    scores = found(submap_of(polygon([(c * x - s * y, s * x + c * y) for x, y in corners])))
     assert scores[0] > 1.5 * scores[1]

@@ -15,11 +15,10 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import partition
 from pc2grid_cli.main import app
-from pc2grid_lab.paper import methods, scale
+from pc2grid_lab.paper import methods, tables
 from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, draw_queries
 from pc2grid_lab.paper.methods import make_methods
-from pc2grid_lab.paper.scale import Counted, count, mean_recall, sources_of
-from pc2grid_lab.paper.tables import rescaled, within_others
+from pc2grid_lab.paper.tables import Counted, count, mean_recall, rescaled, sources_of, within_others
 from tests.helpers.rooms import cross, grid_of, l_shape, random_rooms, rectangle
 
 
@@ -27,8 +26,8 @@ from tests.helpers.rooms import cross, grid_of, l_shape, random_rooms, rectangle
 def maps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Three small buildings, no simulated floor."""
     monkeypatch.setattr(methods, "LEARNED_FROM", 6)
-    monkeypatch.setattr(scale, "FLOORS", 0)
-    monkeypatch.setattr(scale, "FACTORS", (1.0, 0.8))
+    monkeypatch.setattr(tables, "FLOORS", 0)
+    monkeypatch.setattr(tables, "FACTORS", (1.0, 0.8))
     folder = tmp_path / "maps"
     folder.mkdir()
     for name, shapes in {
@@ -63,19 +62,19 @@ def test_counts_are_those_of_the_methods_of_the_tables(level: int, maps: Path, t
     counted = count(asked, level, experiment, sources, kept)
     grid = load_map(asked)
     junctions = partition(grid, PartitionConfig.paper())
-    own = partition(grid, scale.PLACES)
+    own = partition(grid, tables.PLACES)
     others = [
-        (s.kind, place) for s in sources if s.building != "a" for place in partition(s.load(), scale.PLACES)
+        (s.kind, place) for s in sources if s.building != "a" for place in partition(s.load(), tables.PLACES)
     ]
     kinds = np.array([3] * len(own) + [kind for kind, _ in others])
     assert {0, 1, 3} == set(kinds.tolist())
     within = within_others(asked, 8.0, 1, kept)
     centers_m = np.array([junction.center_m for junction in junctions])
     queries = list(draw_queries(grid, centers_m, 8.0, experiment, NOISE_LEVELS[level]))
-    for name, method in make_methods(scale.METHODS, within).items():
-        matcher = method.fit([*own, *(place for _, place in others)])
+    for name, method in make_methods(tables.METHODS, within).items():
+        matcher = method([*own, *(place for _, place in others)])
         for row, query in enumerate(queries):
-            similar = matcher.similarities(query)
+            similar = matcher(query)
             nearest = min(junctions, key=lambda junction: math.dist(junction.center_m, query.center_m))
             right = [place.center_m for place in own].index(nearest.center_m)
             other = np.array([math.dist(place.center_m, query.center_m) > 3.0 for place in own])
@@ -98,7 +97,7 @@ def test_a_run_draws_the_curves_and_the_next_one_only_reads_its_counts(
     for curve in curves:
         assert curve["places"] == sorted(curve["places"]) and np.all(np.diff(curve["recall"]) <= 1e-12)
     assert {row["database"] for row in curves} == {"other buildings", "own building"}
-    monkeypatch.setattr(scale, "_count", None)
+    monkeypatch.setattr(tables, "_count", None)
     second = CliRunner().invoke(app, arguments)
     assert second.exit_code == 0 and second.stdout == first.stdout
 

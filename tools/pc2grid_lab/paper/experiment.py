@@ -9,9 +9,9 @@ compares queries with them.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
+from typing import NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -21,6 +21,10 @@ from pc2grid.geometry import F64
 from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid, Submap
 
 Key = TypeVar("Key")
+Matcher = Callable[[Submap], F64]
+"""Returns the similarity of a query to each of N submaps: (N,), larger is more alike, never NaN."""
+Method = Callable[[Sequence[Submap]], Matcher]
+"""A way to compare submaps: describes those of a map, and learns from them what it needs, as a vocabulary."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,7 +40,7 @@ class Experiment:
         same place at every noise level.
     """
 
-    queries: int = 2000
+    queries: int
     offset_m: float = 1.0
     correct_m: float = 1.0
     seed: int = 1
@@ -204,7 +208,7 @@ def evaluate(
     """
     if not submaps:
         raise ValueError("a map without submaps cannot be evaluated")
-    matchers = {name: method.fit(submaps) for name, method in methods.items()}
+    matchers = {name: method(submaps) for name, method in methods.items()}
     return best_matches(matchers, grid, submaps, experiment, noise)
 
 
@@ -221,7 +225,7 @@ def best_matches(
     correct = {key: np.empty(experiment.queries, np.bool_) for key in matchers}
     for i, query in enumerate(draw_queries(grid, centers_m, submaps[0].radius_m, experiment, noise)):
         for key, matcher in matchers.items():
-            scores = matcher.similarities(query)
+            scores = matcher(query)
             best = int(np.argmax(scores))
             similarity[key][i] = scores[best]
             correct[key][i] = math.dist(centers_m[best], query.center_m) <= experiment.correct_m
@@ -289,22 +293,3 @@ def add_noise(submap: Submap, noise: Noise, rng: np.random.Generator) -> Submap:
     image[beyond] = UNKNOWN
     noisy = OccupancyGrid(cells=image.astype(np.int8), resolution_m=grid.resolution_m, origin_m=grid.origin_m)
     return replace(submap, grid=noisy)
-
-
-@runtime_checkable
-class Matcher(Protocol):
-    """A method that is fitted to the submaps of a map."""
-
-    def similarities(self, query: Submap) -> F64:
-        """Return the similarity of the query to each of the N fitted submaps: (N,), larger is more alike,
-        never NaN."""
-        ...
-
-
-@runtime_checkable
-class Method(Protocol):
-    """A way to describe and compare submaps."""
-
-    def fit(self, submaps: Sequence[Submap]) -> Matcher:
-        """Describe the submaps of a map and learn from them what the method needs, such as a vocabulary."""
-        ...

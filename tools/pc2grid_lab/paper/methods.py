@@ -1,6 +1,6 @@
 """The methods of the comparison by name: the paper's own, its six rivals (paper IV-A), and what beats it.
 
-`Learned` is not in the paper, whose Eq. 6 weighs all bins alike: the boundary at several radii, compared by a
+`learned` is not in the paper, whose Eq. 6 weighs all bins alike: the boundary at several radii, compared by a
 metric that was learned on other maps. A submap is a vector of square roots of shares, and the distance of two
 of them is Mahalanobis's, with the covariance of how a query differs from the submap of its own place: bins
 that change when one stands a metre beside it, or turned, count less. The covariance is that of queries
@@ -9,8 +9,8 @@ without noise on the other maps, so that nothing is learned from the map that is
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from types import MappingProxyType
 from typing import Any
 
@@ -20,56 +20,35 @@ from scipy.spatial import cKDTree
 
 from pc2grid.geometry import F64
 from pc2grid.model import OccupancyGrid, Submap
-from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, Method, draw_queries
-from pc2grid_lab.paper.rivals import DistanceFeatures, ShapeContext, Vocabulary, Words, sift, surf
+from pc2grid_lab.paper.experiment import NOISE_LEVELS, Experiment, Matcher, Method, draw_queries
+from pc2grid_lab.paper.rivals import (
+    DistanceFeatures,
+    Vocabulary,
+    of_last,
+    shape_context,
+    sift,
+    surf,
+    words,
+)
 from signature.boundary import boundary_edges, boundary_points, weighed_pairs
 from signature.config import SignatureConfig
 from signature.freespace import freespace_paths
 from signature.paper import Signature, SignatureTable, described, distances, similarity
 from signature.weights import shrunk
 
-_OF_COMPARING = {"weight_boundary", "symmetry_scale", "symmetry_sigma", "histogram_distance"}
-"""Fields of a configuration that do not change a signature."""
+
+def signature_of(submap: Submap, config: SignatureConfig) -> Signature:
+    """Return the signature that `signature.paper` gives, without a graph that would only be unpacked."""
+    return described(submap, freespace_paths(submap, config), config)
 
 
-@dataclass(slots=True)
-class Signatures:
-    """Signatures, with those of the last submap cached: methods that share them describe a query once."""
-
-    _read: Submap | None = None
-    _found: dict[str, Signature] = field(default_factory=dict)
-
-    def of(self, submap: Submap, config: SignatureConfig) -> Signature:
-        """Return the signature that `signature.paper` gives, without a graph that would only be unpacked."""
-        if self._read is not submap:
-            self._read, self._found = submap, {}
-        key = config.model_dump_json(exclude=_OF_COMPARING)
-        if key not in self._found:
-            self._found[key] = described(submap, freespace_paths(submap, config), config)
-        return self._found[key]
-
-
-@dataclass(frozen=True, slots=True)
-class Proposed:
-    """Three signatures, compared by Eq. 6."""
-
-    config: SignatureConfig = field(default_factory=SignatureConfig)
-    signatures: Signatures = field(default_factory=Signatures)
-
-    def fit(self, submaps: Sequence[Submap]) -> _Signed:
-        """Describe every submap."""
-        signatures = [self.signatures.of(submap, self.config) for submap in submaps]
-        return _Signed(self, SignatureTable.of(signatures, [submap.center_m for submap in submaps]))
-
-
-@dataclass(frozen=True, slots=True)
-class _Signed:
-    method: Proposed
-    table: SignatureTable
-
-    def similarities(self, query: Submap) -> F64:
-        config = self.method.config
-        return similarity(distances(self.method.signatures.of(query, config), self.table, config))
+def proposed(
+    config: SignatureConfig, describe: Callable[[Submap], Signature], submaps: Sequence[Submap]
+) -> Matcher:
+    """Compare three signatures by Eq. 6. describe : with these settings."""
+    signatures = [describe(submap) for submap in submaps]
+    table = SignatureTable.of(signatures, [submap.center_m for submap in submaps])
+    return lambda query: similarity(distances(describe(query), table, config))
 
 
 CONFIG = SignatureConfig.paper().model_copy(update={"thinning": "zhang_suen"})
@@ -112,7 +91,7 @@ def submap_vector(submap: Submap) -> F64:
 
     Free space and symmetry are the paper's.
     """
-    signature = Signatures().of(submap, CONFIG)
+    signature = signature_of(submap, CONFIG)
     return np.concatenate((boundary_vector(submap), _roots(signature.freespace), signature.symmetry / 255))
 
 
@@ -150,18 +129,8 @@ UNLEARNED = {"boundary": 0.5, "near": 0.4, "radial": 0.1}
 """Weights of the method that does not learn, chosen by hand."""
 
 
-@dataclass(slots=True)
-class Vectors:
-    """`submap_vector`, with the last submap cached: methods that share it describe a query once."""
-
-    _read: Submap | None = None
-    _vector: F64 = field(default_factory=lambda: np.empty(0))
-
-    def of(self, submap: Submap) -> F64:
-        """Return the vector of a submap."""
-        if self._read is not submap:
-            self._read, self._vector = submap, submap_vector(submap)
-        return self._vector
+Describe = Callable[[Submap], F64]
+"""`submap_vector`, which methods share."""
 
 
 def differences(grid: OccupancyGrid, submaps: Sequence[Submap], seed: int) -> F64:
@@ -182,60 +151,30 @@ def metric(within: F64) -> F64:
     return np.asarray(np.linalg.cholesky(np.linalg.inv(covariance)))
 
 
-@dataclass(frozen=True, slots=True)
-class Learned:
-    """Parts of the vectors, compared by Mahalanobis's distance.
-
-    within (Q, SIZE) : `differences` of other maps.
-    """
-
-    vectors: Vectors
-    parts: tuple[str, ...]
-    within: F64
-
-    def fit(self, submaps: Sequence[Submap]) -> _Vectors:
-        """Describe every submap."""
-        columns = np.concatenate([np.arange(SIZE)[COLUMNS[part]] for part in self.parts])
-        whitening = np.zeros((SIZE, len(columns)))
-        whitening[columns] = metric(self.within[:, columns])
-        return _Vectors(self.vectors, whitening, np.array([self.vectors.of(s) for s in submaps]) @ whitening)
+def learned(describe: Describe, parts: Sequence[str], within: F64, submaps: Sequence[Submap]) -> Matcher:
+    """Compare parts of the vectors by Mahalanobis's distance. within (Q, SIZE) : `differences` of other
+    maps."""
+    columns = np.concatenate([np.arange(SIZE)[COLUMNS[part]] for part in parts])
+    whitening = np.zeros((SIZE, len(columns)))
+    whitening[columns] = metric(within[:, columns])
+    table = np.array([describe(submap) for submap in submaps]) @ whitening
+    return lambda query: np.asarray(-np.linalg.norm(table - describe(query) @ whitening, axis=1))
 
 
-@dataclass(frozen=True, slots=True)
-class _Vectors:
-    vectors: Vectors
-    whitening: F64
-    table: F64
+def unlearned(describe: Describe, weights: Mapping[str, float], submaps: Sequence[Submap]) -> Matcher:
+    """Compare parts of the vectors by the sum of their distances sqrt(1 - BC) with weights."""
+    table = np.array([describe(submap) for submap in submaps])
 
-    def similarities(self, query: Submap) -> F64:
-        return np.asarray(-np.linalg.norm(self.table - self.vectors.of(query) @ self.whitening, axis=1))
-
-
-@dataclass(frozen=True, slots=True)
-class Unlearned:
-    """Parts of the vectors, compared by the sum of their distances sqrt(1 - BC) with weights."""
-
-    vectors: Vectors
-    weights: Mapping[str, float]
-
-    def fit(self, submaps: Sequence[Submap]) -> _Parts:
-        """Describe every submap."""
-        return _Parts(self, np.array([self.vectors.of(submap) for submap in submaps]))
-
-
-@dataclass(frozen=True, slots=True)
-class _Parts:
-    method: Unlearned
-    table: F64
-
-    def similarities(self, query: Submap) -> F64:
-        apart = self.table - self.method.vectors.of(query)
+    def similarities(query: Submap) -> F64:
+        apart = table - describe(query)
         # Of roots of shares, |a - b|^2 is 2 (1 - BC).
         terms = [
             share * np.linalg.norm(apart[:, COLUMNS[part]], axis=1) / np.sqrt(2.0)
-            for part, share in self.method.weights.items()
+            for part, share in weights.items()
         ]
         return np.asarray(-np.sum(terms, axis=0))
+
+    return similarities
 
 
 METHOD_NAMES = (
@@ -280,22 +219,24 @@ def make_methods(names: Iterable[str], within: F64 | None = None) -> dict[str, M
     are extracted once. within : `learned.differences` of other maps, without which no method can be made that
     learns. Raises KeyError for a name that is not known.
     """
-    signatures, vectors = Signatures(), Vectors()
-    sift_words, surf_words = Vocabulary(sift), Vocabulary(surf)
-    letter = SignatureConfig.paper()
+    letter, default = SignatureConfig.paper(), SignatureConfig()
+    # All variants of the letter differ in comparing alone.
+    of_letter = of_last(partial(signature_of, config=letter))
+    vectors = of_last(submap_vector)
+    sift_words, surf_words = (of_last(partial(Vocabulary, feature)) for feature in (sift, surf))
     known: dict[str, Method] = {
-        "proposed": Proposed(letter, signatures),
-        "as_used_here": Proposed(),
-        "shape_context": ShapeContext(),
-        "sift_bow": Words(sift_words, tfidf=False),
-        "surf_bow": Words(surf_words, tfidf=False),
-        "sift_tfidf": Words(sift_words, tfidf=True),
-        "surf_tfidf": Words(surf_words, tfidf=True),
+        "proposed": partial(proposed, letter, of_letter),
+        "as_used_here": partial(proposed, default, partial(signature_of, config=default)),
+        "shape_context": shape_context,
+        "sift_bow": partial(words, sift_words, tfidf=False),
+        "surf_bow": partial(words, surf_words, tfidf=False),
+        "sift_tfidf": partial(words, sift_words, tfidf=True),
+        "surf_tfidf": partial(words, surf_words, tfidf=True),
         "sdf": DistanceFeatures(),
-        "unlearned": Unlearned(vectors, UNLEARNED),
+        "unlearned": partial(unlearned, vectors, UNLEARNED),
     }
     for name, changed in VARIANTS.items():
-        known[name] = Proposed(letter.model_copy(update=dict(changed)), signatures)
+        known[name] = partial(proposed, letter.model_copy(update=dict(changed)), of_letter)
     if within is not None:
-        known |= {name: Learned(vectors, parts, within) for name, parts in LEARNED.items()}
+        known |= {name: partial(learned, vectors, parts, within) for name, parts in LEARNED.items()}
     return {name: known[name] for name in names}

@@ -23,8 +23,8 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeVar
 
 import cv2
 import numpy as np
@@ -34,53 +34,58 @@ from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.libraries import compiled
 from pc2grid.model import Submap
 from pc2grid.submaps.junction_graph import thin
+from pc2grid_lab.paper.experiment import Matcher
+
+Described = TypeVar("Described")
+Given = TypeVar("Given")
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ShapeContext:
-    """Bins as in the paper; rings grow by a constant factor from `inner_m`, chosen by hand, to the radius."""
+def of_last(describe: Callable[[Given], Described]) -> Callable[[Given], Described]:
+    """Return the same function, with its last result cached: methods that share it describe a query once."""
+    last: list[Any] = [None, None]
 
-    angular_bins: int = 24
-    radial_bins: int = 12
-    inner_m: float = 0.5
+    def described(given: Given) -> Described:
+        if last[0] is not given:
+            last[:] = given, describe(given)
+        found: Described = last[1]
+        return found
 
-    def fit(self, submaps: Sequence[Submap]) -> _Shapes:
-        """Describe every submap."""
-        bins = (self.radial_bins, self.angular_bins)
-        shapes = [self.context(submap) for submap in submaps]
-        return _Shapes(self, np.stack(shapes) if shapes else np.empty((0, *bins), np.float32))
-
-    def context(self, submap: Submap) -> F32:
-        """Return the shares of the boundary pixels, (radial, angular); sum 1, or all 0 without any."""
-        edges = thin(submap.grid.occupied)
-        y, x = ((cells_of(edges) - (np.array(edges.shape) - 1) / 2) * submap.grid.resolution_m).T
-        rings = np.geomspace(self.inner_m, submap.radius_m, self.radial_bins)
-        ring = np.minimum(np.searchsorted(rings, np.hypot(x, y)), self.radial_bins - 1)
-        turn = np.arctan2(y, x) / (2 * np.pi) % 1.0
-        sector = (turn * self.angular_bins).astype(np.int64) % self.angular_bins
-        counts = np.bincount(
-            ring * self.angular_bins + sector, minlength=self.radial_bins * self.angular_bins
-        )
-        shares = counts.reshape(self.radial_bins, self.angular_bins) / max(len(x), 1)
-        return np.asarray(shares, np.float32)
+    return described
 
 
-@dataclass(frozen=True, slots=True)
-class _Shapes:
-    method: ShapeContext
-    table: F32
+ANGULAR_BINS, RADIAL_BINS = 24, 12
+"""Of the Shape Context, as in the paper."""
+_INNER_M = 0.5
+"""Its rings grow from here by a constant factor to the radius of the submap; chosen by hand."""
 
-    def similarities(self, query: Submap) -> F64:
-        shape = self.method.context(query)
-        best = np.ones(len(self.table))
-        for turn in range(shape.shape[1]):
+
+def shape_context(submaps: Sequence[Submap]) -> Matcher:
+    """Compare the Shape Contexts of submaps."""
+    table = np.array([context(submap) for submap in submaps])
+
+    def similarities(query: Submap) -> F64:
+        shape, best = context(query), np.ones(len(table))
+        for turn in range(ANGULAR_BINS):
             turned = np.roll(shape, turn, axis=1)
-            total = self.table + turned
-            terms = np.divide((self.table - turned) ** 2, total, out=np.zeros_like(total), where=total > 0)
+            total = table + turned
+            terms = np.divide((table - turned) ** 2, total, out=np.zeros_like(total), where=total > 0)
             # An empty submap shares no bin with any other: its cost is the largest, 1.
-            cost = 0.5 * terms.sum(axis=(1, 2)) if shape.any() else np.ones(len(self.table))
-            best = np.minimum(best, np.where(self.table.any(axis=(1, 2)), cost, 1.0))
+            cost = 0.5 * terms.sum(axis=(1, 2)) if shape.any() else np.ones(len(table))
+            best = np.minimum(best, np.where(table.any(axis=(1, 2)), cost, 1.0))
         return -best
+
+    return similarities
+
+
+def context(submap: Submap) -> F32:
+    """Return the shares of the boundary pixels, (radial, angular); sum 1, or all 0 without any."""
+    edges = thin(submap.grid.occupied)
+    y, x = ((cells_of(edges) - (np.array(edges.shape) - 1) / 2) * submap.grid.resolution_m).T
+    rings = np.geomspace(_INNER_M, submap.radius_m, RADIAL_BINS)
+    ring = np.minimum(np.searchsorted(rings, np.hypot(x, y)), RADIAL_BINS - 1)
+    sector = (np.arctan2(y, x) / (2 * np.pi) % 1.0 * ANGULAR_BINS).astype(np.int64) % ANGULAR_BINS
+    counts = np.bincount(ring * ANGULAR_BINS + sector, minlength=RADIAL_BINS * ANGULAR_BINS)
+    return np.asarray(counts.reshape(RADIAL_BINS, ANGULAR_BINS) / max(len(x), 1), np.float32)
 
 
 _GRID, _ORIENTATIONS = 4, 8
@@ -128,17 +133,24 @@ class DistanceFeatures:
     distance_weight: float = 0.5
     iterations: int = 400
 
-    def fit(self, submaps: Sequence[Submap]) -> _FeatureTable:
+    def __call__(self, submaps: Sequence[Submap]) -> Matcher:
         """Find and describe the keypoints of every submap."""
         features = [self.features(submap) for submap in submaps]
-        descriptors = np.concatenate([f.descriptors for f in features])
-        return _FeatureTable(
-            self,
-            np.concatenate([f.places_m for f in features]),
-            -2 * descriptors,
-            (descriptors**2).sum(axis=1),
-            np.cumsum([0, *(len(f.places_m) for f in features)]),
-        )
+        places_m, descriptors = (np.concatenate(rows) for rows in zip(*features, strict=True))
+        # |a - b|^2 without |a|^2, which is the same for every b and does not change which is the nearest.
+        minus_twice, squares = -2 * descriptors, (descriptors**2).sum(axis=1)
+        starts = np.cumsum([0, *(len(f.places_m) for f in features)])
+
+        def similarities(query: Submap) -> F64:
+            wanted = self.features(query)
+            if len(wanted.places_m) == 0 or len(places_m) == 0:
+                return np.zeros(len(features))
+            nearest = _nearest(wanted.descriptors @ minus_twice.T + squares, starts)
+            inliers = _consensus(wanted.places_m, places_m, nearest, self.apart_m, self.iterations)
+            # The larger number of keypoints, so that a submap with few is not similar to all that contain it.
+            return np.asarray(inliers / np.maximum(len(wanted.places_m), np.diff(starts)))
+
+        return similarities
 
     def features(self, submap: Submap) -> Features:
         """Return the keypoints of a submap and their descriptors; none where nothing is occupied or
@@ -183,35 +195,6 @@ def distance_function(submap: Submap, smooth_m: float) -> F32:
     return np.asarray(cv2.GaussianBlur(cells, (0, 0), smooth_m / resolution) * resolution, np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class _FeatureTable:
-    """places_m (D, 2), minus_twice (D, 129) of the descriptors b of all submaps: -2 b and |b|^2 (D,)."""
-
-    method: DistanceFeatures
-    places_m: F32
-    minus_twice: F32
-    squares: F32
-    starts: I64
-
-    def similarities(self, query: Submap) -> F64:
-        wanted = self.method.features(query)
-        n = len(self.starts) - 1
-        if len(wanted.places_m) == 0 or len(self.places_m) == 0:
-            return np.zeros(n)
-        # |a - b|^2 without |a|^2, which is the same for every b and does not change which is the nearest.
-        costs = wanted.descriptors @ self.minus_twice.T
-        costs += self.squares
-        inliers = _consensus(
-            wanted.places_m,
-            self.places_m,
-            _nearest(costs, self.starts),
-            self.method.apart_m,
-            self.method.iterations,
-        )
-        # The larger number of keypoints, so that a submap with few is not similar to all that contain it.
-        return np.asarray(inliers / np.maximum(len(wanted.places_m), np.diff(self.starts)))
-
-
 def _turns(gx: F32, gy: F32) -> F64:
     """Return the directions (H, W) of a gradient as shares of a turn, 0 .. 1."""
     return np.asarray(np.arctan2(gy.astype(np.float64), gx) / (2 * math.pi) % 1.0)
@@ -220,19 +203,26 @@ def _turns(gx: F32, gy: F32) -> F64:
 def _directions(keypoints: I64, strength: F32, turns: F64, radius: float) -> F64:
     """Return the main direction (K,), radians, of the gradient (H, W) in the `radius` (cells) of keypoints
     (K, 2)."""
-    bins, reach = _DIRECTIONS, int(radius)
+    reach = int(radius)
     offsets = np.mgrid[-reach : reach + 1, -reach : reach + 1].reshape(2, -1).T
     squared = (offsets**2).sum(axis=1)
     near = squared <= radius * radius
     falloff = np.exp(-2.0 * squared[near] / (radius * radius))
-    rings = ring_votes(keypoints, offsets[near], falloff, strength, turns, bins)
+    rows, columns = (keypoints[:, None] + offsets[near]).transpose(2, 0, 1)
+    rows, columns, inside = _inside(rows, columns, strength.shape)
+    weights, turn = strength[rows, columns] * falloff * inside, turns[rows, columns] * _DIRECTIONS
+    low = np.floor(turn).astype(np.int64)
+    owner, votes = np.arange(len(keypoints))[:, None] * _DIRECTIONS, np.zeros(len(keypoints) * _DIRECTIONS)
+    for at, share in ((low, 1 - (turn - low)), (low + 1, turn - low)):
+        votes += np.bincount((owner + at % _DIRECTIONS).ravel(), (weights * share).ravel(), len(votes))
+    rings = votes.reshape(-1, _DIRECTIONS)
     smooth = np.roll(rings, 1, axis=1) + 2 * rings + np.roll(rings, -1, axis=1)
     peak = smooth.argmax(axis=1)
-    before, at_peak, after = (smooth[np.arange(len(smooth)), (peak + k) % bins] for k in (-1, 0, 1))
+    before, at_peak, after = (smooth[np.arange(len(smooth)), (peak + k) % _DIRECTIONS] for k in (-1, 0, 1))
     # The vertex of the parabola through the highest vote and its neighbours.
     bend = before - 2 * at_peak + after
     shift = np.divide(0.5 * (before - after), bend, out=np.zeros_like(bend), where=bend < 0)
-    return np.asarray((peak + shift) * (2 * math.pi / bins))
+    return np.asarray((peak + shift) * (2 * math.pi / _DIRECTIONS))
 
 
 def _samples(
@@ -247,6 +237,11 @@ def _samples(
     c, s = np.cos(directions)[:, None], np.sin(directions)[:, None]
     rows = np.floor(keypoints[:, :1] + (s * u + c * v) * step + 0.5).astype(np.int64)
     columns = np.floor(keypoints[:, 1:] + (c * u - s * v) * step + 0.5).astype(np.int64)
+    return _inside(rows, columns, shape)
+
+
+def _inside(rows: I64, columns: I64, shape: tuple[int, ...]) -> tuple[I64, I64, BoolGrid]:
+    """Return cells, and whether they lie inside an image of a shape; those outside are moved to (0, 0)."""
     inside = (rows >= 0) & (columns >= 0) & (rows < shape[0]) & (columns < shape[1])
     return np.where(inside, rows, 0), np.where(inside, columns, 0), inside
 
@@ -268,12 +263,16 @@ def _orientation_shares(
     """
     steps = np.arange(-half, half + 1)
     centers = (steps / (2 * half + 1) + 0.5) * _GRID - 0.5
-    shares = np.maximum(0.0, 1.0 - np.abs(centers[:, None] - np.arange(_GRID)))
-    fields = np.kron(shares, shares)  # (S, 16): how much each sample counts in each field
+    near = np.maximum(0.0, 1.0 - np.abs(centers[:, None] - np.arange(_GRID)))
+    fields = np.kron(near, near)  # (S, 16): how much each sample counts in each field
     falloff = np.exp(-0.5 * (steps[:, None] ** 2 + steps**2).ravel() / (half * half))
-    own = directions / (2 * math.pi)
-    parts = direction_shares(*samples, own, falloff, strength, turns, _ORIENTATIONS)
-    found = np.stack([part @ fields for part in parts], axis=-1)
+    rows, columns, inside = samples
+    weights = strength[rows, columns] * falloff * inside
+    turn = (turns[rows, columns] - directions[:, None] / (2 * math.pi)) % 1.0 * _ORIENTATIONS
+    low, shares = turn.astype(np.int64), np.zeros((_ORIENTATIONS, *rows.shape))
+    for at, share in ((low, 1 - (turn - low)), (low + 1, turn - low)):
+        np.put_along_axis(shares, (at % _ORIENTATIONS)[None], (weights * share)[None], axis=0)
+    found = np.stack([part @ fields for part in shares], axis=-1)
     histograms = found.reshape(len(directions), _GRID * _GRID * _ORIENTATIONS)
     lengths = np.linalg.norm(histograms, axis=1, keepdims=True)
     return np.asarray(histograms / np.where(lengths > 0, lengths, 1.0))
@@ -331,9 +330,7 @@ def submap_image(submap: Submap) -> NDArray[np.uint8]:
     The image is blurred by one cell. Without the blur both features respond to the steps in slanted lines
     of one cell, and recognise a third less.
     """
-    image = np.full(submap.grid.cells.shape, 127, np.uint8)
-    image[submap.grid.free] = 255
-    image[submap.grid.occupied] = 0
+    image = np.select([submap.grid.free, submap.grid.occupied], [255, 0], 127).astype(np.uint8)
     return np.asarray(cv2.GaussianBlur(image, (0, 0), 1.0))
 
 
@@ -354,85 +351,52 @@ def surf(image: NDArray[np.uint8]) -> F32:
     return describe_points(image, interest_points(image, MAX_FEATURES))
 
 
-@dataclass(slots=True)
 class Vocabulary:
-    """1024 words for one kind of feature, learned by k-means.
+    """1024 words for one kind of feature, learned by k-means from the features of N submaps.
 
-    The last map and the last submap are cached, so that methods which share a vocabulary extract features
-    once.
+    counts : of each word in each submap (N, words). read : returns the counts of each word in a submap.
     """
 
-    feature: Feature
-    seed: int = 0
-    words: F32 = field(default_factory=lambda: np.empty((0, 0), np.float32))
-    counts: F64 = field(default_factory=lambda: np.empty((0, 0)))
-    _learned: Sequence[Submap] | None = None
-    _read: Submap | None = None
-    _count: F64 = field(default_factory=lambda: np.empty(0))
-
-    def learn(self, submaps: Sequence[Submap]) -> F64:
-        """Learn the words from the features of N submaps; counts of each word in each submap (N, words)."""
+    def __init__(self, feature: Feature, submaps: Sequence[Submap]) -> None:
         from sklearn.cluster import KMeans
 
-        if self._learned is submaps:
-            return self.counts
-        features = [self.feature(submap_image(submap)) for submap in submaps]
+        features = [feature(submap_image(submap)) for submap in submaps]
         everything = np.concatenate(features)
-        size = min(WORDS, len(np.unique(everything, axis=0)))
-        if size:
+        self._words = np.empty((0, everything.shape[1]), np.float32)
+        if size := min(WORDS, len(np.unique(everything, axis=0))):
             # Ten iterations: the words need to be spread over the features, not to have converged.
-            means = KMeans(size, init="random", n_init=1, max_iter=10, random_state=self.seed)
-            self.words = means.fit(everything).cluster_centers_.astype(np.float32)
-        else:
-            self.words = np.empty((0, everything.shape[1]), np.float32)
+            means = KMeans(size, init="random", n_init=1, max_iter=10, random_state=0)
+            self._words = means.fit(everything).cluster_centers_.astype(np.float32)
         self.counts = np.array([self._word_counts(descriptors) for descriptors in features])
-        self._learned, self._read = submaps, None
-        return self.counts
-
-    def read(self, submap: Submap) -> F64:
-        """Return the counts of each word in a submap, (words,)."""
-        if self._read is not submap:
-            self._count = self._word_counts(self.feature(submap_image(submap)))
-            self._read = submap
-        return self._count
+        self.read: Callable[[Submap], F64] = of_last(
+            lambda submap: self._word_counts(feature(submap_image(submap)))
+        )
 
     def _word_counts(self, descriptors: F32) -> F64:
-        if len(self.words) == 0 or len(descriptors) == 0:
-            return np.zeros(len(self.words))
+        if len(self._words) == 0 or len(descriptors) == 0:
+            return np.zeros(len(self._words))
         # |a - b|^2 without |a|^2, which is the same for all words b.
-        nearest = np.argmin((self.words**2).sum(axis=1) - 2 * descriptors @ self.words.T, axis=1)
-        return np.bincount(nearest, minlength=len(self.words)).astype(np.float64)
+        nearest = np.argmin((self._words**2).sum(axis=1) - 2 * descriptors @ self._words.T, axis=1)
+        return np.bincount(nearest, minlength=len(self._words)).astype(np.float64)
 
 
-@dataclass(frozen=True, slots=True)
-class Words:
-    """Submaps compared by the cosine between their word counts.
+def words(
+    learn: Callable[[Sequence[Submap]], Vocabulary], submaps: Sequence[Submap], *, tfidf: bool
+) -> Matcher:
+    """Compare submaps by the cosine between their word counts.
 
-    tfidf : weight a word by its inverse document frequency, which is larger the fewer submaps contain it.
+    learn : makes the vocabulary of a map. tfidf : weight a word by its inverse document frequency, which is
+    larger the fewer submaps contain it.
     """
+    from sklearn.feature_extraction.text import TfidfTransformer
 
-    vocabulary: Vocabulary
-    tfidf: bool
-
-    def fit(self, submaps: Sequence[Submap]) -> _Counts:
-        """Learn the words and their weights from the submaps of a map."""
-        from sklearn.feature_extraction.text import TfidfTransformer
-
-        counts = self.vocabulary.learn(submaps)
-        weights = np.ones(counts.shape[1])
-        if self.tfidf and counts.size:
-            weights = TfidfTransformer(norm=None).fit(counts).idf_
-        return _Counts(self.vocabulary, weights, _unit(counts * weights))
-
-
-@dataclass(frozen=True, slots=True)
-class _Counts:
-    vocabulary: Vocabulary
-    weights: F64
-    table: F64
-
-    def similarities(self, query: Submap) -> F64:
-        return np.asarray(self.table @ _unit(self.vocabulary.read(query) * self.weights))
+    vocabulary = learn(submaps)
+    counts = vocabulary.counts
+    weights = np.ones(counts.shape[1])
+    if tfidf and counts.size:
+        weights = TfidfTransformer(norm=None).fit(counts).idf_
+    table = _unit(counts * weights)
+    return lambda query: np.asarray(table @ _unit(vocabulary.read(query) * weights))
 
 
 def _unit(rows: F64) -> F64:
@@ -488,73 +452,13 @@ def orientations(integral: F64, points: F64) -> F64:
     dx, dy = haar(integral, y + i * scale, x + j * scale, half)
     weights = np.exp(-(i**2 + j**2) / (2 * 2.5 * 2.5))
     dx, dy = weights * dx, weights * dy
-    sums = sector_sums(np.arctan2(dy, dx), dx, dy, _DIRECTIONS)
+    sums = sector_sums(np.arctan2(dy, dx), dx, dy)
     best = (sums**2).sum(axis=1).argmax(axis=0)
     sum_x, sum_y = sums[best, :, np.arange(len(points))].T
     return np.asarray(np.arctan2(sum_y, sum_x))
 
 
 C64 = NDArray[np.complex64]
-
-
-@compiled()
-def ring_votes(keypoints: I64, offsets: I64, falloff: F64, strength: F32, turns: F64, bins: int) -> F64:
-    """Return the votes (K, bins) of the gradient around keypoints (K, 2) on its direction, shared by two
-    bins.
-
-    offsets (S, 2), falloff (S,) : the cells around a keypoint, and their weights. strength, turns (H, W).
-    """
-    height, width = strength.shape
-    lower, upper = np.zeros((len(keypoints), bins)), np.zeros((len(keypoints), bins))
-    for k in range(len(keypoints)):
-        for s in range(len(offsets)):
-            row, column = keypoints[k, 0] + offsets[s, 0], keypoints[k, 1] + offsets[s, 1]
-            if 0 <= row < height and 0 <= column < width:
-                weight = strength[row, column] * falloff[s]
-                turn = turns[row, column] * bins
-                low = math.floor(turn)
-                lower[k, low % bins] += weight * (1 - (turn - low))
-                upper[k, (low + 1) % bins] += weight * (turn - low)
-    return lower + upper
-
-
-@compiled()
-def _remainder(value: float, size: float) -> float:
-    """Return value % size as numpy has it, for a size that is a power of two."""
-    while value >= size:
-        value -= size
-    while value <= -size:
-        value += size
-    return value + size if value < 0 else value
-
-
-@compiled()
-def direction_shares(
-    rows: I64,
-    columns: I64,
-    inside: BoolGrid,
-    own: F64,
-    falloff: F64,
-    strength: F32,
-    turns: F64,
-    bins: int,
-) -> F64:
-    """Return what the samples (K, S) of K keypoints add to each of the directions, a power of two: (bins, K,
-    S).
-
-    own (K,) : directions of the keypoints, as shares of a turn, from which those of the samples are counted.
-    """
-    out = np.zeros((bins, *rows.shape))
-    for k in range(rows.shape[0]):
-        for s in range(rows.shape[1]):
-            if inside[k, s]:
-                row, column = rows[k, s], columns[k, s]
-                weight = strength[row, column] * falloff[s]
-                turn = _remainder(turns[row, column] - own[k], 1.0) * bins
-                for at in (int(turn) % bins, (int(turn) + 1) % bins):
-                    apart = abs(_remainder(turn - at + bins / 2, bins) - bins / 2)
-                    out[at, k, s] = weight * max(0.0, 1.0 - apart)
-    return out
 
 
 @compiled()
@@ -580,7 +484,6 @@ def most_agreeing(
         counts[s] = max(counts[s], count)
 
 
-@compiled()
 def haar(integral: F64, y: F64, x: F64, half: I64) -> tuple[F64, F64]:
     """Return Haar wavelets in x and y at places y, x (M, K), 2 * half (M or 1, K or 1) pixels wide: (M, K)
     each.
@@ -588,36 +491,23 @@ def haar(integral: F64, y: F64, x: F64, half: I64) -> tuple[F64, F64]:
     They are 0 where the wavelet would leave the image.
     """
     height, width = integral.shape
-    across, down = np.zeros(y.shape), np.zeros(y.shape)
-    for m in range(y.shape[0]):
-        for k in range(y.shape[1]):
-            h = half[m if half.shape[0] > 1 else 0, k if half.shape[1] > 1 else 0]
-            row, column = math.floor(y[m, k] + 0.5), math.floor(x[m, k] + 0.5)
-            if row >= h and column >= h and row + h < height and column + h < width:
-                # Integral image at the corners of the four quarters of the wavelet.
-                top, middle, bottom = integral[row - h], integral[row], integral[row + h]
-                west, east = column - h, column + h
-                left = bottom[column] - top[column] - bottom[west] + top[west]
-                right = bottom[east] - top[east] - bottom[column] + top[column]
-                upper = middle[east] - top[east] - middle[west] + top[west]
-                lower = bottom[east] - middle[east] - bottom[west] + middle[west]
-                across[m, k], down[m, k] = right - left, lower - upper
-    return across, down
+    rows, columns = np.floor(y + 0.5).astype(np.int64), np.floor(x + 0.5).astype(np.int64)
+    inside = (rows >= half) & (columns >= half) & (rows + half < height) & (columns + half < width)
+    # The integral image at the corners of the four quarters of the wavelet.
+    row, column = ([np.where(inside, at + k * half, 0) for k in (-1, 0, 1)] for at in (rows, columns))
+    top, middle, bottom = ([integral[row[i], column[j]] for j in range(3)] for i in range(3))
+    left = bottom[1] - top[1] - bottom[0] + top[0]
+    right = bottom[2] - top[2] - bottom[1] + top[1]
+    upper = middle[2] - top[2] - middle[0] + top[0]
+    lower = bottom[2] - middle[2] - bottom[0] + middle[0]
+    return right - left, lower - upper
 
 
-@compiled()
-def sector_sums(angles: F64, dx: F64, dy: F64, sectors: int) -> F64:
+def sector_sums(angles: F64, dx: F64, dy: F64) -> F64:
     """Return the sums (sectors, 2, K) of wavelets (M, K) whose angles lie in each sector of 60 degrees."""
-    sums = np.zeros((sectors, 2, angles.shape[1]))
-    step = math.pi / (sectors / 2)
-    for m in range(angles.shape[0]):
-        for k in range(angles.shape[1]):
-            # The sectors that begin less than 60 degrees before; with one more on either side, for rounding.
-            last = math.floor((angles[m, k] + math.pi) / step)
-            for back in range(-1, sectors // 6 + 2):
-                sector = (last - back) % sectors
-                ahead = angles[m, k] - (sector * math.pi / (sectors / 2) - math.pi)
-                if 0 <= ahead < math.pi / 3 or ahead + 2 * math.pi < math.pi / 3:
-                    sums[sector, 0, k] += dx[m, k]
-                    sums[sector, 1, k] += dy[m, k]
+    sums = np.empty((_DIRECTIONS, 2, angles.shape[1]))
+    for k in range(_DIRECTIONS):
+        ahead = angles - (k * math.pi / (_DIRECTIONS / 2) - math.pi)
+        inside = ((ahead >= 0) & (ahead < math.pi / 3)) | (ahead + 2 * math.pi < math.pi / 3)
+        sums[k] = (dx * inside).sum(axis=0), (dy * inside).sum(axis=0)
     return sums
