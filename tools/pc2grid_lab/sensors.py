@@ -39,7 +39,7 @@ from pc2grid_lab.commands import CompareSensors
 from pc2grid_lab.pages import Cell, print_cells
 from pc2grid_lab.recordings.table import Counts, QueryRow
 from pc2grid_lab.runner import in_processes, once, write_text
-from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, fit_frame, is_right
+from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, apart, fit_frame, is_right
 from signature.config import Config
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
@@ -142,26 +142,22 @@ def register(
             truths.append((truth.x, truth.y, truth.yaw) if truth else (math.nan,) * 3)
             yield scan
 
-    planar_scans: list[PlanarScan] = []
-    poses: list[tuple[float, float, float]] = []
-    lost: list[bool] = []
+    found: list[tuple[PlanarScan, SE2, bool]] = []
     travel_m = 0.0
     for registered, planar_scan in follow(without_truth(), config):
         pose = SE2.from_matrix(registered.T_session_base)
-        if poses:
-            travel_m += math.hypot(pose.x - poses[-1][0], pose.y - poses[-1][1])
+        if found:
+            travel_m += apart(found[-1][1], pose)[0]
         see(registered)
-        planar_scans.append(planar_scan)
-        poses.append((pose.x, pose.y, pose.yaw))
-        lost.append(registered.health is Health.LOST)
+        found.append((planar_scan, pose, registered.health is Health.LOST))
         if travel_m >= until_m:
             break
     return RegisteredSession(
         sensor=sensor,
-        planar_scans=tuple(planar_scans),
-        T_odom_base=np.array(poses, np.float64).reshape(-1, 3),
-        lost=np.array(lost, bool),
-        T_world_base=np.array(truths[: len(poses)], np.float64).reshape(-1, 3),
+        planar_scans=tuple(planar_scan for planar_scan, _, _ in found),
+        T_odom_base=np.array([(pose.x, pose.y, pose.yaw) for _, pose, _ in found]).reshape(-1, 3),
+        lost=np.array([lost for _, _, lost in found], bool),
+        T_world_base=np.array(truths[: len(found)], np.float64).reshape(-1, 3),
     )
 
 
@@ -181,31 +177,33 @@ PlanMap = tuple[OccupancyGrid, SE2]
 class PlanDrives:
     """Maps and drives in floor plans that are made unless they exist.
 
-    setting : what their files are named after: map_length (metres driven to make a map), clutter, rate (scans
-        a second), travel (metres that a query is registered at most).
+    map_length : metres driven to make a map. rate : scans a second. travel : metres that a query is
+        registered at most.
     """
 
     out: Path
-    setting: tuple[tuple[str, float], ...]
+    clutter: int
+    map_length: float
+    rate: float
+    travel: float
 
     def file(self, kind: str, *names: object) -> Path:
         """Return a file of the folder `kind`, named after its building, sensor and so on, and the setting."""
-        tag = (f"{key}{value:g}" for key, value in sorted(self.setting))
+        tag = (f"{key}{getattr(self, key):g}" for key in ("clutter", "map_length", "rate", "travel"))
         return self.out / kind / ".".join([*map(str, names), *tag, "pickle"])
 
     def simulation(
         self, length_m: float, seed: int, start_m: tuple[float, float] | None = None
     ) -> SimulationConfig:
         """Return the configuration of one drive."""
-        setting = dict(self.setting)
-        rates = {sensor: {"rate_hz": setting["rate"]} for sensor in SENSORS}
-        one = {"length_m": length_m, "seed": seed, "clutter": int(setting["clutter"]), "start_m": start_m}
+        rates = {sensor: {"rate_hz": self.rate} for sensor in SENSORS}
+        one = {"length_m": length_m, "seed": seed, "clutter": self.clutter, "start_m": start_m}
         return SimulationConfig.model_validate({**one, **rates})
 
     @property
     def mapping(self) -> SimulationConfig:
         """Return the configuration of the drive that makes a map."""
-        return self.simulation(dict(self.setting)["map_length"], MAP_SEED)
+        return self.simulation(self.map_length, MAP_SEED)
 
     def map(self, plan: Path, sensor: SensorKind) -> PlanMap:
         """Return the map of a plan by one sensor."""
@@ -217,11 +215,11 @@ class PlanDrives:
         from where the mapping robot has never been has no right answer."""
 
         def registered() -> RegisteredSession:
-            grid, travel_m = load_map(plan), dict(self.setting)["travel"]
+            grid = load_map(plan)
             way = prepare_session(sensor="laser", grid=grid, config=self.mapping).drive
-            config = self.simulation(travel_m + 3.0, seed, start_on(way, seed))
+            config = self.simulation(self.travel + 3.0, seed, start_on(way, seed))
             scans = prepare_session(sensor=sensor, grid=grid, config=config).scans()
-            return register(scans, Config(), sensor=sensor, until_m=travel_m)
+            return register(scans, Config(), sensor=sensor, until_m=self.travel)
 
         return once(self.file("drives", plan.stem, sensor, seed), registered)
 
@@ -308,14 +306,6 @@ def located_rows(
             continue
         answer, query = localizer.answer(), localizer.query.map()
         seconds = time.perf_counter() - begin
-        row = QueryRow(
-            window=count,
-            start_s=0.0,
-            status=answer.status,
-            confidence=answer.confidence,
-            travel_m=due[count],
-            cpu_s=seconds,
-        )
         T_map_base = T_plan_map.inverse() @ SE2(*session.T_world_base[count - 1].tolist())
         T_map_query = T_map_base @ answer.T_odom_base.inverse()
         right, error_m = False, None
@@ -323,8 +313,13 @@ def located_rows(
             pose = answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
             right, error_m = is_right(pose, T_map_base, JUDGEMENT.right_m)
         mapped = own and score_fit(index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
-        yield replace(
-            row,
+        yield QueryRow(
+            window=count,
+            start_s=0.0,
+            status=answer.status,
+            confidence=answer.confidence,
+            travel_m=due[count],
+            cpu_s=seconds,
             covered=mapped >= JUDGEMENT.mapped,
             right=own and right,
             error_m=error_m,
@@ -379,7 +374,7 @@ def compare_sensors(given: CompareSensors, terminal: Console) -> None:
     if len(set(names)) != len(names):
         raise ConfigError(f"two plans share a name: {', '.join(names)}", hint="rename one of the files")
     make_folder(out)
-    drives = PlanDrives(out=out, setting=tuple(setting.items()))
+    drives = PlanDrives(out=out, **setting)
     with terminal.progress("map") as advance:
         mapped = [(drives, *one) for one in product(plans, SENSORS)]
         in_processes(PlanDrives.map, mapped, jobs=given.jobs, advance=advance)

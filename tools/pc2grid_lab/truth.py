@@ -296,7 +296,8 @@ class Frame:
         away_m = np.array([_apart_m(clue.T_drive_base, T_drive_base) for clue in clues])
         order = np.argsort(away_m, kind="stable")
         near = max(int(np.sum(away_m <= AGREEMENT.around_m)), min(2, len(clues)))
-        T_map_drive = _fit([clues[k] for k in order[:near]])
+        pairs = [(clues[k].T_drive_base, clues[k].T_map_base) for k in order[:near]]
+        T_map_drive = fit_frame(pairs, AGREEMENT.lever_m)
         within_m = self.within_m + AGREEMENT.bend * float(away_m[order[0]])
         return T_map_drive @ T_drive_base, within_m
 
@@ -353,11 +354,6 @@ def _places(clues: Sequence[Clue]) -> int:
         if all(_apart_m(clue.T_drive_base, other) >= AGREEMENT.place_m for other in kept):
             kept.append(clue.T_drive_base)
     return len(kept)
-
-
-def _fit(clues: Sequence[Clue]) -> SE2:
-    """Return the transform nearest to the clues, least squares."""
-    return fit_frame([(clue.T_drive_base, clue.T_map_base) for clue in clues], AGREEMENT.lever_m)
 
 
 def _apart_m(a: SE2, b: SE2) -> float:
@@ -477,5 +473,5 @@ def _lifted(pose: SE2, floors_m: list[float]) -> F64:
 
 
 def _same(a: SE2, b: SE2, p: RegisteredCloudsParameters) -> bool:
-    between = a.inverse() @ b
-    return math.hypot(between.x, between.y) < p.step_m and abs(between.yaw) < p.step_rad
+    apart_m, apart_rad = apart(a, b)
+    return apart_m < p.step_m and apart_rad < p.step_rad

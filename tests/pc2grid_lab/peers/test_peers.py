@@ -18,7 +18,6 @@ from pc2grid.model import Scan
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from pc2grid_lab.peers import programs
-from pc2grid_lab.peers.locators import carmen_log
 from pc2grid_lab.peers.programs import (
     PEERS,
     PINS,
@@ -29,6 +28,7 @@ from pc2grid_lab.peers.programs import (
     _tasks,
     answers,
     best_threshold,
+    carmen_log,
     how_to_install,
     save_beams,
 )
