@@ -8,7 +8,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,7 @@ from pc2grid.io import export, topics
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.messages.decoders import decoder_for
-from pc2grid.io.messages.types import Odometry, PoseStamped, Seven, valid_pose
+from pc2grid.io.messages.types import Odometry, PoseStamped, valid_pose
 from pc2grid.io.robots import Namespaces
 from pc2grid.io.source import MessageSource, RawMessage, TopicInfo
 from pc2grid.io.topics import tolerant
@@ -45,74 +45,77 @@ def last_map_pose(source: MessageSource, topic: str, base_frame: str, end_ns: in
 
     Raises TopicError, UnsupportedSchema, FrameError, or NoScans if there is no pose.
     """
-    poses = map_poses(source.info.topics, topic, base_frame)
-    for message in source.messages(poses.topics, None, end_ns):
-        poses.take(message)
-    return poses.newest(end_ns)
-
-
-def map_poses(known: Sequence[TopicInfo], topic: str, base_frame: str) -> _TopicPoses | _TfPoses:
-    """Return a follower of the poses on a topic of a pose, an odometry or tf among the known ones.
-
-    Raises TopicError, UnsupportedSchema.
-    """
-    channel = _channel(known, topic)
-    return _TfPoses(known, channel, base_frame) if channel.type in topics.TF else _TopicPoses(channel)
+    believed = BelievedPose(topic)
+    believed.find(source.info.topics, base_frame)
+    for message in source.messages(believed.topics, None, end_ns):
+        believed.keep(message)
+    return believed.at(end_ns)
 
 
 class BelievedPose:
-    """The newest pose on a topic as messages come.
+    """The newest pose on a topic of a pose, an odometry or tf, as messages come.
 
     newest : None before the first. problem : why the last message gave none, such as tf that lacks the map.
     topics : whose messages are used; empty until `find` has found the topic.
+
+    In tf it is map -> base at the newest time at which all transforms between them are known. The transform
+    map -> odom is published ahead of time or rarely, so each one is valid until the next.
     """
 
     def __init__(self, topic: str) -> None:
         self.newest: MapPose | None = None
         self.problem: FrameError | None = None
-        self.topics: frozenset[str] = frozenset()
-        self._topic = topic
-        self._poses: _TopicPoses | _TfPoses | None = None
+        self._topic, self._base_frame, self._is_tf = topic, "", False
+        self._decoders: dict[tuple[str, str], Callable[[Any], Any]] = {}
+        self._last: tuple[Odometry | PoseStamped, int] | None = None
+        self._tree = FrameTree()
+        self._newest_ns: dict[str, int] = {}
+
+    @property
+    def topics(self) -> frozenset[str]:
+        """See above."""
+        return frozenset(topic for topic, _ in self._decoders)
 
     def find(self, known: Sequence[TopicInfo], base_frame: str) -> None:
         """Look for the topic. Raises TopicError, UnsupportedSchema."""
-        self._poses = map_poses(known, self._topic, base_frame)
-        self.topics = self._poses.topics
+        channel, self._base_frame = _channel(known, self._topic), base_frame
+        self._is_tf = channel.type in topics.TF
+        channels = Namespaces(channel, known).tf_topics() if self._is_tf else [channel]
+        self._decoders = {(t.topic, t.type): decoder_for(t) for t in channels}
 
     def take(self, message: RawMessage) -> None:
         """Update with a message; those of other topics are ignored."""
-        if self._poses is None or message.channel.topic not in self.topics:
+        if not self.keep(message):
             return
-        self._poses.take(message)
         self.problem = None
         try:
-            self.newest = self._poses.newest(message.log_time_ns)
+            self.newest = self.at(message.log_time_ns)
         except NoScans:
             return
         except FrameError as error:
             self.problem = error
 
-
-class _TopicPoses:
-    """The poses of one topic. topics : whose messages are used."""
-
-    def __init__(self, channel: TopicInfo) -> None:
-        self._topic, self._type = channel.topic, channel.type
-        self._decode = decoder_for(channel)
-        self.topics = frozenset({channel.topic})
-        self._last: tuple[Odometry | PoseStamped, int] | None = None
-
-    def take(self, message: RawMessage) -> None:
-        """Update with a message; those of other topics are ignored."""
-        if (message.channel.topic, message.channel.type) != (self._topic, self._type):
-            return
-        found = tolerant(self._decode, message.data, None)
-        if found is not None and valid_pose(found.pose):
+    def keep(self, message: RawMessage) -> bool:
+        """Keep what a message says, and return whether it is of the topic."""
+        decode = self._decoders.get((message.channel.topic, message.channel.type))
+        if decode is None:
+            return False
+        found, static = tolerant(decode, message.data), topics.is_static(message.channel)
+        for edge in (found or ()) if self._is_tf else ():
+            self._tree.add(replace(edge, lasting=True), static=static, log_time_ns=message.log_time_ns)
+            if not static:
+                self._newest_ns[edge.child] = edge.header.stamp_ns or message.log_time_ns
+        if not self._is_tf and found is not None and valid_pose(found.pose):
             self._last = found, message.log_time_ns
+        return True
 
-    def newest(self, now_ns: int) -> MapPose:
-        """Return the newest pose. now_ns : see `_TfPoses`. Raises FrameError, or NoScans if there is none
-        yet."""
+    def at(self, now_ns: int) -> MapPose:
+        """Return the newest pose. now_ns : its time if all transforms are static.
+
+        Raises FrameError, or NoScans if there is none yet.
+        """
+        if self._is_tf:
+            return self._in_tf(now_ns)
         if self._last is None:
             raise NoScans(f"{self._topic}: no pose in the part asked for")
         found, log_time_ns = self._last
@@ -121,44 +124,14 @@ class _TopicPoses:
                 f"{self._topic}: its poses are in frame {found.header.frame}, not in a map",
                 hint="name a topic of localization, such as /amcl_pose or /tf",
             )
+        values = found.covariance if isinstance(found, PoseStamped) else None
         return MapPose(
             stamp_ns=found.header.stamp_ns or log_time_ns,
-            T_map_base=_planar(found.pose),
-            covariance=_covariance(found),
+            T_map_base=SE2.from_matrix(pose_from_xyz_quat(found.pose[:3], found.pose[3:])),
+            covariance=None if values is None else np.reshape(values, (6, 6))[_PLANAR],
         )
 
-
-class _TfPoses:
-    """The pose map -> base at the newest time at which all transforms between them are known.
-
-    topics : whose messages are used.
-
-    The transform map -> odom is published ahead of time or rarely, so each one is valid until the next.
-    """
-
-    def __init__(self, known: Sequence[TopicInfo], channel: TopicInfo, base_frame: str) -> None:
-        self._decoders = {(t.topic, t.type): decoder_for(t) for t in Namespaces(channel, known).tf_topics()}
-        self._base_frame = base_frame
-        self._tree = FrameTree()
-        self._newest_ns: dict[str, int] = {}
-        self.topics = frozenset(topic for topic, _ in self._decoders)
-
-    def take(self, message: RawMessage) -> None:
-        """Update with a message; those of other topics are ignored."""
-        decode = self._decoders.get((message.channel.topic, message.channel.type))
-        if decode is None:
-            return
-        static = topics.is_static(message.channel)
-        for edge in tolerant(decode, message.data, ()):
-            self._tree.add(replace(edge, lasting=True), static=static, log_time_ns=message.log_time_ns)
-            if not static:
-                self._newest_ns[edge.child] = edge.header.stamp_ns or message.log_time_ns
-
-    def newest(self, now_ns: int) -> MapPose:
-        """Return the newest pose. now_ns : its time if all transforms are static.
-
-        Raises FrameError, or NoScans if there is none yet.
-        """
+    def _in_tf(self, now_ns: int) -> MapPose:
         tree, base_frame = self._tree, self._base_frame
         above = tree.chain(base_frame) if base_frame in tree else [base_frame]
         map_frame = next((frame for frame in above[1:] if _is_map(frame)), None)
@@ -192,15 +165,6 @@ def _is_map(frame: str) -> bool:
     """Return True if a frame is a map by its name (REP-105), also of one robot of several."""
     name = frame.rsplit("/", 1)[-1]
     return name == "map" or name.endswith("_map")
-
-
-def _planar(pose: Seven) -> SE2:
-    return SE2.from_matrix(pose_from_xyz_quat(pose[:3], pose[3:]))
-
-
-def _covariance(found: Odometry | PoseStamped) -> F64 | None:
-    values = found.covariance if isinstance(found, PoseStamped) else None
-    return None if values is None else np.asarray(np.reshape(values, (6, 6))[_PLANAR], np.float64)
 
 
 _MOST_BYTES = 1 << 20

@@ -179,13 +179,16 @@ class Tally:
 class MessageSource(Protocol):
     """A source of timed messages.
 
-    info : known as soon as the source is open. tally : counts while it is read.
-    files : those that the messages come from.
+    tally : counts while it is read. files : those that the messages come from.
     """
 
-    info: LogInfo
     tally: Tally
     files: tuple[Path, ...]
+
+    @property
+    def info(self) -> LogInfo:
+        """Return the facts about them, which are known as soon as the source is open."""
+        ...
 
     def messages(
         self, topics: Collection[str], start_ns: int | None = None, end_ns: int | None = None

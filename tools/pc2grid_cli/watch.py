@@ -22,8 +22,7 @@ from pc2grid import libraries
 from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, TrackingLost, one_line
 from pc2grid.geometry import SE2
-from pc2grid.io.live.feed import FeedCounts, News
-from pc2grid.io.live.live_log import LiveLog, is_robot, open_live
+from pc2grid.io.live.live_log import FeedCounts, LiveLog, News, is_robot, open_live
 from pc2grid.io.live.nav2 import Nav2Publisher, Outlet
 from pc2grid.io.map_pose import BelievedPose, MapPose
 from pc2grid.io.recording import Log, open_log

@@ -10,8 +10,7 @@ from collections.abc import Collection, Sequence
 import pytest
 
 from pc2grid.errors import NoScans
-from pc2grid.io.live.feed import Arrived, FeedCounts, Inbox, InboxParameters, News
-from pc2grid.io.live.live_log import LiveLog
+from pc2grid.io.live.live_log import Arrived, FeedCounts, Inbox, InboxParameters, LiveLog, News
 from pc2grid.io.source import RawMessage, TopicInfo
 from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import T0, Message, laser_drive, ros
