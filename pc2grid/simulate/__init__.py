@@ -10,7 +10,6 @@ from pc2grid.simulate.scene import Building, load_building
 from pc2grid.simulate.session import (
     Session,
     SimulatedSession,
-    iter_session,
     prepare_session,
     simulate_session,
 )
@@ -20,7 +19,6 @@ __all__ = [
     "Session",
     "SimulatedSession",
     "SimulationConfig",
-    "iter_session",
     "load_building",
     "office_floorplan",
     "prepare_session",

@@ -12,6 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -166,22 +167,17 @@ class Building:
     T_map_file: F64
 
     @staticmethod
-    def of_cloud(points_m: NDArray[np.floating]) -> Building:
-        """Make a building of a cloud (N, 3) whose z axis points up. Raises MapFileError if it shows no
-        floor."""
-        points = np.asarray(points_m, np.float64)
-        T_map_cloud = level_cloud(points)
-        # The voxels follow the axes of the cloud, in which they may have been a lattice before.
-        shell = _moved(voxel_faces(points, voxel_m(points)), T_map_cloud)
-        return Building(drivable_plan(transform_points(T_map_cloud, points)), shell, T_map_cloud)
+    def of(points_m: NDArray[np.floating], mesh: Mesh | None = None) -> Building:
+        """Make a building of points (N, 3) whose z axis points up, and of the mesh that they lie on, if any.
 
-    @staticmethod
-    def of_mesh(mesh: Mesh) -> Building:
-        """Make a building of a mesh whose z axis points up. Raises MapFileError if it shows no floor."""
-        points = voxel_cloud(sampled(mesh.vertices_m.astype(np.float64), mesh.triangles.astype(np.int64)))
-        T_map_mesh = level_cloud(points)
-        plan = drivable_plan(transform_points(T_map_mesh, points))
-        return Building(plan, _moved(mesh, T_map_mesh), T_map_mesh)
+        Raises MapFileError if they show no floor.
+        """
+        points = np.asarray(points_m, np.float64)
+        T_map_file = level_cloud(points)
+        # The voxels follow the axes of the cloud, in which they may have been a lattice before.
+        shell = voxel_faces(points, voxel_m(points)) if mesh is None else mesh
+        plan = drivable_plan(transform_points(T_map_file, points))
+        return Building(plan, _moved(shell, T_map_file), T_map_file)
 
 
 def load_building(path: str | Path) -> OccupancyGrid | Building:
@@ -196,8 +192,9 @@ def load_building(path: str | Path) -> OccupancyGrid | Building:
         if is_building_file(path) and kind_of(path) == "mesh":
             vertices, triangles = load_mesh(path)
             check_plausible(vertices)
-            return Building.of_mesh(Mesh(vertices.astype(np.float32), triangles.astype(np.uint32)))
-        return Building.of_cloud(np.concatenate([np.empty((0, 3)), *building_points(path, ReadConfig())]))
+            mesh = Mesh(vertices.astype(np.float32), triangles.astype(np.uint32))
+            return Building.of(voxel_cloud(sampled(mesh.vertices_m.astype(np.float64), triangles)), mesh)
+        return Building.of(np.concatenate([np.empty((0, 3)), *building_points(path, ReadConfig())]))
     except MapFileError as error:
         if str(path) in error.message:
             raise
@@ -466,14 +463,11 @@ def _box(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     return outline, [Prism(outline, 0.0, height)]
 
 
-def _person(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
-    outline = _disc(rng.uniform(0.18, 0.26))
-    return outline, [Prism(outline, 0.0, rng.uniform(1.55, 1.9))]
-
-
-def _bin(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
-    outline = _disc(rng.uniform(0.14, 0.22))
-    return outline, [Prism(outline, 0.0, rng.uniform(0.3, 0.75))]
+def _cylinder(
+    radius_m: tuple[float, float], height_m: tuple[float, float], rng: np.random.Generator
+) -> tuple[F64, list[Prism]]:
+    outline = _disc(rng.uniform(*radius_m))
+    return outline, [Prism(outline, 0.0, rng.uniform(*height_m))]
 
 
 def _chair(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
@@ -494,7 +488,7 @@ FURNITURE: dict[str, tuple[Callable[[np.random.Generator], tuple[F64, list[Prism
     "chair": (_chair, 0.35),
     "box": (_box, 0.25),
     "table": (_table, 0.15),
-    "person": (_person, 0.15),
-    "bin": (_bin, 0.10),
+    "person": (partial(_cylinder, (0.18, 0.26), (1.55, 1.9)), 0.15),
+    "bin": (partial(_cylinder, (0.14, 0.22), (0.3, 0.75)), 0.10),
 }
 """For each kind the function that makes one, and its share of all objects (chosen by hand)."""

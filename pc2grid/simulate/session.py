@@ -192,19 +192,6 @@ def prepare_session(
     return Session(make_sensor(sensor, config), plan, clutter, drive, odometry, config, shell)
 
 
-def iter_session(
-    *,
-    sensor: SensorKind,
-    grid: OccupancyGrid | Building | None = None,
-    config: SimulationConfig | None = None,
-) -> Iterator[tuple[Scan, SE2]]:
-    """Simulate a session in memory: yield each scan with the true T_map_base at its stamp.
-
-    The same scans as in the log that `simulate_session` writes, without the log.
-    """
-    yield from prepare_session(sensor=sensor, grid=grid, config=config).scans()
-
-
 # --- recordings ---------------------------------------------------------------------------------------
 
 BASE_FRAME, ODOM_FRAME = "base_link", "odom"

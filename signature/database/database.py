@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, cast
 
@@ -26,13 +26,11 @@ from signature.database.document import (
 )
 from signature.database.protocol import BuildingFrame, Label, Problem, Provenance, SessionInfo
 from signature.database.rows import Rows, SessionRow, no_session
-from signature.paper import SignatureTable
+from signature.paper import Signature, SignatureTable
+from signature.visible import SeenPlaces
 
 if TYPE_CHECKING:
     import networkx as nx
-
-    from signature.paper import Signature
-    from signature.visible import SeenPlaces
 
 
 class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
@@ -156,16 +154,12 @@ class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
         )
         return {name: frame for name, frame in found if frame is not None}
 
-    def submap(self, session: str, submap_id: int) -> Submap:
-        """Return one submap. Raises DatabaseError if the session has none of that number."""
-        found = next(self._cut(session, submap_id), None)
-        if found is None:
-            raise DatabaseError(f"{self.location}: session {session!r} has no submap {submap_id}")
-        return found
-
-    def submaps(self, session: str) -> Iterable[Submap]:
-        """Yield all submaps of a session, by id."""
-        return self._cut(session)
+    def submaps(self, session: str) -> Iterator[Submap]:
+        """Yield all submaps of a session, by id, cut from its grid."""
+        parts = self._parts(session, "grid", "submaps")
+        submaps, config = parts["submaps"], parts["info"].provenance.config
+        for number, (x, y) in zip(submaps.submap_id.tolist(), submaps.center_m.tolist(), strict=True):
+            yield view_at(parts["grid"], (x, y), config.partition, submap_id=number)
 
     def stored(self, session: str, *, recover: bool = False) -> StoredSession:
         """Return everything that is stored of a session.
@@ -202,11 +196,6 @@ class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
             self._rows.change(self._rows.source, lambda rows: rows.store([session], overwrite=overwrite))
         finally:
             self._rows.renew()
-
-    def check(self) -> tuple[Problem, ...]:
-        """Return all damage of the present content; empty if there is none."""
-        with contextlib.closing(self._rows.open(self._rows.source, damaged=True)) as rows:
-            return rows.all_problems()
 
     def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
         """Restrict this handle to the sessions of a building and floor; None: any, "": not labelled.
@@ -268,11 +257,3 @@ class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
         for part in parts:
             found[part] = self._rows.part(row, part, found)
         return found
-
-    def _cut(self, session: str, submap_id: int | None = None) -> Iterator[Submap]:
-        """Yield the submaps of a session, or that of a number, cut from its grid."""
-        parts = self._parts(session, "grid", "submaps")
-        submaps, config = parts["submaps"], parts["info"].provenance.config
-        for number, (x, y) in zip(submaps.submap_id.tolist(), submaps.center_m.tolist(), strict=True):
-            if submap_id in (None, number):
-                yield view_at(parts["grid"], (x, y), config.partition, submap_id=number)

@@ -13,7 +13,7 @@ from pc2grid.geometry import SE2
 from pc2grid.io.building_file import sampled
 from pc2grid.model import PointMap, RegisteredScan
 from pc2grid.pipeline import follow
-from pc2grid.simulate import SimulationConfig, iter_session
+from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.scene import extrude
 from signature.config import Config
 from tests.helpers.simulated_drives import office
@@ -43,7 +43,7 @@ def lidar_drive(
             "lidar": {"rate_hz": 5.0, "columns": 360, "elevation_deg": 30.0},
         }
     )
-    made = list(islice(iter_session(sensor="lidar", grid=office(), config=simulation), scans))
+    made = list(islice(prepare_session(sensor="lidar", grid=office(), config=simulation).scans(), scans))
     followed = follow((scan for scan, _ in made), Config())
     for (registered, planar_scan), (_, T_map_base) in zip(followed, made, strict=True):
         yield registered, planar_scan, T_map_base

@@ -21,7 +21,7 @@ from pc2grid.io.recording import open_log
 from pc2grid.model import Health, Scan
 from pc2grid.pipeline import follow
 from pc2grid.settings import Config, RegistrationConfig
-from pc2grid.simulate import SimulationConfig, iter_session
+from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.config import LidarConfig
 from tests.helpers.field import DATA
 
@@ -266,7 +266,7 @@ def test_the_scans_of_the_first_metres_decide_whether_a_robot_is_on_wheels(
 ) -> None:
     small = LidarConfig(rate_hz=5.0, columns=300)
     config = SimulationConfig(length_m=4.0, seed=3, clutter=0, lidar=small)
-    driven = [scan for scan, _ in iter_session(sensor="lidar", config=config)]
+    driven = [scan for scan, _ in prepare_session(sensor="lidar", config=config).scans()]
     scans = [moved(scan, height_m(k), pitch_deg(k)) for k, scan in enumerate(driven)]
     assert len(scans) > 35
     beginning = begin(iter([scans[0]] * standing + scans))

@@ -19,7 +19,7 @@ from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Health, OdometryCheck, OdometryOutlier, Scan
 from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
-from pc2grid.simulate import SimulationConfig, iter_session, prepare_session
+from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.config import LidarConfig, OdometryConfig
 from tests.helpers.field import DATA
 
@@ -27,7 +27,7 @@ HALL = DATA / "lidar/hall.mcap"
 
 
 def session(sensor, *, length_m=6.0, seed=4):
-    return list(iter_session(sensor=sensor, config=SimulationConfig(length_m=length_m, seed=seed)))
+    return list(prepare_session(sensor=sensor, config=SimulationConfig(length_m=length_m, seed=seed)).scans())
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,7 @@ def carried_at_2_hz(turn_rad):
     """
     config = SimulationConfig(length_m=6.0, seed=4, lidar=LidarConfig(beams=64, elevation_deg=35.0))
     rng, yaw_rad, chosen, last = np.random.default_rng(2), 0.0, [], None
-    for scan, pose in iter_session(sensor="lidar", config=config):
+    for scan, pose in prepare_session(sensor="lidar", config=config).scans():
         if last is not None and np.hypot(pose.x - last.x, pose.y - last.y) < 0.7:
             continue
         points = deskew(scan.points_m, scan.offsets_s, scan.T_first_last, float(np.ptp(scan.offsets_s)))
@@ -134,7 +134,7 @@ def test_each_sensor_is_followed(sensor, limit_m):
 
 def test_a_camera_keeps_its_heading_where_wheels_turn_a_tenth_too_far():
     config = SimulationConfig(length_m=6.0, seed=5, odometry=OdometryConfig(rotation_bias=0.1))
-    pairs = list(iter_session(sensor="depth", config=config))
+    pairs = list(prepare_session(sensor="depth", config=config).scans())
     start = pairs[0][1].yaw
     true = np.array([pose.yaw - start for _, pose in pairs])
 
@@ -432,7 +432,7 @@ def test_deskew_puts_points_back_where_they_were():
 
 def test_a_turn_that_begins_within_a_scan_is_undone_by_odometry():
     config = SimulationConfig(length_m=6.0, seed=4, lidar=LidarConfig(rate_hz=5.0, columns=450))
-    pairs = list(iter_session(sensor="lidar", config=config))
+    pairs = list(prepare_session(sensor="lidar", config=config).scans())
     first = pairs[0][1].inverse()
 
     def worst_heading(scans):
@@ -529,7 +529,7 @@ def test_all_walls_that_change_in_a_standstill_begin_a_new_part(laser, cabin_s):
     """A robot rides in a lift, of which the cabin hides all else, and looks at another floor for 4 s."""
     down = [scan for scan, _ in laser[:40]]
     config = SimulationConfig(length_m=6.0, seed=2, building_seed=2)
-    up = [scan for scan, _ in iter_session(sensor="laser", config=config)]
+    up = [scan for scan, _ in prepare_session(sensor="laser", config=config).scans()]
     ride = standing(down[-1], cabin_s, lambda points, k: within(points, 0.8, -4.0, 4.0))
     parts = [list(part) for part in (down, ride, standing(up[0], 4.0), up)]
     (changed,) = walls_changed(chained(*filter(None, parts)))

@@ -16,7 +16,6 @@ from pc2grid.model import FREE, OCCUPIED, OccupancyGrid, Scan, SensorKind
 from pc2grid.simulate import (
     Session,
     SimulationConfig,
-    iter_session,
     office_floorplan,
     prepare_session,
     simulate_session,
@@ -88,7 +87,7 @@ def test_motion_distorts_a_scan_and_point_times_undo_it(sensor: SensorKind) -> N
 
 @pytest.mark.parametrize("sensor", SENSORS)
 def test_scan_is_as_documented(sensor: SensorKind) -> None:
-    scans = list(iter_session(sensor=sensor, config=brief(length_m=1.0)))
+    scans = list(prepare_session(sensor=sensor, config=brief(length_m=1.0)).scans())
     stamps = [scan.stamp_ns for scan, _ in scans]
     assert np.diff(stamps).tolist() == [100_000_000] * (len(scans) - 1)
     assert stamps[0] == EPOCH_NS

@@ -28,14 +28,12 @@ def test_what_goes_in_comes_out(place: str | Path) -> None:
         assert (info.sensor, info.report, info.provenance) == ("lidar", MONDAY[0].report, MONDAY[2])
         assert info.area_m2 == round(MONDAY[0].grid.free_m2, 3)
         assert info.path_m == round(MONDAY[0].trajectory.length_m, 3)
-        assert database.check() == ()
+        assert maintenance.check(database.location) == ()
         assert database.leave_out_damaged() == ()
         assert list(database.signatures("tuesday").session_index) == [1] * 5
         assert [info.name for info in database.sessions(["tuesday", "friday"])] == ["tuesday"]
         with pytest.raises(DatabaseError, match="no session 'sunday'"):
             database.grid("sunday")
-        with pytest.raises(DatabaseError, match="has no submap 99"):
-            database.submap("monday", 99)
         with pytest.raises(DatabaseError, match="reading only"):
             database.add(*make_entry("wednesday", 2))
 
@@ -48,7 +46,7 @@ def test_a_session_of_which_nothing_was_measured(place: str | Path) -> None:
         assert database.sessions(["old"])[0].consistency is None
         assert database.sessions(["old"])[0].precision is None
         assert database.sessions(["old"])[0].odometry is None
-        assert database.check() == ()
+        assert maintenance.check(database.location) == ()
 
 
 def test_sessions_without_submaps_or_poses(place: str | Path) -> None:
@@ -61,7 +59,7 @@ def test_sessions_without_submaps_or_poses(place: str | Path) -> None:
             assert_holds(database, entry)
             info = database.sessions(["empty"])[0]
             assert (info.path_m, info.duration_s, info.scans, info.submaps) == (0.0, 0.0, 0, 0)
-            assert database.check() == ()
+            assert maintenance.check(database.location) == ()
             assert len(database.signatures("empty")) == 0
             assert len(database.signatures()) == (8 if keep else 0)
             assert len(database.seen_places("empty")) == 0
@@ -122,7 +120,7 @@ def test_submaps_are_cut_from_the_map_as_the_settings_say(empty: str | Path) -> 
         assert_holds(database, entries[0])
         # A disc of 5 m holds all of the map that is known, and an isovist only what is seen.
         known = (database.grid("monday").cells >= 0).sum()
-        assert (database.submap("monday", 2).grid.cells >= 0).sum() == known
+        assert ([*database.submaps("monday")][2].grid.cells >= 0).sum() == known
 
 
 @pytest.mark.parametrize("other", ["sqlite", "postgres"])
@@ -171,7 +169,7 @@ def test_queries_leave_bytes_and_folder_as_they_are(path: Path) -> None:
     with open_database(path) as database:
         database.signatures()
         database.grid("monday")
-        database.check()
+        maintenance.check(database.location)
         assert sorted(path.parent.iterdir()) == folder
         with pytest.raises(DatabaseError, match="reading only"):
             database.add(*make_entry("wednesday", 2))
@@ -209,7 +207,7 @@ def test_adding_again_changes_nothing_and_another_of_the_name_needs_force(place:
         assert_holds(database, make_entry("monday", 7))
         assert_holds(database, TUESDAY)
         assert [info.name for info in database.sessions()] == ["monday", "tuesday"]
-        assert database.check() == ()
+        assert maintenance.check(database.location) == ()
 
 
 def test_create_refuses_to_overwrite_and_leaves_what_is_there(place: str | Path) -> None:

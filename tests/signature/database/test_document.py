@@ -14,12 +14,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from pc2grid.errors import DatabaseVersion
-from signature.database import document as arrays
-from signature.database import open_database, sqlite
+from signature.database import document as arrays, open_database, sqlite
 from signature.database.document import clean, pack, row_crc, to_json, unpack
 from signature.database.maintenance import check, store
 from signature.database.protocol import FORMAT

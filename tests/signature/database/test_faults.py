@@ -37,8 +37,16 @@ from pc2grid.submaps.submaps import divide
 from pc2grid_cli.main import app
 from signature.boundary import boundary_bins
 from signature.config import Config
-from signature.database import Label, Provenance, SubmapDatabase, maintenance, open_database, postgres, sqlite
-from signature.database import document as validation
+from signature.database import (
+    Label,
+    Provenance,
+    SubmapDatabase,
+    document as validation,
+    maintenance,
+    open_database,
+    postgres,
+    sqlite,
+)
 from signature.database.document import PARTS
 from signature.database.maintenance import check, copy, merge, store
 from signature.database.protocol import APPLICATION_ID
@@ -529,7 +537,7 @@ def test_words_that_are_no_text_are_shown(empty: maintenance.Location) -> None:
         assert info.provenance.label == Label(building=r"north\xff", floor=r"\xff")
         assert info.report.scans_skipped == {r"of \xff": 2}
         assert info.warnings == (r"odd\xff.pcd: empty",)
-        assert database.check() == ()
+        assert maintenance.check(database.location) == ()
         with pytest.raises(DatabaseError, match=r"no session|UTF-8 only"):
             database.grid("fri\udcffday")
 

@@ -200,7 +200,7 @@ def test_robots_that_write_and_read_at_once() -> None:
     assert wrong == []
     with open_database(url) as database:
         assert len(database.sessions()) == 6 * 3 + 1
-        assert database.check() == ()
+        assert maintenance.check(database.location) == ()
 
 
 def test_first_two_with_different_settings_do_not_both_win() -> None:
@@ -288,4 +288,4 @@ def test_killed_server_loses_nothing_that_was_stored(url: str) -> None:
         names = [info.name for info in database.sessions()]
         # One more than it was told of may have been stored: the answer got lost, not the session.
         assert names[: 2 + len(stored)] == ["monday", "tuesday", *(f"day {i}" for i in stored)]
-        assert database.check() == ()
+        assert maintenance.check(database.location) == ()
