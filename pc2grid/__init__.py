@@ -49,43 +49,42 @@ from pc2grid._version import __version__
 if TYPE_CHECKING:
     from pc2grid.errors import Pc2GridError as Pc2GridError
     from pc2grid.geometry import SE2 as SE2
-    from pc2grid.io.maps import load_map as load_map
-    from pc2grid.io.maps import save_map as save_map
-    from pc2grid.io.recording import Log as Log
-    from pc2grid.io.recording import open_log as open_log
-    from pc2grid.io.trajectory import read_tum as read_tum
-    from pc2grid.io.trajectory import write_kitti as write_kitti
-    from pc2grid.io.trajectory import write_tum as write_tum
-    from pc2grid.model import Health as Health
-    from pc2grid.model import Loop as Loop
-    from pc2grid.model import OccupancyGrid as OccupancyGrid
-    from pc2grid.model import RegisteredScan as RegisteredScan
-    from pc2grid.model import Scan as Scan
-    from pc2grid.model import SessionMap as SessionMap
-    from pc2grid.model import Submap as Submap
-    from pc2grid.model import Trajectory as Trajectory
-    from pc2grid.observer import Observer as Observer
-    from pc2grid.observer import TimeSpan as TimeSpan
-    from pc2grid.pipeline import build_map as build_map
-    from pc2grid.pipeline import build_maps as build_maps
-    from pc2grid.pipeline import follow as follow
-    from pc2grid.pipeline import map_scans as map_scans
-    from pc2grid.simulate import SimulationConfig as SimulationConfig
-    from pc2grid.simulate import simulate_session as simulate_session
+    from pc2grid.io.maps import load_map as load_map, save_map as save_map
+    from pc2grid.io.recording import Log as Log, open_log as open_log
+    from pc2grid.io.trajectory import read_tum as read_tum, write_kitti as write_kitti, write_tum as write_tum
+    from pc2grid.model import (
+        Health as Health,
+        Loop as Loop,
+        OccupancyGrid as OccupancyGrid,
+        RegisteredScan as RegisteredScan,
+        Scan as Scan,
+        SessionMap as SessionMap,
+        Submap as Submap,
+        Trajectory as Trajectory,
+    )
+    from pc2grid.observer import Observer as Observer, TimeSpan as TimeSpan
+    from pc2grid.pipeline import (
+        build_map as build_map,
+        build_maps as build_maps,
+        follow as follow,
+        map_scans as map_scans,
+    )
+    from pc2grid.simulate import SimulationConfig as SimulationConfig, simulate_session as simulate_session
     from pc2grid.submaps.submaps import partition as submaps_of  # noqa: F401
 
     # Of the package above this one, so that a user needs one import. `pyproject.toml` allows it here only.
     from signature.config import Config as Config
-    from signature.database import Label as Label
-    from signature.database import SubmapDatabase as SubmapDatabase
-    from signature.database import open_database as open_database
+    from signature.database import (
+        Label as Label,
+        SubmapDatabase as SubmapDatabase,
+        open_database as open_database,
+    )
     from signature.localization.answer import Answer as Answer
     from signature.localization.localizer import Localizer as Localizer
     from signature.localization.map_index import MapIndex as MapIndex
     from signature.localization.posterior import Prior as Prior
     from signature.localization.shown.page import Found as Found
-    from signature.sessions import convert as convert
-    from signature.sessions import relocalize as relocalize
+    from signature.sessions import convert as convert, relocalize as relocalize
 
 # Where each is found; with another name there, behind the colon. A test compares this with the list above.
 _HOMES = {

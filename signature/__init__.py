@@ -41,29 +41,36 @@ from typing import TYPE_CHECKING
 # as the module would hide it.
 if TYPE_CHECKING:
     from signature.config import Config as Config
-    from signature.database import Label as Label
-    from signature.database import SubmapDatabase as SubmapDatabase
-    from signature.database import create_database as create_database
-    from signature.database import open_database as open_database
+    from signature.database import (
+        Label as Label,
+        SubmapDatabase as SubmapDatabase,
+        create_database as create_database,
+        open_database as open_database,
+    )
     from signature.localization.answer import Answer as Answer
-    from signature.localization.localizer import Estimate as Estimate
-    from signature.localization.localizer import Localizer as Localizer
-    from signature.localization.localizer import locate_map as locate_map
+    from signature.localization.localizer import (
+        Estimate as Estimate,
+        Localizer as Localizer,
+        locate_map as locate_map,
+    )
     from signature.localization.map_index import MapIndex as MapIndex
-    from signature.localization.pose_check import PoseCheck as PoseCheck
-    from signature.localization.pose_check import check_pose as check_pose
+    from signature.localization.pose_check import PoseCheck as PoseCheck, check_pose as check_pose
     from signature.localization.posterior import Prior as Prior
     from signature.localization.shown.page import Found as Found
-    from signature.paper import Signature as Signature
-    from signature.paper import SignatureTable as SignatureTable
-    from signature.paper import describe as signature_of  # noqa: F401
-    from signature.paper import distances as distances
-    from signature.sessions import add_session as add_session
-    from signature.sessions import build_session as build_session
-    from signature.sessions import build_sessions as build_sessions
-    from signature.sessions import convert as convert
-    from signature.sessions import provenance as provenance
-    from signature.sessions import relocalize as relocalize
+    from signature.paper import (
+        Signature as Signature,
+        SignatureTable as SignatureTable,
+        describe as signature_of,  # noqa: F401
+        distances as distances,
+    )
+    from signature.sessions import (
+        add_session as add_session,
+        build_session as build_session,
+        build_sessions as build_sessions,
+        convert as convert,
+        provenance as provenance,
+        relocalize as relocalize,
+    )
 
 # Where each is found; with another name there, behind the colon. A test compares this with the list above.
 _HOMES = {

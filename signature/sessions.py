@@ -13,42 +13,34 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pc2grid._version import __version__
 from pc2grid.clouds.cloud import VoxelCloud
+from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import ConfigError, OutputError
 from pc2grid.io.atomic import require_writable
-from pc2grid.io.recording import open_log
+from pc2grid.io.recording import Log, open_log
 from pc2grid.libraries import one_blas_thread
-from pc2grid.mapping.drawn import digest_of_map, is_drawn_map, load_drawn_map
+from pc2grid.mapping.drawn import DrawnMap, digest_of_map, is_drawn_map, load_drawn_map
 from pc2grid.mapping.part_maps import lost_warnings
-from pc2grid.model import Health, PointMap, ReadReport, SessionMap, Trajectory
+from pc2grid.model import Health, PointMap, ReadReport, RegisteredScan, SessionMap, Trajectory
 from pc2grid.observer import Observer, ProgressBars, TimeSpan
 from pc2grid.pipeline import build_maps, follow, longest_of
 from pc2grid.submaps.submaps import divide
 from signature.config import Config
-from signature.database import Label, Provenance, open_database
+from signature.database import Label, Provenance, SubmapDatabase, open_database
 from signature.database.maintenance import exists, store
 from signature.database.postgres import is_url
 from signature.localization.answer import Answer, QueryRecording, followed
 from signature.localization.localizer import Estimate, Localizer, locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
+from signature.localization.pose_check import PoseCheck
+from signature.localization.posterior import Prior
 from signature.localization.shown.page import Found
 from signature.paper import Signature, describe
-
-if TYPE_CHECKING:
-    from pc2grid.clouds.planar_scan import PlanarScan
-    from pc2grid.io.recording import Log
-    from pc2grid.mapping.drawn import DrawnMap
-    from pc2grid.model import RegisteredScan
-    from signature.database import SubmapDatabase
-    from signature.localization.pose_check import PoseCheck
-    from signature.localization.posterior import Prior
-
 
 # --- from file to file --------------------------------------------------------------------------------
 

@@ -32,7 +32,7 @@ from pc2grid.geometry import (
 from pc2grid.io import topics
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Imu, Seven, Transform, valid_pose
-from pc2grid.io.source import MessageSource, TopicInfo
+from pc2grid.io.source import LIDAR_PERIOD_NS, MessageSource, TopicInfo
 from pc2grid.io.topics import FIRST, First, tolerant
 
 
@@ -41,13 +41,14 @@ class FrameParameters:
     """How poses over time are interpolated, and how many are kept; chosen by hand.
 
     max_gap_ns : two samples farther apart are not interpolated (a gap in the log).
-    hold_ns : time before the first and after the last sample for which that sample is used.
+    hold_ns : time before the first and after the last sample for which that sample is used,
+        the time between two scans.
     kept_samples : samples of one track; a multiple of a minute at any usual rate.
     max_frames : frames of one tree, against hostile files.
     """
 
     max_gap_ns: int = 2_000_000_000
-    hold_ns: int = 100_000_000
+    hold_ns: int = LIDAR_PERIOD_NS
     kept_samples: int = 20_000
     max_frames: int = 10_000
 

@@ -28,8 +28,7 @@ from pc2grid.errors import MapFileError
 from pc2grid.geometry import F64, BoolGrid, hand_over
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.messages.types import EDGES_M, FARTHEST_M
-from pc2grid.io.sensors.depth import MAGIC as PNG_MAGIC
-from pc2grid.io.sensors.depth import read_header
+from pc2grid.io.sensors.depth import MAGIC as PNG_MAGIC, read_header
 from pc2grid.io.source import LFS_HINT, is_lfs_pointer
 from pc2grid.model import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_FROM, UNKNOWN, MapOf, OccupancyGrid
 

@@ -27,8 +27,7 @@ from pc2grid.errors import (
     UnsupportedSchema,
 )
 from pc2grid.geometry import F32, F64, invert_pose
-from pc2grid.io.frames import PARAMETERS as FRAMES
-from pc2grid.io.frames import Attitude, FrameTree, PoseTrack
+from pc2grid.io.frames import PARAMETERS as FRAMES, Attitude, FrameTree, PoseTrack
 from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import CameraInfo, Imu, Odometry, ScanMessage, Transform
 from pc2grid.io.plan import FIRST_SCANS, Plan, Sensor, registered

@@ -35,21 +35,18 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, Pc2GridError
 from pc2grid.geometry import F32, F64, I64, frozen_arrays
 from pc2grid.io.messages.types import EDGES_M, FARTHEST_M
-from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Trajectory
+from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Submap, Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid.submaps.submaps import divide
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Entry, Problem, SessionInfo
 from signature.freespace import freespace_bins
-from signature.paper import I32, SignatureTable, describe
+from signature.paper import I32, Signature, SignatureTable, describe
 from signature.visible import SIGNATURE_COLUMNS, SeenPlaces
 
 if TYPE_CHECKING:
     import networkx as nx
-
-    from pc2grid.model import Submap
-    from signature.paper import Signature
 
 
 NODE_KINDS = ("junction", "end")

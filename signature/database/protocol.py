@@ -14,7 +14,6 @@ from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,10 +23,7 @@ from pc2grid.geometry import F64, SE2
 from pc2grid.io.source import SUBMAPS_ID
 from pc2grid.model import Consistency, OdometryCheck, Precision, ReadReport, SessionMap
 from signature.config import Config
-
-if TYPE_CHECKING:
-    from signature.paper import Signature
-
+from signature.paper import Signature
 
 FORMAT = 1
 """The format that is written and read."""
@@ -145,7 +141,7 @@ class SessionInfo:
         return self.report.lossy
 
 
-Entry = tuple[SessionMap, "Sequence[Signature]", Provenance]
+Entry = tuple[SessionMap, Sequence[Signature], Provenance]
 """Everything that is stored of one session: the map, the signature of each submap, the provenance."""
 
 

@@ -10,18 +10,16 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from pydantic import ValidationError
+from typing_extensions import Self
 
 from pc2grid.errors import DatabaseError, DatabaseVersion
 from pc2grid.model import is_part_of
 from signature.database import document
 from signature.database.document import PARTS, DatabaseDamage, StoredSession, explained, row_crc
 from signature.database.protocol import BuildingFrame, Location, Problem, SessionInfo
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
 
 SESSION_COLUMNS = ("building", "id", "floor", "name", "document")
 PART_COLUMNS = ("building", "session_id", "name", "data")

@@ -18,8 +18,10 @@ import sqlite3
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from urllib.parse import quote
+
+from typing_extensions import Self
 
 from pc2grid.errors import DatabaseBusy, DatabaseCorrupt, DatabaseError, NotADatabase, OutputError
 from pc2grid.io.atomic import is_at, replace_file
@@ -35,10 +37,6 @@ from signature.database.protocol import (
     refuse_other_format,
 )
 from signature.database.rows import Rows, definitions
-
-if TYPE_CHECKING:
-    from typing_extensions import Self
-
 
 _MAPPED_BYTES = 1 << 30
 """How much of a file SQLite maps into memory at most; chosen by hand."""

@@ -252,8 +252,7 @@ def write_rosbag2(
     version: int = 9,
 ) -> Path:
     """The messages (of dialect ros2) as a rosbag2 folder with its metadata.yaml."""
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
-    from rosbags.rosbag2 import Writer as FolderWriter
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer as FolderWriter
 
     out = FolderWriter(folder, version=version, storage_plugin=StoragePlugin[storage.upper()])
     if compression:

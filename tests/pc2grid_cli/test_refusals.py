@@ -27,8 +27,7 @@ from pc2grid.errors import (
 )
 from pc2grid.io.maps import save_map
 from pc2grid.model import MISSING_FILES, ReadReport
-from pc2grid_cli import console, relocalize
-from pc2grid_cli import output as data_loss
+from pc2grid_cli import console, output as data_loss, relocalize
 from pc2grid_cli.main import app
 from signature.database.maintenance import store
 from tests.helpers.databases import make_entry

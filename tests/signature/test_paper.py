@@ -10,8 +10,7 @@ import networkx as nx
 import numpy as np
 import pytest
 import scipy
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from signature.config import SignatureConfig
 from signature.freespace import freespace_graph

@@ -12,9 +12,10 @@ import keyword
 import math
 import re
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import Typesdict
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.base import TypesysError
@@ -37,10 +38,6 @@ from pc2grid.io.messages.types import (
     valid_pose,
 )
 from pc2grid.io.source import TopicInfo
-
-if TYPE_CHECKING:
-    from rosbags.interfaces.typing import Typesdict
-
 
 _MOST_FIELDS = 1000
 """Fields of a message and of a cloud that no real message reaches. The known types flatten to some tens of

@@ -28,8 +28,7 @@ from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.scene import OPTICAL, Mesh, Scene, prism
 from tests.helpers.field import DATA
-from tests.helpers.flat_by_hand import CORRIDOR, carried, rising
-from tests.helpers.flat_by_hand import images as drifting_images
+from tests.helpers.flat_by_hand import CORRIDOR, carried, images as drifting_images, rising
 
 ROOMS = DATA / "depth/room"
 T_BASE_CAMERA = np.eye(4)

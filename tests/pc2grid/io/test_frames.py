@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pc2grid.errors import FrameError, LogCorrupt, PointCloudError, TopicError
 from pc2grid.geometry import F64, invert_pose, motion_size, pose_from_rotation_vector, quat_xyzw_from_pose

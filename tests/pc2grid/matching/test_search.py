@@ -7,8 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
 from pc2grid.geometry import F64, I64, SE2, U8
 from pc2grid.matching.score import refine, score_fit

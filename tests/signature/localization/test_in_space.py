@@ -24,8 +24,7 @@ from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
 from tests.helpers.simulated_drives import building, office
-from tests.helpers.tall_offices import lidar_drive
-from tests.helpers.tall_offices import points as points_of
+from tests.helpers.tall_offices import lidar_drive, points as points_of
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, twin_map
 
 

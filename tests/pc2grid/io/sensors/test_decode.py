@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from pc2grid.errors import LimitExceeded, NoScans, Pc2GridError, PointCloudError
 from pc2grid.io.messages.clouds import parser
