@@ -46,8 +46,8 @@ def main(map_yaml: str, queries: int = 200) -> None:
     print(f"{len(submaps)} submaps, {queries} queries; area under the curve, share recognised")
     for level, noise in enumerate(NOISE_LEVELS):
         for name, matches in evaluate(methods, grid, submaps, experiment, noise).items():
-            curve = matches.curve()
-            print(f"noise {level}  {name:16} {curve.auc:.3f}  {matches.correct.mean():.2f}")
+            measures = matches.measures()
+            print(f"noise {level}  {name:16} {measures.auc:.3f}  {measures.r_at_1:.2f}")
 
 
 if __name__ == "__main__":

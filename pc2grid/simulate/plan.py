@@ -355,53 +355,44 @@ def _doors(
     corridors: list[Box], rooms: list[Box], wall: int, unit: float, rng: np.random.Generator
 ) -> list[Door]:
     """Open a door from every room to the corridor, or to a room that has one; some rooms get two."""
-    doors = _Doors(rooms, wall, unit, rng)
+    opened: list[Door] = []
+
+    def opens(room: int, other: Box, number: int) -> bool:
+        box = _door(rooms[room], other, wall, unit, rng)
+        if box is not None:
+            opened.append(Door(box, (room, number)))
+        return box is not None
+
+    def to_corridor(room: int) -> bool:
+        """Open one door to a corridor, sometimes two."""
+        tried = [corridors[int(i)] for i in rng.permutation(len(corridors))]
+        count = sum(opens(room, corridor, -1) for corridor in tried[:1])
+        for corridor in tried[1:]:
+            if count == 0 or (count == 1 and rng.random() < 0.15):
+                count += opens(room, corridor, -1)
+        return count > 0
+
+    def to_room(room: int, others: Iterable[int]) -> bool:
+        """Open a door to the first possible one of other rooms."""
+        return any(opens(room, rooms[other], other) for other in others)
+
     order = [int(k) for k in rng.permutation(len(rooms))]
-    reached = [k for k in order if doors.to_corridor(k, corridors)]
-    _through_rooms(doors, reached, [k for k in order if k not in reached])
+    reached = [k for k in order if to_corridor(k)]
+    _through_rooms(to_room, reached, [k for k in order if k not in reached])
     for k in reached:
         for other in reached:
             if k < other and rng.random() < 0.1:
-                doors.to_room(k, [other])
-    return doors.opened
+                to_room(k, [other])
+    return opened
 
 
-class _Doors:
-    """Opens doors between rooms and corridors.
-
-    opened : the doors so far. wall : half the thickness of an inner wall, cells.
-    """
-
-    def __init__(self, rooms: list[Box], wall: int, unit: float, rng: np.random.Generator) -> None:
-        self.opened: list[Door] = []
-        self._rooms, self._wall, self._unit, self._rng = rooms, wall, unit, rng
-
-    def to_corridor(self, room: int, corridors: list[Box]) -> bool:
-        """Open one door from a room to a corridor, sometimes two; returns True if there is one."""
-        rng = self._rng
-        tried = [corridors[int(i)] for i in rng.permutation(len(corridors))]
-        count = sum(self._open(room, corridor, -1) for corridor in tried[:1])
-        for corridor in tried[1:]:
-            if count == 0 or (count == 1 and rng.random() < 0.15):
-                count += self._open(room, corridor, -1)
-        return count > 0
-
-    def to_room(self, room: int, others: Iterable[int]) -> bool:
-        """Open a door from a room to the first possible one of others; returns True if there is one."""
-        return any(self._open(room, self._rooms[other], other) for other in others)
-
-    def _open(self, room: int, other: Box, number: int) -> bool:
-        box = _door(self._rooms[room], other, self._wall, self._unit, self._rng)
-        if box is not None:
-            self.opened.append(Door(box, (room, number)))
-        return box is not None
-
-
-def _through_rooms(doors: _Doors, reached: list[int], waiting: list[int]) -> None:
+def _through_rooms(
+    to_room: Callable[[int, Iterable[int]], bool], reached: list[int], waiting: list[int]
+) -> None:
     """Open doors from waiting rooms to reached ones, and add them to these, until none is left."""
     while waiting:
         for k in waiting:
-            if doors.to_room(k, reached):
+            if to_room(k, reached):
                 reached.append(k)
         left = [k for k in waiting if k not in reached]
         if left == waiting:

@@ -9,13 +9,13 @@ from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
 from pc2grid.submaps.submaps import submap_at
 from pc2grid_lab.paper.experiment import (
     NOISE_LEVELS,
+    BestMatches,
     Experiment,
     Matcher,
     Noise,
     add_noise,
     draw_queries,
     evaluate,
-    precision_recall,
 )
 from pc2grid_lab.paper.methods import make_methods
 from tests.helpers.rooms import canvas, cross, disc, grid_of, l_shape, rectangle, submap_of
@@ -33,17 +33,19 @@ def centers() -> np.ndarray:
 
 
 def test_precision_and_recall_by_hand() -> None:
-    curve = precision_recall(np.array([0.9, 0.8, 0.7, 0.6, 0.5]), np.array([True, True, False, True, False]))
+    correct = np.array([True, True, False, True, False])
+    matches = BestMatches(similarity=np.array([0.9, 0.8, 0.7, 0.6, 0.5]), correct=correct)
+    curve, measures = matches.curve(), matches.measures()
     assert curve.recall.tolist() == pytest.approx([1 / 3, 2 / 3, 2 / 3, 1, 1])
     assert curve.precision.tolist() == pytest.approx([1, 1, 2 / 3, 3 / 4, 3 / 5])
-    assert curve.auc == pytest.approx(2 / 3 + (2 / 3 + 3 / 4) / 2 / 3)
-    assert curve.recall_at_90 == pytest.approx(2 / 3)
-    assert curve.f1 == pytest.approx(2 * 0.75 / 1.75)
+    assert measures.auc == pytest.approx(2 / 3 + (2 / 3 + 3 / 4) / 2 / 3)
+    assert measures.rp9 == pytest.approx(2 / 3)
+    assert measures.f1 == pytest.approx(2 * 0.75 / 1.75)
 
 
 def test_nothing_true_has_no_area() -> None:
-    curve = precision_recall(np.array([0.5, 0.4]), np.array([False, False]))
-    assert (curve.auc, curve.recall_at_90, curve.f1) == (0.0, 0.0, 0.0)
+    matches = BestMatches(similarity=np.array([0.5, 0.4]), correct=np.array([False, False]))
+    assert matches.measures() == (0.0, 0.0, 0.0, 0.0)
 
 
 def test_queries_lie_near_centres_on_free_cells_and_repeat() -> None:

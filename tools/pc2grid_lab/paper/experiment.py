@@ -63,8 +63,16 @@ class BestMatches:
 
     def measures(self) -> MatchMeasures:
         """Return all measures of these matches."""
-        curve = self.curve()
-        return MatchMeasures(curve.auc, float(self.correct.mean()), curve.recall_at_90, curve.f1)
+        recall, precision = self.curve()
+        area, total = 0.0, precision + recall
+        if len(recall):
+            from sklearn.metrics import auc
+
+            # Trapezoids from recall 0 at the precision of the first point.
+            area = float(auc([0.0, *recall], [precision[0], *precision]))
+        f1 = np.divide(2 * precision * recall, total, out=np.zeros_like(total), where=total > 0)
+        rp9 = recall[precision >= 0.9].max(initial=0.0)
+        return MatchMeasures(area, float(self.correct.mean()), float(rp9), float(f1.max(initial=0.0)))
 
     def half_widths(self, resamples: int = 300, seed: int = 0) -> MatchMeasures:
         """Return half of the interval from 5 to 95 % of each measure, by bootstrap over the queries."""
@@ -79,8 +87,9 @@ class BestMatches:
 
 
 class MatchMeasures(NamedTuple):
-    """Area under the precision-recall curve, the share of the queries whose best match is true (R@1), recall
-    at a precision of 0.9, and F1; each 0 .. 1. R@1 is not in the paper.
+    """Area under the precision-recall curve, the share of the queries whose best match is true (R@1), the
+    largest recall at a precision of at least 0.9 (0 if there is none), and the largest F1 over the
+    thresholds; each 0 .. 1. R@1 is not in the paper.
     """
 
     auc: float
@@ -89,8 +98,7 @@ class MatchMeasures(NamedTuple):
     f1: float
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PrecisionRecall:
+class PrecisionRecall(NamedTuple):
     """A precision-recall curve, from the highest threshold to the lowest.
 
     recall, precision : (T,), one point for each distinct similarity.
@@ -102,27 +110,6 @@ class PrecisionRecall:
 
     recall: F64
     precision: F64
-
-    @property
-    def auc(self) -> float:
-        """Return the area under the curve (AUPRC), trapezoids from (0, precision of the first point)."""
-        if len(self.recall) == 0:
-            return 0.0
-        from sklearn.metrics import auc
-
-        return float(auc([0.0, *self.recall], [self.precision[0], *self.precision]))
-
-    @property
-    def recall_at_90(self) -> float:
-        """Return RP9, the largest recall at a precision of at least 0.9; 0 if there is none."""
-        return float(self.recall[self.precision >= 0.9].max(initial=0.0))
-
-    @property
-    def f1(self) -> float:
-        """Return the largest F1 score over the thresholds."""
-        total = self.precision + self.recall
-        scores = np.divide(2 * self.precision * self.recall, total, out=np.zeros_like(total), where=total > 0)
-        return float(scores.max(initial=0.0))
 
 
 def precision_recall(similarity: F64, correct: NDArray[np.bool_]) -> PrecisionRecall:
