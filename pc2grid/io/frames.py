@@ -30,10 +30,9 @@ from pc2grid.geometry import (
     quat_xyzw_from_pose,
 )
 from pc2grid.io import topics
-from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Imu, Seven, Transform, valid_pose
 from pc2grid.io.source import LIDAR_PERIOD_NS, MessageSource, TopicInfo
-from pc2grid.io.topics import FIRST, First, tolerant
+from pc2grid.io.topics import FIRST, First, decoder_for, tolerant
 
 
 @dataclass(frozen=True, slots=True)

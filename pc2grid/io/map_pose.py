@@ -21,11 +21,10 @@ from pc2grid.geometry import F64, SE2, pose_from_xyz_quat
 from pc2grid.io import export, topics
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import Odometry, PoseStamped, valid_pose
 from pc2grid.io.robots import Namespaces
 from pc2grid.io.source import MessageSource, RawMessage, TopicInfo
-from pc2grid.io.topics import tolerant
+from pc2grid.io.topics import decoder_for, tolerant
 
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """x, y and yaw among x, y, z, roll, pitch, yaw."""

@@ -28,13 +28,12 @@ from pc2grid.errors import (
 )
 from pc2grid.geometry import F32, F64, invert_pose
 from pc2grid.io.frames import PARAMETERS as FRAMES, Attitude, FrameTree, PoseTrack
-from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.types import CameraInfo, Imu, Odometry, ScanMessage, Transform
 from pc2grid.io.plan import FIRST_SCANS, Plan, Sensor, registered
 from pc2grid.io.sensors.decode import MOST_TURNS, ScanDecoder
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.source import GAP_NS, LIDAR_PERIOD_NS, MessageSource, RawMessage, Tally, TopicInfo
-from pc2grid.io.topics import tolerant
+from pc2grid.io.topics import decoder_for, tolerant
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ReadConfig
 

@@ -1,4 +1,4 @@
-"""The topics of a log by their types and names, which of them hold scans, and their first messages."""
+"""The topics of a log by types and names, which of them hold scans, their decoders and first messages."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from pc2grid.errors import NoScans, PointCloudError, TopicError, UnsupportedSchema
-from pc2grid.io.messages.decoders import decoder_for
+from pc2grid.io.messages import clouds, foxglove, ros
 from pc2grid.io.source import MessageSource, TopicInfo
 from pc2grid.model import SENSOR_MODELS, SensorKind
 
@@ -232,6 +232,18 @@ def _is_copy(topic: TopicInfo, full: Sequence[TopicInfo]) -> bool:
     return topic.type.endswith("CompressedImage") and any(
         topic.topic.startswith(t.topic + "/") for t in full if not t.type.endswith("CompressedImage")
     )
+
+
+def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
+    """Return a function from the bytes of a topic's messages to one of the classes of `messages.types`.
+
+    Raises UnsupportedSchema for a type or encoding that is not supported.
+    """
+    if channel.encoding in ("protobuf", "json"):
+        return foxglove.decoder_for(channel)
+    if channel.type.startswith("cloud/"):
+        return clouds.decoder_for(channel)
+    return ros.decoder_for(channel)
 
 
 FIRST = 5

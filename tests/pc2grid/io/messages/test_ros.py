@@ -8,10 +8,10 @@ import pytest
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
-from pc2grid.io.messages.decoders import decoder_for
 from pc2grid.io.messages.ros import store_of
 from pc2grid.io.messages.types import Header, Odometry
 from pc2grid.io.source import TopicInfo
+from pc2grid.io.topics import decoder_for
 
 TYPES = [
     "sensor_msgs/PointCloud2", "sensor_msgs/LaserScan", "sensor_msgs/Image", "sensor_msgs/CompressedImage",
