@@ -118,10 +118,12 @@ class _Rows:
         need = self.used + more
         if need <= len(self.codes):
             return
-        room = max(2 * len(self.codes), need, 1 << 13) - len(self.codes)
-        self.codes = np.concatenate((self.codes, np.empty(room, np.int64)))
-        self.moments = np.concatenate((self.moments, np.empty((room, 10))))
-        self.shapes = np.concatenate((self.shapes, np.empty((room, 9))))
+        room = max(2 * len(self.codes), need, 1 << 13)
+        # What is not written takes no memory: a scan is thinned by rows most of which stay unused.
+        codes, moments, shapes = np.empty(room, np.int64), np.empty((room, 10)), np.empty((room, 9))
+        for rows, more_rows in ((self.codes, codes), (self.moments, moments), (self.shapes, shapes)):
+            more_rows[: self.used] = rows[: self.used]
+        self.codes, self.moments, self.shapes = codes, moments, shapes
 
     def keep(self, kept: BoolGrid) -> None:
         """Keep some (used,) of the rows."""
@@ -477,9 +479,16 @@ def normal_equations(
         i, j, k = math.floor(x / edge), math.floor(y / edge), math.floor(z / edge)
         code = ((i + HALF_VOXELS) << (2 * AXIS_BITS)) | ((j + HALF_VOXELS) << AXIS_BITS) | (k + HALF_VOXELS)
         best, best_row = 2.25 * edge * edge, -1
-        for a in range(-1, 2):
-            for b in range(-1, 2):
-                for c in range(-1, 2):
+        # The own voxel first: no mean in a voxel around it is nearer than that voxel is.
+        low_x, low_y, low_z = x - i * edge, y - j * edge, z - k * edge
+        for a in (0, -1, 1):
+            off_x = 0.0 if a == 0 else low_x if a < 0 else edge - low_x
+            for b in (0, -1, 1):
+                off_y = 0.0 if b == 0 else low_y if b < 0 else edge - low_y
+                for c in (0, -1, 1):
+                    off_z = 0.0 if c == 0 else low_z if c < 0 else edge - low_z
+                    if off_x * off_x + off_y * off_y + off_z * off_z >= best:
+                        continue
                     row = slots[_slot(slots, codes, code + (a << (2 * AXIS_BITS)) + (b << AXIS_BITS) + c)]
                     if row < 0 or shapes[row, 3] + shapes[row, 6] + shapes[row, 8] <= 0.0:
                         continue
