@@ -1,4 +1,4 @@
-"""KISS-ICP (Vizzo et al. 2023) per scan. The only file that imports kiss_icp.
+"""KISS-ICP (Vizzo et al. 2023) per scan. The only file of the library that imports kiss_icp.
 
 `KissRegistration` is composed of the public parts of kiss_icp, in the order of `KissICP.register_frame`.
 Three things differ. The initial guess comes from outside (the prediction of the smoother). A scan is added to
@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F64, pose_from_rotation_vector, rotation_vector
-from pc2grid.model import Scan
 from pc2grid.settings import RegistrationConfig
 
 _EXACT = 1e-12
@@ -102,25 +101,6 @@ class KissRegistration:
         self._registration = get_registration(config)
         self._threshold = get_threshold_estimator(config)
         self._map = get_voxel_hash_map(config)
-
-
-class BareKissIcp:
-    """KISS-ICP with its own defaults and all points of each scan, to compare with."""
-
-    def __init__(self) -> None:
-        from kiss_icp.config import load_config
-        from kiss_icp.kiss_icp import KissICP
-
-        config = load_config(None)
-        config.registration.max_num_threads = 1
-        self._kiss: Any = KissICP(config)
-
-    def register(self, scan: Scan) -> F64:
-        """Return T_start_base (4, 4) at the time of the last point of a scan, to which KISS-ICP deskews."""
-        times = np.empty(0) if scan.offsets_s is None else scan.offsets_s.astype(np.float64)
-        if len(scan.points_m):
-            self._kiss.register_frame(scan.points_m.astype(np.float64), times)
-        return np.array(self._kiss.last_pose, dtype=np.float64)
 
 
 def _proper(pose: F64) -> F64:

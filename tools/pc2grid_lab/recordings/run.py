@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from kiss_icp.config import KISSConfig
+from kiss_icp.config import KISSConfig, load_config
 from kiss_icp.kiss_icp import KissICP
 from mcap.reader import make_reader
 from mcap.records import Channel, Schema
@@ -32,7 +32,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from pc2grid.display import plain
 from pc2grid.errors import Pc2GridError
-from pc2grid.estimation.registration import BareKissIcp
 from pc2grid.geometry import SE2, pose_from_xyz_quat
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.recording import open_log
@@ -582,18 +581,21 @@ def main() -> None:
         config: Any = KISSConfig()
         config.mapping.voxel_size, config.data.max_range = indoors(*islice(opened.scans(), 2))
         config.data.deskew = False
-        config.registration.max_num_threads = 1
-        kiss, own = KissICP(config), BareKissIcp()
+        own_config: Any = load_config(None)
+        config.registration.max_num_threads = own_config.registration.max_num_threads = 1
+        kiss, own = KissICP(config), KissICP(own_config)
         stamps, poses, cpu_s = [], [], 0.0
         for scan in opened.scans():
             points_m = np.asarray(scan.points_m, np.float64)
             begin = time.process_time()
             kiss.register_frame(points_m, np.empty(0))
             cpu_s += time.process_time() - begin
-            last_s = 0.0 if scan.offsets_s is None or not len(scan.offsets_s) else float(scan.offsets_s.max())
-            stamps.append(scan.stamp_ns + round(last_s * 1e9))
-            if truth is not None:
-                poses.append(own.register(scan))
+            # It deskews to the time of the last point.
+            offsets_s = np.asarray(() if scan.offsets_s is None else scan.offsets_s, np.float64)
+            stamps.append(scan.stamp_ns + round(float(offsets_s.max(initial=0.0)) * 1e9))
+            if truth is not None and len(points_m):
+                own.register_frame(points_m, offsets_s)
+            poses.append(np.array(own.last_pose, np.float64))
     ate_m = None
     if truth is not None:
         trajectory = Trajectory(stamps_ns=np.array(stamps, np.int64), T_session_base=np.array(poses))
