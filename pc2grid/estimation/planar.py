@@ -84,13 +84,13 @@ class PlanarMatcher:
         self._points_m = self._floor.remove(points_m)
         self._planar_scan, self._unaided = self._project(scan, points_m), scan.T_odom_base is None
 
-    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
-        """Match from the pose of KISS-ICP and from the expected one: along a corridor KISS-ICP tends to stand
+    def match(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
+        """Match from the expected pose and from that of KISS-ICP: along a corridor KISS-ICP tends to stand
         still.
         """
-        expected = self.levelled(belief.pose)
-        starts = self._kiss.register(self._points_m, expected), expected
-        return [self._matched(self._maps, SE2.from_matrix(start), belief) for start in starts]
+        yield self._matched(self._maps, SE2.from_matrix(belief.pose), belief)
+        registered = self._kiss.register(self._points_m, self.levelled(belief.pose))
+        yield self._matched(self._maps, SE2.from_matrix(registered), belief)
 
     def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         """Search the window of the belief, and match the best placements."""
@@ -112,7 +112,7 @@ class PlanarMatcher:
             return None
         fit = self._matched_with_last(belief)
         at, information = fit.alone
-        motion = self._last.inverse() @ SE2.from_matrix(at)
+        motion = self._latest[-1][1].inverse() @ SE2.from_matrix(at)
         return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible else None
 
     def fits_last(self, belief: PoseWithCovariance) -> bool:
@@ -138,25 +138,15 @@ class PlanarMatcher:
         information = _turned(belief.information, -prior.yaw)  # in the axes of the session frame
         match = maps.match(self._planar_scan, guess, prior, information)
         unknown = 1.0 - match.overlap - match.contradicted
+        hits = min(len(self._planar_scan.hits_m), p.matched_hits)
         return ScanMatch(
             pose=match.pose.lift(),
             alone=(match.by_points.lift(), _turned(match.information, match.by_points.yaw)),
             overlap=match.overlap,
             measured=match.measured,
-            evidence=self._weight * (match.overlap + p.sure_overlap * unknown),
+            evidence=p.hit_weight * hits * (match.overlap + p.sure_overlap * unknown),
             credible=match.overlap >= p.sure_overlap,
         )
-
-    @property
-    def _last(self) -> SE2:
-        """Return the final pose of the scan before."""
-        return self._latest[-1][1]
-
-    @property
-    def _weight(self) -> float:
-        """Return the log likelihood ratio of the scan taken last if it fits without any error."""
-        p = self._parameters
-        return p.hit_weight * min(len(self._planar_scan.hits_m), p.matched_hits)
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
         """Return the planar scan of the scan taken last."""
@@ -240,8 +230,9 @@ class MatchingMaps:
         grid = self._maps[0][0]
         chosen = evenly(len(planar_scan.hits_m), self._parameters.matched_hits)
         hits, normals = planar_scan.hits_m[chosen], planar_scan.normal_rad[chosen]
-        guess = grid.weighed(hits, normals, near, prior, information)
-        return grid.match(hits, normals, guess, prior, information)
+        if near != prior:
+            near = grid.weighed(hits, normals, near, prior, information)
+        return grid.match(hits, normals, near, prior, information)
 
     def extend(self, planar_scan: PlanarScan, pose: SE2) -> None:
         """Add a planar scan at its final pose T_session_base."""
@@ -255,9 +246,11 @@ class MatchingMaps:
             self._maps.append((PointGrid(low_m, high_m, parameters=self._matching), self._travel_m))
         if len(self._maps) > 2:
             del self._maps[0]
+        hits_m, normal_rad = pose.apply(planar_scan.hits_m), planar_scan.normal_rad + pose.yaw
+        outline_m = pose.apply(planar_scan.free_polygon())
         for grid, _ in self._maps:
-            grid.add(pose.apply(planar_scan.hits_m), planar_scan.normal_rad + pose.yaw)
-            grid.clear(pose.apply(planar_scan.free_polygon()))
+            grid.add(hits_m, normal_rad)
+            grid.clear(outline_m)
 
     def restart(self) -> None:
         """Forget the maps: the next scan begins new ones."""

@@ -9,8 +9,9 @@ covariance is widened by the spread of all matches: where two places fit alike, 
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Protocol
 
 import numpy as np
@@ -63,8 +64,8 @@ class ScanMatcher(Protocol):
     def __bool__(self) -> bool:
         """Return True if there is a local map."""
 
-    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
-        """Match the scan taken last with the local map, from the pose of KISS-ICP and from others.
+    def match(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
+        """Match the scan taken last with the local map, from the expected pose, and from that of KISS-ICP.
 
         KISS-ICP begins at the belief, which is also the prior of all matches.
         """
@@ -138,36 +139,48 @@ class MatchSelector:
     def __init__(self, sensor: ScanMatcher, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
         self._sensor, self._parameters = sensor, parameters
 
-    def place(self, scan: Scan, points_m: F32, expected: Sequence[PoseWithCovariance]) -> MatchedScan:
+    def place(
+        self, scan: Scan, points_m: F32, belief: PoseWithCovariance, others: Iterable[PoseWithCovariance] = ()
+    ) -> MatchedScan:
         """Match the next scan with the local map.
 
-        points_m : (N, 3) deskewed, base frame. expected : predictions of the pose, the most credible first. A
-        scan that fits nowhere, or is empty, gets the first of them.
+        points_m : (N, 3) deskewed, base frame. belief : the most credible prediction of the pose, which a
+        scan gets that fits nowhere, or is empty. others : less credible ones, made only where needed.
         """
-        p, belief = self._parameters, expected[0]
+        p = self._parameters
         self._sensor.take(scan, points_m)
         if not self._sensor:
             return MatchedScan(belief.pose, sure=True, first=True)
-        found = self._candidates(expected)
+        found = self._candidates(belief, others)
         best = max(found)
         if best.fit.overlap < p.min_overlap or not (best.near or best.fit.credible):
             return MatchedScan(belief.pose, motion=self._sensor.follow(belief))
-        spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
         fit = self._sensor.observable(best.fit)
         alone, information = fit.alone
-        # The inverse of the sum of both covariances, also where a match has no information on a direction.
-        believed = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
-        estimate = alone, 0.5 * (believed + believed.T)
+        if len(found) > 1:
+            spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
+            # The inverse of the sum of both covariances, also where a match has none of a direction.
+            information = np.asarray(
+                np.linalg.solve(np.eye(len(spread)) + information @ spread, information), np.float64
+            )
+        estimate = alone, 0.5 * (information + information.T)
         return MatchedScan(fit.pose, estimate, sure=best.sure, measured=fit.measured)
 
-    def _candidates(self, expected: Sequence[PoseWithCovariance]) -> list[_Candidate]:
-        """Return the matches at the expected poses and, if none of them fits, those of a search."""
-        found: list[_Candidate] = []
-        first = expected[0]
-        for belief in expected:
-            found += [self._candidate(fit, expected) for fit in self._sensor.match(belief)]
-            if max(found).sure and max(found).near and not self._is_vague(belief):
-                return found
+    def _candidates(
+        self, first: PoseWithCovariance, others: Iterable[PoseWithCovariance]
+    ) -> list[_Candidate]:
+        """Return the matches at the expected poses, as many as are needed until one fits that an exact belief
+        has led to; if none fits, also those of a search.
+        """
+        expected: list[PoseWithCovariance] = []
+        fits: list[ScanMatch] = []
+        for belief in chain((first,), others):
+            expected.append(belief)
+            for fit in self._sensor.match(belief):
+                fits.append(fit)
+                found = [self._candidate(fit, expected) for fit in fits]
+                if max(found).sure and max(found).near and not self._is_vague(belief):
+                    return found
         if not max(found).sure and (self._is_vague(first) or not max(found).near):
             found += [
                 replace(self._candidate(fit, expected), near=False) for fit in self._sensor.search(first)

@@ -84,11 +84,6 @@ class SpatialMatcher:
         self._last: F64 = np.eye(4)  # pose of the last scan that was not lost
         self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0))  # the scan taken last
 
-    @property
-    def map(self) -> SpaceMap | None:
-        """Return the local map in space; None before the first scan and after `restart`."""
-        return self._map
-
     def restart(self) -> None:
         """Forget the map: the next scan begins a new one."""
         self._map = None
@@ -112,9 +107,9 @@ class SpatialMatcher:
             self._map = SpaceMap(scan, points_m, self._registration, self._projection)
         self._thinned = self._map.thin(scan, points_m)
 
-    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
+    def match(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         """Match from the expected pose."""
-        return [self._matched(belief.pose, belief)]
+        yield self._matched(belief.pose, belief)
 
     def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         """Search in all headings around the last pose, with its height and tilt, and match there.
@@ -354,12 +349,7 @@ class SpaceMap:
         self._above_floor_m: float | None = None  # the base, by the last scan
 
     def __bool__(self) -> bool:
-        return self._added_at is not None and bool(self.surfaces)
-
-    @property
-    def surfaces(self) -> SurfaceMap:
-        """Return the shapes to which scans are registered."""
-        return self._surfaces
+        return self._added_at is not None and bool(self._surfaces)
 
     def thin(self, scan: Scan, points_m: F32) -> ThinnedScan:
         """Downsample the points (N, 3) of a deskewed scan, base frame."""

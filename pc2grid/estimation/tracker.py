@@ -17,6 +17,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -103,21 +104,23 @@ class Tracker:
         continues = self._odometer.continues(scan, seconds)
         # 1. Predict: by odometry, or by constant velocity. An implausible prediction comes last.
         steady = self._smoother.constant_velocity(seconds, turn := self._turn(scan))
-        expected = [self._smoother.after(*steady)]
+        predictions = [partial(self._smoother.after, *steady)]
         if reading is not None and reported is not None:
-            expected.insert(0 if continues else 1, self._smoother.by_odometry(reading))
+            predictions.insert(0 if continues else 1, partial(self._smoother.by_odometry, reading))
+        expected = (predict() for predict in predictions)  # the second only where it is needed
+        first = next(expected)
         # 2. Undo the motion within the scan.
-        motion = invert_pose(self._smoother.belief.pose) @ expected[0].pose
+        motion = invert_pose(self._smoother.belief.pose) @ first.pose
         points = self._deskewed(scan, motion, seconds)
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
-        placed = MatchSelector(self._sensor, self._parameters).place(scan, points, expected)
+        placed = MatchSelector(self._sensor, self._parameters).place(scan, points, first, expected)
         between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
         evidence = ScanFactors(seconds, reading, continues, placed.alone, between)
         estimate = self._estimated(placed, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
         health = self._judged(placed, estimate, evidence)
         sure = placed.sure and not placed.first
-        if self._standstill.left(scan, sure=sure) and self._sensor.fits_last(expected[0]):
+        if self._standstill.left(scan, sure=sure) and self._sensor.fits_last(first):
             self._walls_changed, health = True, self._health.give_up()
         pose = self._sensor.levelled(estimate.pose)
         tracked = self._finish(scan, points, pose, health)
@@ -302,19 +305,19 @@ class Odometer:
     def __init__(self, begin_ns: int = 0, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
         self._parameters, self._begin_ns = parameters, begin_ns
         self._scans = 0
-        self._last: tuple[F64, F64] | None = None  # T_odom_base and T_session_base
+        self._last: tuple[F64, F64] | None = None  # T_base_odom and T_session_base
 
     def remember(self, scan: Scan, pose: F64) -> None:
         """Keep the reading of a scan, if it has one, with its final pose (4, 4)."""
         self._scans += 1
         if scan.T_odom_base is not None:
-            self._last = scan.T_odom_base, pose
+            self._last = invert_pose(scan.T_odom_base), pose
 
     def reported(self, scan: Scan) -> F64 | None:
         """Return the motion (4, 4) since the last reading; None if there is none."""
         if scan.T_odom_base is None or self._last is None:
             return None
-        return invert_pose(self._last[0]) @ scan.T_odom_base
+        return self._last[0] @ scan.T_odom_base
 
     def continues(self, scan: Scan, seconds: float) -> bool:
         """Return True if odometry continues from its last reading; `seconds` since the last scan.

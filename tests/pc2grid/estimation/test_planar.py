@@ -46,11 +46,13 @@ def expected(x: float, sigma: float) -> PoseWithCovariance:
 
 @dataclass
 class Sensor:
-    """Its matches are given: near where it is expected, and by search."""
+    """Its matches are given: near where it is expected, from where KISS-ICP has brought it, and by search."""
 
     near: ScanMatch
     elsewhere: Sequence[ScanMatch] = ()
+    registered: Sequence[ScanMatch] = ()
     searched: int = 0
+    brought: int = 0
     free = PLANAR
     ground = None
 
@@ -62,8 +64,10 @@ class Sensor:
 
     def take(self, *of_scan: object) -> None: ...
 
-    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
-        return [self.near]
+    def match(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
+        yield self.near
+        self.brought += 1
+        yield from self.registered
 
     def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         self.searched += 1
@@ -85,7 +89,7 @@ class Sensor:
 
 
 def placed(sensor: Sensor, belief: PoseWithCovariance) -> MatchedScan:
-    return MatchSelector(sensor).place(SCAN, SCAN.points_m, [belief])  # type: ignore[arg-type]
+    return MatchSelector(sensor).place(SCAN, SCAN.points_m, belief)  # type: ignore[arg-type]
 
 
 def test_what_fits_where_it_is_expected_is_not_searched_for() -> None:
@@ -93,6 +97,30 @@ def test_what_fits_where_it_is_expected_is_not_searched_for() -> None:
     found = placed(sensor, expected(0.0, 0.02))
     assert found.alone is not None and found.alone[0][0, 3] == 0.01
     assert found.alone[1] == pytest.approx(EXACT) and not sensor.searched
+
+
+@pytest.mark.parametrize(
+    ("sigma", "fits", "brought"), [(0.02, True, False), (0.02, False, True), (0.5, True, True)]
+)
+def test_a_scan_is_matched_once_where_it_can_be_nowhere_else(sigma: float, fits: bool, brought: bool) -> None:
+    """Where it is known to centimetres and fits; else KISS-ICP brings it near; the better match counts."""
+    sensor = Sensor(fit_at(0.01, evidence=50.0, fits=fits), registered=[fit_at(0.04, evidence=100.0)])
+    found = placed(sensor, expected(0.0, sigma))
+    assert bool(sensor.brought) is brought and found.pose[0, 3] == (0.04 if brought else 0.01)
+
+
+def test_a_less_credible_prediction_is_made_only_for_a_scan_that_does_not_fit_the_first() -> None:
+    made = []
+
+    def another() -> Iterator[PoseWithCovariance]:
+        made.append(True)
+        yield expected(0.01, 0.02)
+
+    for at, needed in ((0.01, False), (0.5, True)):
+        sensor = Sensor(fit_at(at, evidence=100.0))
+        selector = MatchSelector(sensor)  # type: ignore[arg-type]
+        selector.place(SCAN, SCAN.points_m, expected(0.0, 0.02), another())
+        assert bool(made) is needed
 
 
 def test_what_may_be_far_off_and_does_not_fit_is_searched_for() -> None:
