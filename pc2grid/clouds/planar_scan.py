@@ -136,10 +136,9 @@ def project_to_plane(
         cell_m = config.resolution_m
     # Two standard deviations of the noise on either side of the mean.
     depths = (cell_m, 4.0 * model.noise_per_m2)
-    nearest, reach, surfaces = scan_bearings(
-        points, origin, plane, band, config.max_range_m, depths, BEARINGS
+    free, surfaces = scan_bearings(
+        points, origin, plane, band, config.max_range_m, depths, BEARINGS, parameters.max_gap_bins
     )
-    free = fill_gaps(np.where(np.isfinite(nearest), nearest, reach), parameters.max_gap_bins)
     hits = mean_per_cell(surfaces, cell_m)
     seen_at = np.empty(0, np.uint8)
     if ground is not None:
@@ -165,19 +164,6 @@ def mean_per_cell(sums: F64, cell_m: float) -> F32:
     total = np.column_stack([np.bincount(cell, weights) for weights in sums.T])[np.argsort(first)]
     means: F32 = (total[:, :2] / total[:, 2:]).astype(np.float32)
     return means
-
-
-def fill_gaps(free_m: F64, max_gap_bins: int) -> F64:
-    """Return free ranges (B,) in which narrow gaps, zeros between two ranges, take the shorter of the two."""
-    filled = free_m.copy()
-    right = np.flatnonzero(free_m > 0.0)
-    left = np.roll(right, 1)
-    gap = (right - left - 1) % len(free_m)
-    shorter = np.minimum(free_m[left], free_m[right])
-    for step in range(1, max_gap_bins + 1):
-        inside = (gap >= step) & (gap <= max_gap_bins)
-        filled[(left[inside] + step) % len(free_m)] = shorter[inside]
-    return filled
 
 
 def planar_normals(hits_m: F32, origin_m: F64, parameters: CloudParameters = CLOUD_PARAMETERS) -> F32:
@@ -271,16 +257,18 @@ def scan_bearings(
     limit: float,
     depths: tuple[float, float],
     bearings: int,
-) -> tuple[F64, F64, F64]:
+    most_between: int,
+) -> tuple[F64, F64]:
     """Sort points (N, 3) by bearing.
 
     sensor : (3,). plane : (4,) with height = plane[:3] . p + plane[3]. band : lowest and highest height of an
     obstacle. limit : farthest range of an obstacle point. depths : (d, q), obstacle points of one bearing
-    belong to one surface up to a range difference of d + q * range**2.
+    belong to one surface up to a range difference of d + q * range**2. most_between : as many bearings of
+    which nothing is known take the shorter range of the two beside them.
 
-    Returns for each bearing the range of the nearest obstacle (inf: none) and the range up to which floor and
-    ceiling show it to be free (0: none), and for each surface (S, 3) the sums of x and y of its points and
-    their number, by increasing bearing and range.
+    Returns for each bearing how far it is free, up to the nearest obstacle or as far as floor and ceiling
+    show it (0: not at all), and for each surface (S, 3) the sums of x and y of its points and their number,
+    by increasing bearing and range.
 
     Measured: 0.6 ms instead of 23 ms a scan of a lidar, 0.015 instead of 0.7 ms of a planar laser.
     """
@@ -338,7 +326,17 @@ def scan_bearings(
             surfaces[found - 1, 0] += points[k, 0]
             surfaces[found - 1, 1] += points[k, 1]
             surfaces[found - 1, 2] += 1.0
-    return nearest, reach, surfaces[:found].copy()
+        if nearest[b] < math.inf:
+            reach[b] = nearest[b]
+    last = -1
+    for b in range(bearings + most_between + 1):  # once round, and on over a gap at the first bearing
+        at = b % bearings
+        if reach[at] > 0.0:
+            if last >= 0 and b - last <= most_between + 1:
+                for between in range(last + 1, b):
+                    reach[between % bearings] = min(reach[last % bearings], reach[at])
+            last = b
+    return reach, surfaces[:found].copy()
 
 
 @compiled()

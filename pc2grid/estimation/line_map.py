@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pc2grid.geometry import F32, F64, SE2, SUBPIXEL_BITS, BoolGrid, polygon_corners, skew, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, SUBPIXEL_BITS, U8, polygon_corners, wrap_angle
 from pc2grid.libraries import compiled
 
 
@@ -194,17 +194,14 @@ class PointGrid:
         self._moments = np.zeros((256, parameters.sectors, 6), dtype=np.float64)
         self._used = 0
         self._free = np.zeros((height, width), dtype=np.uint8)
-
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Return the numbers of rows (y) and columns (x)."""
-        return self._index.shape[0], self._index.shape[1]
+        self.shape: tuple[int, int] = self._free.shape  # rows (y) and columns (x)
 
     def add(self, points_m: NDArray[np.floating], normal_rad: NDArray[np.floating]) -> None:
         """Add points (N, 2) with the directions (N,) of their surface normals, in the map frame."""
-        points = np.asarray(points_m, dtype=np.float64)
-        row, column, inside = self._cells(points)
-        x, y = (points[inside] - self.low_m).T
+        relative_m = np.asarray(points_m, dtype=np.float64) - self.low_m
+        column, row = np.floor(relative_m / self.cell_m).astype(np.int64).T
+        inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
+        x, y = relative_m[inside].T
         cell = row[inside] * self.shape[1] + column[inside]
         cells = self._index.reshape(-1)
         fresh = np.unique(cell[cells[cell] < 0])
@@ -215,29 +212,21 @@ class PointGrid:
             self._moments = np.concatenate((self._moments, room))
         sector = sector_of(np.asarray(normal_rad, np.float64)[inside], self._parameters.sectors)
         slot = cells[cell] * self._parameters.sectors + sector
-        changed, group = np.unique(slot, return_inverse=True)
-        flat = self._moments.reshape(-1, 6)
-        for moment, weights in enumerate((np.ones_like(x), x, y, x * x, x * y, y * y)):
-            flat[changed, moment] += np.bincount(group, weights, len(changed))
+        moments = np.column_stack((np.ones_like(x), x, y, x * x, x * y, y * y))
+        at = 6 * slot[:, None] + np.arange(6)
+        np.add.at(self._moments.reshape(-1), at.reshape(-1), moments.reshape(-1))
 
     def clear(self, outline_m: F64) -> None:
         """Mark the ground within an outline (B, 2) as free, but for its border, which may be a wall."""
-        corners = [polygon_corners((outline_m - self.low_m) / self.cell_m)]
-        inside = np.zeros_like(self._free)
-        cv2.fillPoly(inside, corners, 1, shift=SUBPIXEL_BITS)
-        cv2.polylines(inside, corners, True, 0, thickness=_BORDER_CELLS, shift=SUBPIXEL_BITS)
-        self._free |= inside
-
-    def free(self, points_m: F64) -> float:
-        """Return the share of points (N, 2), in the map frame, on free ground."""
-        row, column, inside = self._cells(points_m)
-        return float(self._free[row[inside], column[inside]].sum()) / max(len(points_m), 1)
-
-    def _cells(self, points_m: F64) -> tuple[NDArray[np.int64], NDArray[np.int64], BoolGrid]:
-        """Return rows (N,) and columns (N,) of points (N, 2), and a mask (N,) of those on the map."""
-        column, row = np.floor((points_m - self.low_m) / self.cell_m).astype(np.int64).T
-        inside = (row >= 0) & (row < self.shape[0]) & (column >= 0) & (column < self.shape[1])
-        return row, column, inside
+        corners = polygon_corners((outline_m - self.low_m) / self.cell_m)
+        x, y, width, height = cv2.boundingRect(corners >> SUBPIXEL_BITS)
+        first = np.maximum(np.array([x, y], np.int32) - _BORDER_CELLS, 0)
+        end = np.maximum((x + width + _BORDER_CELLS, y + height + _BORDER_CELLS), 0)
+        part = self._free[first[1] : end[1], first[0] : end[0]]
+        if part.size:
+            corners -= first << SUBPIXEL_BITS
+            inside = cv2.fillPoly(np.zeros_like(part), [corners], 1, shift=SUBPIXEL_BITS)
+            part |= cv2.erode(inside, np.ones((_BORDER_CELLS, _BORDER_CELLS), np.uint8))
 
     def likelihood(self, sigma_m: float) -> F32:
         """Return the likelihood field (H, W), 0..1, of the cells that hold points."""
@@ -260,7 +249,7 @@ class PointGrid:
         Points, normals and prior are as of `match`.
         """
         p, points = self._parameters, np.asarray(points_m, np.float64)
-        *_, information, _ = self._aligned(
+        *_, information, _, _ = self._aligned(
             points, normal_rad, registered, prior, prior_information, p.radii_cells[:1]
         )
         turn_rad = wrap_angle(registered.yaw - prior.yaw)
@@ -285,7 +274,7 @@ class PointGrid:
         x, y, yaw. radii : half widths of the neighbourhood, as `MatchingParameters.radii_cells`, its default.
         """
         p, points = self._parameters, np.asarray(points_m, np.float64)
-        placed, by_points, information, found = self._aligned(
+        placed, by_points, information, found, contradicted = self._aligned(
             points, normal_rad, guess, prior, prior_information, radii or p.radii_cells
         )
         xx, xy, xt, yy, yt, tt = information
@@ -293,13 +282,13 @@ class PointGrid:
         t = tt + 1e-9
         a, b, d = xx - xt * xt / t, xy - xt * yt / t, yy - yt * yt / t
         least = 0.5 * (a + d) - math.hypot(0.5 * (a - d), b)
-        overlap = found / max(len(points), 1)
+        count = max(len(points), 1)
         return LineMatch(
             placed,
             by_points,
             np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]]),
-            overlap,
-            min(self.free(placed.apply(points)), 1.0 - overlap),
+            found / count,
+            contradicted / count,
             least > p.least_points / self.cell_m**2,
         )
 
@@ -311,12 +300,13 @@ class PointGrid:
         prior: SE2,
         prior_information: F64,
         radii: tuple[int, ...],
-    ) -> tuple[SE2, SE2, tuple[float, ...], int]:
+    ) -> tuple[SE2, SE2, tuple[float, ...], int, int]:
         """Return the results of `aligned`, in the map frame."""
         p, (low_x, low_y) = self._parameters, self.low_m.tolist()
-        pose, alone, information, found = aligned(
+        pose, alone, information, found, contradicted = aligned(
             self._index,
             self._moments,
+            self._free,
             points_m,
             np.asarray(normal_rad, np.float64),
             (guess.x - low_x, guess.y - low_y, guess.yaw),
@@ -324,12 +314,13 @@ class PointGrid:
             tuple(prior_information[_UPPER].tolist()),
             self.cell_m,
             np.array(radii),
+            np.full((len(points_m) + 1, 6), -1.0),
             p.residual_scale_m,
             p.prior_scale,
             p.converged,
         )
         placed, by_points = (SE2(x + low_x, y + low_y, wrap_angle(yaw)) for x, y, yaw in (pose, alone))
-        return placed, by_points, information, found
+        return placed, by_points, information, found, contradicted
 
 
 _UPPER = np.triu_indices(3)
@@ -425,10 +416,10 @@ def inverse_adjoint(motion: F64) -> F64:
 
     It maps a change of a pose to the change of the pose after the motion.
     """
-    R = motion[:3, :3].T
+    R, (x, y, z) = motion[:3, :3].T, motion[:3, 3].tolist()
     result = np.zeros((6, 6))
     result[:3, :3] = result[3:, 3:] = R
-    result[:3, 3:] = -R @ skew(motion[None, :3, 3])[0]
+    result[:3, 3:] = R @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
     return result
 
 
@@ -448,6 +439,7 @@ _DAMPING = 1e-6  # so that directions that no point measures can be solved for
 def aligned(
     index: NDArray[np.int32],
     moments: F64,
+    free: U8,
     points: F64,
     normal_rad: F64,
     guess: tuple[float, float, float],
@@ -455,19 +447,22 @@ def aligned(
     prior_information: tuple[float, float, float, float, float, float],
     cell_m: float,
     radii: NDArray[np.int64],
+    lines: F64,
     residual_scale_m: float,
     prior_scale: float,
     converged: float,
-) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], int]:
+) -> tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], int, int]:
     """Minimise the point-to-line distances by Gauss-Newton with a prior, one radius of `radii` an iteration.
 
-    index : (H, W) row of `moments` (K, sectors, 6) for each cell, or -1. points : (N, 2) and normal_rad :
-    (N,) in their frame. guess, prior : poses of that frame from the corner of cell (0, 0). prior_information
-    : of x, y, yaw, the upper triangle row by row. radii : half widths in cells of the neighbourhood.
+    index : (H, W) row of `moments` (K, sectors, 6) for each cell, or -1. free : (H, W) 1 where the ground is
+    free. points : (N, 2) and normal_rad : (N,) in their frame. guess, prior : poses of that frame from the
+    corner of cell (0, 0). prior_information : of x, y, yaw, the upper triangle row by row. radii : half
+    widths in cells of the neighbourhood. lines : (N + 1, 6) room for the line that each point has
+    found, filled with -1.
     residual_scale_m, prior_scale, converged : see `MatchingParameters`.
 
     Returns the pose; the pose by the points alone, linearised at the last iteration, with its information
-    (the upper triangle); and the number of points with a line there.
+    (the upper triangle); the number of points with a line there, and of those without one on free ground.
 
     Measured: 0.03 ms an iteration instead of 7 ms for 290 points of a planar laser.
     """
@@ -479,8 +474,7 @@ def aligned(
         at, scale_m = (x, y, yaw), residual_scale_m * radius
         hxx = hxy = hxt = hyy = hyt = htt = gx = gy = gt = 0.0
         c, s = math.cos(yaw), math.sin(yaw)
-        found, last_row, last_column, last_sector = 0, -1, -1, -1
-        mx = my = nx = ny = straight = 0.0
+        found, contradicted = 0, 0
         for k in range(points.shape[0]):
             rx = c * points[k, 0] - s * points[k, 1]
             ry = s * points[k, 0] + c * points[k, 1]
@@ -488,17 +482,21 @@ def aligned(
             if row < radius or column < radius or row >= height - radius or column >= width - radius:
                 continue
             sector = round((normal_rad[k] + yaw) * (sectors / (2.0 * math.pi))) % sectors
-            if row != last_row or column != last_column or sector != last_sector:
-                # The line of the points around; neighbours on a wall share it.
-                last_row, last_column, last_sector, straight = row, column, sector, 0.0
-                n = sx = sy = sxx = sxy = syy = 0.0
+            # What the line depends on, as one number: the radius is less than the height.
+            code = float(((row * width + column) * sectors + sector) * height + radius)
+            if lines[k + 1, 0] != code and lines[k, 0] == code:  # neighbours on a wall share it
+                for part in range(6):
+                    lines[k + 1, part] = lines[k, part]
+            elif lines[k + 1, 0] != code:
+                # The line of the points around.
+                mx = my = nx = ny = straight = n = sx = sy = sxx = sxy = syy = 0.0
+                before, after = (sector + sectors - 1) % sectors, (sector + 1) % sectors
                 for i in range(row - radius, row + radius + 1):
                     for j in range(column - radius, column + radius + 1):
                         cell = index[i, j]
                         if cell < 0:
                             continue
-                        for beside in range(sector + sectors - 1, sector + sectors + 2):
-                            m = beside % sectors
+                        for m in (before, sector, after):
                             n += moments[cell, m, 0]
                             sx += moments[cell, m, 1]
                             sy += moments[cell, m, 2]
@@ -516,7 +514,12 @@ def aligned(
                         )  # of the line; its normal is a quarter turn on
                         nx, ny = -math.sin(angle), math.cos(angle)
                         straight = 1.0 - max(middle - spread, 0.0) / (middle + spread)
+                lines[k + 1, 0], lines[k + 1, 1], lines[k + 1, 2] = code, mx, my
+                lines[k + 1, 3], lines[k + 1, 4], lines[k + 1, 5] = nx, ny, straight
+            mx, my, nx, ny = lines[k + 1, 1], lines[k + 1, 2], lines[k + 1, 3], lines[k + 1, 4]
+            straight = lines[k + 1, 5]
             if straight == 0.0:
+                contradicted += free[row, column]
                 continue
             r = nx * (rx + x - mx) + ny * (ry + y - my)
             found += 1
@@ -546,7 +549,7 @@ def aligned(
     step = _solved((hxx, hxy, hxt, hyy, hyt, htt), (-gx, -gy, -gt))
     alone = at[0] + step[0], at[1] + step[1], at[2] + step[2]
     information = unit * hxx, unit * hxy, unit * hxt, unit * hyy, unit * hyt, unit * htt
-    return (x, y, yaw), alone, information, found
+    return (x, y, yaw), alone, information, found, contradicted
 
 
 @compiled(error_model="numpy")

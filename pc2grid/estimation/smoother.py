@@ -113,8 +113,8 @@ class PoseWithCovariance:
     @cached_property
     def sigmas(self) -> tuple[float, float]:
         """Return the largest standard deviation of the position (m) and of the turn (rad)."""
-        position = self.free < 3
-        largest = (np.linalg.eigvalsh(self.covariance[np.ix_(k, k)])[-1] for k in (position, ~position))
+        n = np.count_nonzero(self.free < 3)
+        largest = (np.linalg.eigvalsh(self.covariance[k, k])[-1] for k in (np.s_[:n], np.s_[n:]))
         of_position_m, of_turn_rad = (math.sqrt(variance) for variance in largest)
         return of_position_m, of_turn_rad
 
@@ -364,8 +364,8 @@ class Smoother:
             H, g, self._drift_scale = normal_equations(
                 state, self._window, self._prior, self._free, p, self._drift_scale, n
             )
-            H[np.diag_indices(len(g))] += _DAMPING
-            factor, delta, failed = dposv(H, -g)
+            H.flat[:: len(g) + 1] += _DAMPING
+            factor, delta, failed = dposv(H.T, -g, overwrite_a=True)
             if failed:
                 raise np.linalg.LinAlgError("the information of the smoother is not positive definite")
             changes = np.zeros((2, n, 6))

@@ -296,16 +296,17 @@ def scan_bearings_plain(
     limit: float,
     depths: tuple[float, float],
     bearings: int,
-) -> tuple[F64, F64, F64]:
+    most_between: int,
+) -> tuple[F64, F64]:
     """Sort points (N, 3) by bearing, in plain numpy.
 
     sensor : (3,). plane : (4,) with height = plane[:3] . p + plane[3]. band : lowest and highest height of
     an obstacle. limit : farthest range of an obstacle point. depths : (d, q), obstacle points of one
-    bearing belong to one surface up to a range difference of d + q * range**2.
+    bearing belong to one surface up to a range difference of d + q * range**2. most_between : as many
+    bearings of which nothing is known take the shorter range of the two beside them.
 
-    Returns for each bearing the range of the nearest obstacle (inf: none) and how far floor and ceiling
-    show it to be free (0: not at all), and for each surface (S, 3) the sums of x and y of its points and
-    their number, by increasing bearing and range.
+    Returns for each bearing how far it is free (0: not at all), and for each surface (S, 3) the sums of x
+    and y of its points and their number, by increasing bearing and range.
     """
     away = points[:, :2].astype(np.float64) - sensor[:2]
     ranges = np.hypot(away[:, 0], away[:, 1])
@@ -329,7 +330,21 @@ def scan_bearings_plain(
             last, first_m = bearing[k], ranges[k]
             surfaces.append(np.zeros(3))
         surfaces[-1] += points[k, 0], points[k, 1], 1.0
-    return nearest, reach, np.array(surfaces).reshape(-1, 3)
+    free = np.where(np.isfinite(nearest), nearest, reach)
+    return fill_gaps(free, most_between), np.array(surfaces).reshape(-1, 3)
+
+
+def fill_gaps(free_m: F64, most_between: int) -> F64:
+    """Return free ranges (B,) in which narrow gaps, zeros between two ranges, take the shorter of the two."""
+    filled = free_m.copy()
+    right = np.flatnonzero(free_m > 0.0)
+    left = np.roll(right, 1)
+    gap = (right - left - 1) % len(free_m)
+    shorter = np.minimum(free_m[left], free_m[right])
+    for step in range(1, most_between + 1):
+        inside = (gap >= step) & (gap <= most_between)
+        filled[(left[inside] + step) % len(free_m)] = shorter[inside]
+    return filled
 
 
 @pytest.mark.parametrize("count", [3, 4, 9])
@@ -379,7 +394,7 @@ def test_bearings_are_sorted_as_by_their_definition(ground: bool) -> None:
     sensor = np.array([0.1, 0.2, 0.7])
     plane = np.array([0.01, -0.02, 1.0, 0.05]) if ground else np.zeros(4)
     band = (0.2, 1.8) if ground else (-math.inf, math.inf)
-    for depths in ((0.05, 0.0), (0.05, 0.006)):
-        arguments = (points, sensor, plane, band, 5.0, depths, 360)
+    for depths, count in (((0.05, 0.0), 3000), ((0.05, 0.006), 3000), ((0.05, 0.0), 150), ((0.05, 0.0), 1)):
+        arguments = (points[:count], sensor, plane, band, 5.0, depths, 360, 3)
         for found, expected in zip(scan_bearings(*arguments), scan_bearings_plain(*arguments), strict=True):
             assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)

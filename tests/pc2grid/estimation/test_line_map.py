@@ -170,6 +170,10 @@ def test_free_ground_contradicts_what_is_placed_there_and_unknown_ground_does_no
     assert placed(0.0) == (1.0, 0.0)  # the wall itself bounds the free ground, and is no part of it
     assert placed(-2.0) == (0.0, 1.0)  # in the middle of the room
     assert placed(2.0) == (0.0, 0.0)  # behind the wall
+    grid.clear(np.array([(1.5, 4.6), (7.5, 4.6), (7.5, 9.5), (1.5, 9.5)]))  # also beyond the map
+    overlap, contradicted = placed(2.0)
+    assert overlap == 0.0 and contradicted == pytest.approx(0.77, abs=0.05)  # but for the border of it
+    grid.clear(np.array([(-9.0, -9.0), (-8.0, -9.0), (-8.0, -8.0)]))  # nothing of it is on the map
 
 
 def test_moments_of_points_added_in_parts_are_those_of_all_at_once() -> None:
@@ -212,9 +216,12 @@ def test_a_match_is_that_of_its_definition(sigma: float, turns: int, radii: tupl
         *(np.array(radii), 0.05, 2.0, 1e-4),
     )
     upper = np.triu_indices(3)
-    *poses, found_information, found = aligned(
-        *arguments[:4], tuple(guess), tuple(prior), tuple(information[upper]), *arguments[7:]
-    )
+    *poses, found_information, found, contradicted = aligned(
+        *arguments[:2], np.ones(grid.shape, np.uint8), *arguments[2:4],
+        *(tuple(guess), tuple(prior), tuple(information[upper])), *arguments[7:9],
+        *(np.full((len(points) + 1, 6), -1.0), *arguments[9:]),
+    )  # fmt: skip
+    assert found + contradicted == len(points)  # all of them lie on the map
     *plain, plain_information, plain_found = aligned_plain(*arguments)
     assert found == plain_found
     assert found_information == pytest.approx(plain_information[upper], rel=1e-9, abs=1e-9)

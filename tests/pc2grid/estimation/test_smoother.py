@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pc2grid.estimation.line_map import Steps, moved, skew, steps
+from pc2grid.estimation.line_map import Steps, moved, steps
 from pc2grid.estimation.smoother import (
     IN_THE_HAND,
     PLANAR,
@@ -20,7 +20,7 @@ from pc2grid.estimation.smoother import (
     _without,
     normal_equations,
 )
-from pc2grid.geometry import F64, SE2, invert_pose, motion_size, pose_from_rotation_vector
+from pc2grid.geometry import F64, SE2, invert_pose, motion_size, pose_from_rotation_vector, skew
 from tests.helpers.plain_smoother import plain_equations
 
 
