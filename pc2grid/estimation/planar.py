@@ -84,13 +84,16 @@ class PlanarMatcher:
         self._points_m = self._floor.remove(points_m)
         self._planar_scan, self._unaided = self._project(scan, points_m), scan.T_odom_base is None
 
-    def match(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
-        """Match from the expected pose and from that of KISS-ICP: along a corridor KISS-ICP tends to stand
-        still.
-        """
-        yield self._matched(self._maps, SE2.from_matrix(belief.pose), belief)
-        registered = self._kiss.register(self._points_m, self.levelled(belief.pose))
-        yield self._matched(self._maps, SE2.from_matrix(registered), belief)
+    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
+        """Match from the expected pose and, if KISS-ICP brings half of the hits into other cells, from its
+        pose, too: along a corridor KISS-ICP tends to stand still."""
+        expected = SE2.from_matrix(belief.pose)
+        registered = SE2.from_matrix(self._kiss.register(self._points_m, self.levelled(belief.pose)))
+        hits_m = self._planar_scan.hits_m
+        moved_m = np.linalg.norm((expected.inverse() @ registered).apply(hits_m) - hits_m, axis=1)
+        elsewhere = len(hits_m) > 0 and np.median(moved_m) > self._matching.cell_m
+        starts = (expected, registered) if elsewhere else (expected,)
+        return [self._matched(self._maps, start, belief) for start in starts]
 
     def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         """Search the window of the belief, and match the best placements."""

@@ -64,8 +64,8 @@ class ScanMatcher(Protocol):
     def __bool__(self) -> bool:
         """Return True if there is a local map."""
 
-    def match(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
-        """Match the scan taken last with the local map, from the expected pose, and from that of KISS-ICP.
+    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
+        """Match the scan taken last with the local map, from the expected pose or that of KISS-ICP, or both.
 
         KISS-ICP begins at the belief, which is also the prior of all matches.
         """
@@ -176,11 +176,10 @@ class MatchSelector:
         fits: list[ScanMatch] = []
         for belief in chain((first,), others):
             expected.append(belief)
-            for fit in self._sensor.match(belief):
-                fits.append(fit)
-                found = [self._candidate(fit, expected) for fit in fits]
-                if max(found).sure and max(found).near and not self._is_vague(belief):
-                    return found
+            fits += self._sensor.match(belief)
+            found = [self._candidate(fit, expected) for fit in fits]
+            if max(found).sure and max(found).near and not self._is_vague(belief):
+                return found
         if not max(found).sure and (self._is_vague(first) or not max(found).near):
             found += [
                 replace(self._candidate(fit, expected), near=False) for fit in self._sensor.search(first)

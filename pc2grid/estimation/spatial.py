@@ -107,9 +107,9 @@ class SpatialMatcher:
             self._map = SpaceMap(scan, points_m, self._registration, self._projection)
         self._thinned = self._map.thin(scan, points_m)
 
-    def match(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
+    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
         """Match from the expected pose."""
-        yield self._matched(belief.pose, belief)
+        return [self._matched(belief.pose, belief)]
 
     def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         """Search in all headings around the last pose, with its height and tilt, and match there.

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from pc2grid.estimation.ground_model import GroundModel, is_rolling
+from pc2grid.estimation.planar import PlanarMatcher
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.scan_matching import MatchedScan, MatchSelector, ScanMatch
 from pc2grid.estimation.smoother import PLANAR, PoseWithCovariance
@@ -20,7 +21,7 @@ from pc2grid.geometry import F64, SE2, pose_from_rotation_vector
 from pc2grid.io.recording import open_log
 from pc2grid.model import Health, Scan
 from pc2grid.pipeline import follow
-from pc2grid.settings import Config, RegistrationConfig
+from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.config import LidarConfig
 from tests.helpers.field import DATA
@@ -46,13 +47,11 @@ def expected(x: float, sigma: float) -> PoseWithCovariance:
 
 @dataclass
 class Sensor:
-    """Its matches are given: near where it is expected, from where KISS-ICP has brought it, and by search."""
+    """Its matches are given: near where it is expected, and by search."""
 
     near: ScanMatch
     elsewhere: Sequence[ScanMatch] = ()
-    registered: Sequence[ScanMatch] = ()
     searched: int = 0
-    brought: int = 0
     free = PLANAR
     ground = None
 
@@ -64,10 +63,8 @@ class Sensor:
 
     def take(self, *of_scan: object) -> None: ...
 
-    def match(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
-        yield self.near
-        self.brought += 1
-        yield from self.registered
+    def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
+        return [self.near]
 
     def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         self.searched += 1
@@ -97,16 +94,6 @@ def test_what_fits_where_it_is_expected_is_not_searched_for() -> None:
     found = placed(sensor, expected(0.0, 0.02))
     assert found.alone is not None and found.alone[0][0, 3] == 0.01
     assert found.alone[1] == pytest.approx(EXACT) and not sensor.searched
-
-
-@pytest.mark.parametrize(
-    ("sigma", "fits", "brought"), [(0.02, True, False), (0.02, False, True), (0.5, True, True)]
-)
-def test_a_scan_is_matched_once_where_it_can_be_nowhere_else(sigma: float, fits: bool, brought: bool) -> None:
-    """Where it is known to centimetres and fits; else KISS-ICP brings it near; the better match counts."""
-    sensor = Sensor(fit_at(0.01, evidence=50.0, fits=fits), registered=[fit_at(0.04, evidence=100.0)])
-    found = placed(sensor, expected(0.0, sigma))
-    assert bool(sensor.brought) is brought and found.pose[0, 3] == (0.04 if brought else 0.01)
 
 
 def test_a_less_credible_prediction_is_made_only_for_a_scan_that_does_not_fit_the_first() -> None:
@@ -189,6 +176,22 @@ def test_kiss_icp_brings_a_scan_near_and_the_control_leaves_it_where_it_was() ->
         found.append(registration.register(walls, guess))
     assert np.abs(found[0] - np.eye(4)).max() < 0.05
     assert np.array_equal(found[1], guess)
+
+
+@pytest.mark.parametrize(("by_m", "beginnings"), [(0.05, 1), (0.2, 2)])
+def test_a_scan_is_matched_twice_where_kiss_icp_brings_it_elsewhere(
+    by_m: float, beginnings: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Within a cell both matches end at one place."""
+    _, walls = hall()
+    scan = scan_of(walls, mounted_m=1.0)
+    matcher = PlanarMatcher(RegistrationConfig(), ProjectionConfig())
+    matcher.start(scan, scan.points_m)
+    matcher.cut(scan, scan.points_m, np.eye(4), lost=False)
+    matcher.extend(np.eye(4))
+    matcher.take(scan, scan.points_m)
+    monkeypatch.setattr(KissRegistration, "register", lambda *given: SE2(by_m, 0.0, 0.0).lift())
+    assert len(matcher.match(expected(0.0, 0.02))) == beginnings
 
 
 @needs_data
