@@ -283,8 +283,9 @@ def open_live(target: str, config: ReadConfig | None = None) -> LiveLog:
     Raises LiveError if the robot cannot be reached, LogNotFound and what `open_log` raises.
 
     >>> with open_live("monday.mcap") as live:
-    ...     live.choose().topic, sum(1 for scan in live.scans()) > 10
-    ('/scan', True)
+    ...     scan = next(live.scans())
+    ...     live.choose().topic, scan.sensor
+    ('/scan', 'laser')
     """
     config = config or ReadConfig()
     if is_robot(target):
