@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import itertools
 import math
+import struct
+import zlib
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +31,7 @@ def nav2_map(yaml_path: Path) -> tuple[np.ndarray, float, tuple[float, float]]:
     """A map as nav2's map server reads it, by another implementation: cells, metres a cell, origin."""
     keys = yaml.safe_load(yaml_path.read_text())
     pixels = cv2.imread(str(yaml_path.parent / keys["image"]), cv2.IMREAD_GRAYSCALE)
-    states = np.array([oracle(grey, keys, keys["mode"]) for grey in range(256)])
+    states = np.array([by_nav2([grey], 255, keys) for grey in range(256)])
     cells = states[pixels[::-1]]
     return cells, keys["resolution"], tuple(keys["origin"][:2])
 
@@ -74,16 +76,40 @@ def known_at(edges: Iterable[Any], frames: Sequence[str], stamp_ns: int) -> bool
     return all(first <= stamp_ns <= last for first, last in spans.values())
 
 
-def oracle(grey: int, keys: dict[str, Any], mode: str) -> int:
-    """The cell of a grey value, 0..255, as the documentation of nav2 defines it."""
-    shade = grey / 255
-    if mode == "raw":
-        return grey if grey <= 100 else -1
+def by_nav2(pixel: Sequence[int], white: int, keys: dict[str, Any]) -> int:
+    """nav2_map_server of Humble, map_io.cpp, `loadMapFromFile`: the cell of a pixel's channels."""
+    colours, alpha = (pixel[:3], pixel[3]) if len(pixel) == 4 else (pixel, None)
+    counted = [*colours, alpha] if alpha is not None and keys["mode"] == "trinary" else colours
+    shade = sum(counted) / (len(counted) * white)
+    if keys["mode"] == "raw":
+        percent = math.floor(shade * 255 + 0.5)
+        return percent if percent <= 100 else -1
+    if keys["mode"] == "scale" and alpha is not None and alpha < white:
+        return -1
     occupied = shade if keys["negate"] else 1 - shade
     if occupied > keys["occupied_thresh"]:
         return 100
     if occupied < keys["free_thresh"]:
         return 0
-    if mode == "trinary":
+    if keys["mode"] == "trinary":
         return -1
     return round((occupied - keys["free_thresh"]) / (keys["occupied_thresh"] - keys["free_thresh"]) * 100)
+
+
+KEYS: dict[str, Any] = {
+    "resolution": 0.05, "origin": [0, 0, 0], "negate": 0, "occupied_thresh": 0.65, "free_thresh": 0.196,
+}  # fmt: skip
+
+
+def map_of(folder: Path, pixels: bytes, name: str = "m.png", /, **keys: object) -> Path:
+    """A map of the image `pixels`, a file of this name. keys : of its YAML, for others than `KEYS`; None: left out."""
+    (folder / name).write_bytes(pixels)
+    path = folder / "m.yaml"
+    known = {"image": name, **KEYS, **keys}
+    path.write_text("".join(f"{key}: {value}\n" for key, value in known.items() if value is not None))
+    return path
+
+
+def png_chunk(kind: bytes, body: bytes) -> bytes:
+    """With the right checksum: damage is caught by it, a liar is not."""
+    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))

@@ -42,6 +42,7 @@ from pc2grid.settings import ReadConfig
 from tests.helpers import foxglove_messages
 from tests.helpers.cloud_folders import folder_of
 from tests.helpers.memory import peak_memory
+from tests.helpers.nav2_map import map_of, png_chunk
 from tests.helpers.recordings import T0, Message, drive, raw_log, read, ros, write_bag, write_mcap
 
 INFO, DEPTH = "/camera/depth/camera_info", "/camera/depth/image_raw"
@@ -172,28 +173,21 @@ refused(12, LimitExceeded, "2147483648 bytes", lambda folder: read(bag_of_a_hole
 # --- images of maps, and of depths --------------------------------------------------------------------
 
 
-def chunk(kind: bytes, body: bytes) -> bytes:
-    """With the right checksum: damage is caught by it, a liar is not."""
-    return struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-
-
 def lying_png(width: int, height: int, bits: int = 8, colour: int = 0, data: bytes = b"") -> bytes:
-    header = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0))
-    return MAGIC + header + chunk(b"IDAT", data or zlib.compress(bytes(64))) + chunk(b"IEND", b"")
+    header = png_chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, bits, colour, 0, 0, 0))
+    return MAGIC + header + png_chunk(b"IDAT", data or zlib.compress(bytes(64))) + png_chunk(b"IEND", b"")
 
 
 def loaded(image: bytes, name: str = "m.png", size: int = 0) -> Act:
     """A map with this image, or one of another name, which may be made larger."""
 
     def act(folder: Path) -> None:
-        (folder / "m.png").write_bytes(image)
+        path = map_of(folder, image, image=name)
         if size:
             os.truncate(folder / "m.png", size)
         if name == "pipe":
             os.mkfifo(folder / "pipe")
-        keys = f"image: {name}\nresolution: 0.05\norigin: [0, 0, 0]\n"
-        (folder / "m.yaml").write_text(keys + "negate: 0\noccupied_thresh: 0.65\nfree_thresh: 0.196\n")
-        load_map(folder / "m.yaml")
+        load_map(path)
 
     return act
 
@@ -214,6 +208,14 @@ for _image, _words in (
     (b"P2 2 2 255\n1 2 3 -4\n", "a damaged image"),
     (b"P2 2 2 255\n1 2 3\n", "a damaged image"),
     (b"P2 2 2 99999\n1 2 3 9\n", "its white is 99999"),
+    (b"\xff\xd8\xff\xc0\x00\x11\x08\x23\x28\x23\x28\x03" + bytes(90), "cannot hold 9000 x 9000"),
+    (b"\xff\xd8\xff\xff\xff\xff\xe0\x00\x02\xff\xc0\x00\x11\x08\0\0\0\x05", "5 x 0 pixels"),
+    (b"\xff\xd8\xff\xe0\x00\x02\x00\xc0\x00\x11\x08\0\x01\0\x05", "its header makes no sense"),
+    (b"\xff\xd8\xff\xe0\x00\x02", "it is cut off"),
+    (b"P5 2 2 65536\n" + bytes(8), "its white is 65536"),
+    (b"P5 2 2\n" + bytes(8), "its white is 0"),
+    (b"P6 9000 9000 255\n" + bytes(99), "cannot hold"),
+    (b"P4 9000 9000\n" + bytes(99), "cannot hold"),
 ):
     refused(46, MapFileError, rf"/m\.png: .*{_words}", loaded(_image))
 refused(
