@@ -102,7 +102,7 @@ KEYS: dict[str, Any] = {
 
 
 def map_of(folder: Path, pixels: bytes, name: str = "m.png", /, **keys: object) -> Path:
-    """A map of the image `pixels`, a file of this name. keys : of its YAML, for others than `KEYS`; None: left out."""
+    """A map with this image. keys : of its YAML, in place of `KEYS`; None: left out."""
     (folder / name).write_bytes(pixels)
     path = folder / "m.yaml"
     known = {"image": name, **KEYS, **keys}

@@ -438,6 +438,7 @@ def test_a_mount_that_is_nowhere_or_turned_nowhere_is_refused_by_name(
     assert any("base_link -> lidar" in warning for warning in report.warnings)
 
 
+@pytest.mark.fault(36)
 def test_a_chain_of_very_many_frames() -> None:
     links = [
         Transform(Header(T0, f"f{i}"), f"f{i + 1}", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))

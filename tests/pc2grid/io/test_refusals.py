@@ -22,6 +22,7 @@ from pc2grid.errors import (
     ConfigError,
     LimitExceeded,
     LogNotFound,
+    LogTruncated,
     MapFileError,
     NotALog,
     Pc2GridError,
@@ -32,9 +33,9 @@ from pc2grid.errors import (
 from pc2grid.io.maps import load_map
 from pc2grid.io.messages import clouds, foxglove
 from pc2grid.io.messages.ros import decoder_for
-from pc2grid.io.messages.types import Header, LaserScan
+from pc2grid.io.messages.types import Header, LaserScan, PointCloud2
 from pc2grid.io.recording import open_log
-from pc2grid.io.sensors import decode
+from pc2grid.io.sensors import decode, pointcloud2
 from pc2grid.io.sensors.depth import MAGIC
 from pc2grid.io.source import TopicInfo
 from pc2grid.io.trajectory import read_tum
@@ -78,8 +79,12 @@ for _head, _words in (
     (b"ply\nformat" + bytes(90), "a PLY cloud.*one file per scan"),
     (b"\0\1\2\3", "binary data of another kind"),
     (b"plain", "text"),
+    (b"version https://git-lfs.github.com/spec/v1\n", "a Git LFS pointer.*git lfs pull"),
 ):
     refused(4, NotALog, rf"a\.mcap: not a recording; looks like {_words}", opened(_head))
+
+
+refused(3, LogTruncated, "ends after its first 8 bytes", opened(b"\x89MCAP0\r\n"))
 
 
 def pipe(folder: Path) -> Path:
@@ -276,6 +281,28 @@ for _kind, _data in (
         20, PointCloudError, f"no whole {_kind}",
         lambda _, kind=_kind, data=_data: decoder_for(topic(kind))(data),
     )  # fmt: skip
+XYZ = [(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
+
+
+def points(*fields: tuple[str, int, int, int], data: bytes = bytes(32), step: int = 16) -> Act:
+    """A cloud of two points of these fields."""
+    cloud = PointCloud2(Header(T0, ""), 1, 2, fields, False, step, 2 * step, data)
+    return lambda _: pointcloud2.decode(cloud)
+
+
+for _fields, _words in (
+    ([*XYZ[:2], ("z", 13, 7, 1)], "field z: ends at byte 17 of a 16-byte point"),
+    ([*XYZ, ("y", 8, 7, 1)], "field y: defined twice"),
+    (XYZ[:2], "field z: missing"),
+    ([("x", 0, 7, 3), *XYZ[1:]], "field x: 3 values per point"),
+):
+    refused(25, PointCloudError, _words, points(*_fields))
+refused(26, PointCloudError, "field x: unknown datatype 77", points(("x", 0, 77, 1), *XYZ[1:]))
+refused(24, PointCloudError, "20 bytes of data where 32 are declared", points(*XYZ, data=bytes(20)))
+refused(
+    32, PointCloudError, r"field t: times that span 1\d+\.0 fit no unit .*point_time",
+    points(*XYZ, ("t", 12, 8, 1), data=struct.pack("<3fd3fd", 1, 2, 3, 0, 1, 2, 3, 1e14), step=20),
+)  # fmt: skip
 refused(
     37, PointCloudError, "a CameraInfo with 101 numbers of distortion",
     lambda _: decoder_for(topic("sensor_msgs/CameraInfo"))(

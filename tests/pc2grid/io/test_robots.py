@@ -191,6 +191,7 @@ def test_the_nearest_odometry_is_taken_and_said(tmp_path: Path) -> None:
     assert words in read(path)[1].warnings
 
 
+@pytest.mark.fault(15)
 @pytest.mark.parametrize(
     ("robots", "topic", "words", "hint"),
     [

@@ -67,11 +67,13 @@ def test_a_laser_of_both_dialects(tmp_path: Path, dialect: str) -> None:
 # --- stamps (33) and gaps (34) ------------------------------------------------------------------------
 
 
+@pytest.mark.fault(33)
 @pytest.mark.parametrize(
     ("bad", "stamp_ns", "reason"),
     [
         (7, 0, "stamp is zero or negative"),
         (3, -5 * STEP, "stamp is zero or negative"),
+        (5, T0 + 4 * STEP, "stamp is a duplicate"),
         (15, T0 + 3 * STEP + 1, "stamp goes back in time"),
         (8, T0 + 8 * STEP + DAY, "stamp jumps"),
     ],
@@ -121,6 +123,7 @@ def test_a_clock_that_was_set_is_continued_and_reported(tmp_path: Path) -> None:
     assert any("jumps forward" in w for w in report.warnings)
 
 
+@pytest.mark.fault(34)
 def test_a_gap_is_reported_and_not_bridged_by_odometry(tmp_path: Path) -> None:
     to = ros()
     gap = 30 * 10**9
@@ -142,9 +145,8 @@ def test_a_gap_is_reported_and_not_bridged_by_odometry(tmp_path: Path) -> None:
 
 # --- schemas (17, 19) and checksums (8) ---------------------------------------------------------------
 
-# As rosidl_adapter writes it for a LaserScan, reduced to what a parser has to cope with.
 
-
+@pytest.mark.fault(17)
 def test_the_same_type_in_two_schema_records(tmp_path: Path) -> None:
     schema = ros().schema("sensor_msgs/LaserScan")
     name = "sensor_msgs/msg/LaserScan"
@@ -164,6 +166,7 @@ def test_the_same_type_in_two_schema_records(tmp_path: Path) -> None:
     assert len(read(one)[0]) == 2
 
 
+@pytest.mark.fault(8)
 @pytest.mark.parametrize("chunked", [True, False])
 def test_absent_checksums_are_said(tmp_path: Path, chunked: bool) -> None:
     options = {"enable_crcs": False, "enable_data_crcs": False, "use_chunking": chunked}
@@ -320,6 +323,7 @@ def on_one_topic(messages: Sequence[Message]) -> list[Message]:
     return [m._replace(topic="/scan") if m.topic in ("/front", "/rear") else m for m in messages]
 
 
+@pytest.mark.fault(35)
 @pytest.mark.parametrize("late_ns", [0, 10_000_000, 40_000_000])
 @pytest.mark.parametrize("odometry", [True, False])
 def test_sensors_of_two_frames_on_one_topic_are_read_as_two_topics(

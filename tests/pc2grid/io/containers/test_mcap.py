@@ -138,6 +138,7 @@ def test_a_footer_that_points_elsewhere_costs_nothing(tmp_path: Path, start: int
     assert any("the index is not usable" in warning for warning in report.warnings)
 
 
+@pytest.mark.fault(9)
 def test_a_damaged_summary_renames_no_topic(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000)
     whole = bytearray(path.read_bytes())
@@ -267,6 +268,7 @@ def test_whether_tf_is_lost_is_known_where_the_summary_lists_the_topics(tmp_path
         read(path, recover=True)
 
 
+@pytest.mark.fault(6)
 def test_a_file_that_ends_is_truncated_and_one_that_was_not_closed_is_whole(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     whole = recording(path)

@@ -144,6 +144,7 @@ def test_odometry_with_a_field_and_an_order_of_its_own() -> None:
         decoder_for(odometry_of(ODOMETRY))(data[:-20])
 
 
+@pytest.mark.fault(19)
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [

@@ -57,6 +57,10 @@ def clouds(draw: st.DrawFn) -> tuple[PointCloud2, list[list[float]]]:
     return message, [p for r in rows for p in r]
 
 
+@pytest.mark.fault(21)
+@pytest.mark.fault(22)
+@pytest.mark.fault(23)
+@pytest.mark.fault(26)
 @settings(max_examples=100, deadline=None)
 @given(clouds())
 def test_round_trip_against_the_oracle(case: tuple[PointCloud2, list[list[float]]]) -> None:
@@ -138,6 +142,7 @@ def test_wild_times_decide_no_unit(wild: float, share: float, scale: float, begi
     assert bool(found.notes) == (found.dropped > 0)
 
 
+@pytest.mark.fault(31)
 def test_no_times_or_all_the_same_is_no_offsets() -> None:
     data = b"".join(struct.pack("<4f", 1, 2, 3, 0.5) for _ in range(3))
     same = decode(PointCloud2(Header(STAMP, ""), 1, 3, (*XYZ, ("t", 12, 7, 1)), False, 16, 48, data))
@@ -238,6 +243,7 @@ def test_ranges_without_a_return(
     assert "metres" in str(caught.value.hint)
 
 
+@pytest.mark.fault(27)
 def test_a_single_scan_without_returns_is_an_empty_one(tmp_path: Path) -> None:
     (first, _), report = scans_of(tmp_path, laser(0, np.full(180, np.inf)), laser(1))
     assert len(first.points_m) == 0
@@ -319,6 +325,7 @@ def test_angles_may_be_off_by_two_beams_or_two_percent(count: int, slack: int) -
 HEADER = Header(T0, "lidar")
 
 
+@pytest.mark.fault(28)
 def test_an_origin_that_is_nowhere() -> None:
     from pc2grid.io.sensors.decode import ScanDecoder
 
