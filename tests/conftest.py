@@ -1,7 +1,5 @@
 """What tests of several folders are given."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 

@@ -24,8 +24,6 @@ recording, to the last bit. Most cases stand in the tests of what reads or decid
 16 topic without messages              32 per-point times of any unit
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

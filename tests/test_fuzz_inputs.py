@@ -6,8 +6,6 @@ Whatever is changed, the result is whole and possible, or a Pc2GridError; never 
 PC2GRID_FUZZ is the number of mutations of each kind; from 100 on, every outcome must occur.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 from typing import NamedTuple

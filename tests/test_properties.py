@@ -1,7 +1,5 @@
 """Laws that hold for any input: of poses, of settings, of what is written and read back."""
 
-from __future__ import annotations
-
 import math
 import os
 import shutil
@@ -211,8 +209,6 @@ def test_no_assignment_breaks_anything(key: str, value: str) -> None:
 
 
 ROOT = Path(__file__).resolve().parent.parent
-
-
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS", "TBB_NUM_THREADS")
 
 

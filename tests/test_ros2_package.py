@@ -4,8 +4,6 @@ They are written from the public interfaces: https://docs.ros.org/en/jazzy/p/rcl
 the messages.
 """
 
-from __future__ import annotations
-
 import ast
 import importlib.util
 import math

@@ -1,7 +1,5 @@
 """A browser without a window, in which tests look at pages: chromium, spoken to by its DevTools protocol."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import shutil
@@ -19,7 +17,6 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
 DESK, PHONE = (1280, 900), (375, 812)
 """Sizes of a window, pixels."""
 _SECONDS = 240.0
-
 _FAULTS = {
     # It reaches over the side of the window; or its section is to be scrolled, which nobody sees.
     "cut": """

@@ -1,7 +1,5 @@
 """Clouds of small buildings, for what turns a cloud into a map or drives through it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Folders of PCD, PLY and KITTI .bin files, as Open3D and plain numpy write them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Databases for tests: sessions with random content, and what must come out of a database again."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import io
@@ -66,6 +64,7 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
         )
         for _ in parts
     ]
+    t = trajectory.stamps_ns.tolist()
     session_map = SessionMap(
         session=name,
         sensor="lidar",
@@ -74,52 +73,33 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
         trajectory=trajectory,
         loops=tuple(
             Loop(
-                older=k,
-                newer=6 - k,
-                T_older_newer=SE2(*(rng.random(3) / 3).tolist()),
-                information=np.diag(rng.random(3) * 1e4),
-                accepted=k != 1,
+                older=k, newer=6 - k, T_older_newer=SE2(*(rng.random(3) / 3).tolist()),
+                information=np.diag(rng.random(3) * 1e4), accepted=k != 1,
             )
             for k in range(3)
         ),
         graph=small_graph(seed),
         odometry=OdometryCheck(
-            compared=9,
-            overruled=2,
+            compared=9, overruled=2,
             stretches=(OdometryOutlier(from_ns=10**9, to_ns=2 * 10**9, distance_m=0.3, turn_rad=0.5),),
         ),
         consistency=Consistency(
-            hits_on_free=1 / 7,
-            contradicted=0.25,
-            bent=True,
+            hits_on_free=1 / 7, contradicted=0.25, bent=True,
             stretches=(
-                Contradiction(
-                    from_ns=int(trajectory.stamps_ns[2]),
-                    to_ns=int(trajectory.stamps_ns[4]),
-                    x_m=0.3,
-                    y_m=-0.1,
-                    length_m=2 / 3,
-                    share=0.5,
-                ),
+                Contradiction(from_ns=t[2], to_ns=t[4], x_m=0.3, y_m=-0.1, length_m=2 / 3, share=0.5),
             ),
         ),
         precision=Precision(
-            stamps_ns=(int(trajectory.stamps_ns[0]), int(trajectory.stamps_ns[-1])),
-            sigma_m=(0.05, 0.7),
+            stamps_ns=(t[0], t[-1]), sigma_m=(0.05, 0.7),
             loose=(
                 UncertainSegment(
-                    from_ns=int(trajectory.stamps_ns[3]),
-                    to_ns=int(trajectory.stamps_ns[-1]),
-                    x_m=1 / 3,
-                    y_m=-0.2,
-                    length_m=5.5,
-                    sigma_m=0.7,
+                    from_ns=t[3], to_ns=t[-1], x_m=1 / 3, y_m=-0.2, length_m=5.5, sigma_m=0.7
                 ),
             ),
         ),
         points=PointMap.of(rng.uniform(-1.0, 1.0, (40, 3)), 0.1),
         report=ReadReport(scans_read=7, warnings=("no per-point time",)),
-    )
+    )  # fmt: skip
     digest = hashlib.sha256(f"{name}{seed}".encode()).hexdigest()
     origin = Provenance(source=f"{name}.mcap", digest=digest, config=config, versions={"pc2grid": "0.1.0"})
     return session_map, signatures, origin

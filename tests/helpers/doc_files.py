@@ -1,7 +1,5 @@
 """A folder with the recordings, maps and databases that README and docstrings name."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,8 +1,6 @@
 """Recordings that have what users report: the folder `field` beside the real data (PC2GRID_DATA), and others
 that are altered to have it."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

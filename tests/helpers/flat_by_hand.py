@@ -1,7 +1,5 @@
 """A flat of seven rooms, through which a depth camera is carried; the height of its odometry drifts."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -13,9 +11,7 @@ from pc2grid.model import Scan
 from pc2grid.simulate.scene import OPTICAL, Mesh, Scene, prism
 
 STEP_M, TURN_RAD = 0.25, 0.35  # between two images
-WIDTH, HEIGHT = 96, 72
 Point = tuple[float, float]
-
 _CORRIDOR = (0.0, 1.3)  # its lowest and highest y; x from 0 to 10.5 m
 _DOORS = {1.3: (1.2, 3.8, 6.4, 9.0), 0.0: (1.7, 5.2, 8.8)}  # of its walls at y: the middles of doors
 _DEEP_M = 3.4  # the rooms
@@ -34,7 +30,7 @@ _FURNITURE = (  # lowest corner, highest corner, bottom, top
 )
 
 
-def _box(low: Point, high: Point, bottom_m: float, top_m: float) -> Mesh:
+def box(low: Point, high: Point, bottom_m: float, top_m: float) -> Mesh:
     (a, b), (c, d) = low, high
     return prism(np.array([(a, b), (c, b), (c, d), (a, d)]), bottom_m, top_m)
 
@@ -42,15 +38,15 @@ def _box(low: Point, high: Point, bottom_m: float, top_m: float) -> Mesh:
 def scene() -> Scene:
     """Walls with doors 0.9 m wide and 2 m high, furniture, a floor and a ceiling of 2.5 m."""
     low, high = _CORRIDOR[0] - _DEEP_M, _CORRIDOR[1] + _DEEP_M
-    parts = [_box((0.0, low), (10.5, high), 0.0, 2.5)]
+    parts = [box((0.0, low), (10.5, high), 0.0, 2.5)]
     for y, doors in _DOORS.items():
         ends = [0.0, *(x + side for x in doors for side in (-0.45, 0.45)), 10.5]
         for first, last in zip(ends[::2], ends[1::2], strict=True):
-            parts.append(_box((first, y - 0.05), (last, y + 0.05), 0.0, 2.5))
-        parts += [_box((x - 0.45, y - 0.05), (x + 0.45, y + 0.05), 2.0, 2.5) for x in doors]
-    parts += [_box((x - 0.05, 1.3), (x + 0.05, high), 0.0, 2.5) for x in (2.5, 5.3, 7.8)]
-    parts += [_box((x - 0.05, low), (x + 0.05, 0.0), 0.0, 2.5) for x in (3.5, 7.0)]
-    return Scene(Mesh.join([*parts, *(_box(*thing) for thing in _FURNITURE)]))
+            parts.append(box((first, y - 0.05), (last, y + 0.05), 0.0, 2.5))
+        parts += [box((x - 0.45, y - 0.05), (x + 0.45, y + 0.05), 2.0, 2.5) for x in doors]
+    parts += [box((x - 0.05, 1.3), (x + 0.05, high), 0.0, 2.5) for x in (2.5, 5.3, 7.8)]
+    parts += [box((x - 0.05, low), (x + 0.05, 0.0), 0.0, 2.5) for x in (3.5, 7.0)]
+    return Scene(Mesh.join([*parts, *(box(*thing) for thing in _FURNITURE)]))
 
 
 CORRIDOR: tuple[Point, ...] = ((0.5, 0.65), (10.0, 0.65), (0.5, 0.65))
@@ -95,24 +91,42 @@ def rising(poses: Sequence[F64], share: float) -> list[F64]:
 
 
 def images(poses: Sequence[F64], odometry: Sequence[F64]) -> Iterator[Scan]:
-    """What the camera sees at its poses, 88 x 66 degrees, with noise and holes."""
-    flat, rng = scene(), np.random.default_rng(1)
-    v, u = np.meshgrid(np.linspace(-0.58, 0.58, HEIGHT), np.linspace(-0.77, 0.77, WIDTH), indexing="ij")
+    """What the camera sees at its poses in the flat, five times a second."""
+    return camera_images(scene(), poses, odometry, half=(0.77, 0.58), noise_per_m=0.002, holes=0.1)
+
+
+def camera_images(
+    scene: Scene,
+    poses: Sequence[F64],
+    odometry: Sequence[F64],
+    *,
+    half: tuple[float, float],
+    noise_per_m: float,
+    holes: float,
+    flying: float = 0.0,
+    interval_ns: int = 200_000_000,
+) -> Iterator[Scan]:
+    """What a depth camera sees up to 5 m. half : tangents of half its view, right and down. holes, flying :
+    shares of its pixels without a depth, and of those at edges whose depth lies between both surfaces."""
+    rng = np.random.default_rng(1)
+    right, down = (np.linspace(-side, side, count) for side, count in zip(half, (96, 72), strict=True))
+    v, u = np.meshgrid(down, right, indexing="ij")
     rays = np.column_stack((u.ravel(), v.ravel(), np.ones(u.size)))
     T_base_camera = np.eye(4)
     T_base_camera[:3, :3] = OPTICAL
     for k, (T, T_odom_base) in enumerate(zip(poses, odometry, strict=True)):
-        T_flat_camera = T @ T_base_camera
-        ahead = rays @ T_flat_camera[:3, :3].T
-        start = np.tile(T_flat_camera[:3, 3], (len(rays), 1))
-        depth = flat.cast(np.hstack((start, ahead)).astype(np.float32)).astype(np.float64)
-        depth += 0.002 * depth**2 * rng.standard_normal(len(depth))
-        seen = np.isfinite(depth) & (depth < 5.0) & (rng.random(len(depth)) > 0.1)
-        points = (depth[seen, None] * rays[seen]) @ T_base_camera[:3, :3].T
+        T_room_camera = T @ T_base_camera
+        ahead = rays @ T_room_camera[:3, :3].T
+        start = np.tile(T_room_camera[:3, 3], (len(rays), 1))
+        depth = scene.cast(np.hstack((start, ahead)).astype(np.float32)).astype(np.float64)
+        if flying:
+            beside = np.roll(depth, 1)
+            between = (np.abs(beside - depth) > 0.1) & (rng.random(len(depth)) < flying)
+            depth = np.where(between, 0.5 * (beside + depth), depth)
+        depth += noise_per_m * depth**2 * rng.standard_normal(len(depth))
+        seen = np.isfinite(depth) & (depth < 5.0) & (rng.random(len(depth)) > holes)
+        points = ((depth[seen, None] * rays[seen]) @ T_base_camera[:3, :3].T).astype(np.float32)
         yield Scan(
-            stamp_ns=200_000_000 * k,
-            points_m=points.astype(np.float32),
-            T_base_sensor=T_base_camera,
-            sensor="depth",
+            stamp_ns=interval_ns * k, points_m=points, T_base_sensor=T_base_camera, sensor="depth",
             T_odom_base=T_odom_base,
-        )
+        )  # fmt: skip

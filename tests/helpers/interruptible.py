@@ -1,7 +1,5 @@
 """How tests start a program that they want to stop with Ctrl-C."""
 
-from __future__ import annotations
-
 import signal
 
 

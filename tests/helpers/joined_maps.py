@@ -1,7 +1,5 @@
 """Maps of parts of a small office, each turned and moved into a frame of its own."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """JSON Schemas for tests."""
 
-from __future__ import annotations
-
 from typing import Any
 
 

@@ -1,7 +1,5 @@
 """Measuring and bounding the memory that a piece of work takes."""
 
-from __future__ import annotations
-
 import contextlib
 import resource
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Random damage: what transfer, storage, killed recorders and attackers do to a file."""
 
-from __future__ import annotations
-
 import functools
 import os
 import time

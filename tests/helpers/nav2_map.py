@@ -1,7 +1,5 @@
 """An independent reading of nav2 maps, and of what nav2, AMCL and tf2 are told, by their own rules."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import struct

@@ -1,7 +1,5 @@
 """The normal equations of the smoother once more: residuals in numpy, derivatives by small differences."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

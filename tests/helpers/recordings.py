@@ -4,8 +4,6 @@ Messages are encoded by `rosbags`, which shares no code with pc2grid's own decod
 compared with what an independent implementation wrote.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterable, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small maps with known shapes, for the tests of partition and signatures."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 
@@ -51,22 +49,8 @@ def disc(radius_m: float) -> np.ndarray:
 
 def cross(arm_m: float, width_m: float) -> np.ndarray:
     a, w = arm_m, width_m / 2
-    return polygon(
-        [
-            (w, w),
-            (a, w),
-            (a, -w),
-            (w, -w),
-            (w, -a),
-            (-w, -a),
-            (-w, -w),
-            (-a, -w),
-            (-a, w),
-            (-w, w),
-            (-w, a),
-            (w, a),
-        ]
-    )
+    right, down, left = [(w, w), (a, w), (a, -w), (w, -w)], [(w, -a), (-w, -a)], [(-w, -w), (-a, -w), (-a, w)]
+    return polygon([*right, *down, *left, (-w, w), (-w, a), (w, a)])
 
 
 def l_shape() -> np.ndarray:

@@ -1,7 +1,5 @@
 """Session maps with a trajectory and loops, without a recording."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pc2grid.geometry import SE2

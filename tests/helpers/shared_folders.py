@@ -1,7 +1,5 @@
 """Folders of maps, recordings and databases that several tests read, filled once for all workers of a run."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

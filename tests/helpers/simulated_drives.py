@@ -1,7 +1,5 @@
 """Planar drives through small plans without any 3D simulation: planar scans from isovists, exact poses."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Collection, Iterator, Sequence
@@ -9,6 +7,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
 from pc2grid.geometry import SE2
@@ -41,26 +40,12 @@ def plan(
 def office() -> OccupancyGrid:
     """20 x 14 m: a corridor with rooms of different sizes, no two places alike."""
     walls = [
-        (0, 6, 3, 6),
-        (4, 6, 9, 6),
-        (10, 6, 16, 6),
-        (17, 6, 20, 6),
-        (0, 8, 6, 8),
-        (7, 8, 13, 8),
-        (14, 8, 20, 8),
-        (5, 0, 5, 6),
-        (12, 0, 12, 6),
-        (8, 8, 8, 14),
-        (14.5, 8, 14.5, 14),
-        (2, 2, 3, 2),
-        (3, 2, 3, 4),
-        (7, 1, 7, 3),
-        (15, 3, 18, 3),
-        (16, 1, 16, 3),
-        (2, 11, 5, 11),
-        (10, 10, 10, 12),
-        (17, 10, 17, 14),
-    ]
+        (0, 6, 3, 6), (4, 6, 9, 6), (10, 6, 16, 6), (17, 6, 20, 6),  # of the corridor, with doors
+        (0, 8, 6, 8), (7, 8, 13, 8), (14, 8, 20, 8),
+        (5, 0, 5, 6), (12, 0, 12, 6), (8, 8, 8, 14), (14.5, 8, 14.5, 14),  # between rooms
+        (2, 2, 3, 2), (3, 2, 3, 4), (7, 1, 7, 3), (15, 3, 18, 3), (16, 1, 16, 3),  # within them
+        (2, 11, 5, 11), (10, 10, 10, 12), (17, 10, 17, 14),
+    ]  # fmt: skip
     return plan(20, 14, walls)
 
 
@@ -127,8 +112,17 @@ def look(grid: OccupancyGrid, truth: SE2, stamp_ns: int, field_rad: float, reach
     free = np.zeros(BEARINGS, np.float32)
     bins = np.rint(relative * BEARINGS / (2 * np.pi)).astype(int) % BEARINGS
     free[bins[inside]] = view.ranges_m[inside]
+    return flat_scan(points[hit], free, stamp_ns)
+
+
+def flat_scan(hits_m: ArrayLike, free_m: ArrayLike, stamp_ns: int = 0) -> PlanarScan:
+    """The planar scan of a sensor at the base. free_m : of each bearing, or the same for all."""
+    free = np.asarray(free_m, np.float32)
     return PlanarScan.of_hits(
-        stamp_ns=stamp_ns, hits_m=points[hit].astype(np.float32), origin_m=np.zeros(2), free_m=free
+        stamp_ns=stamp_ns,
+        hits_m=np.asarray(hits_m, np.float32).reshape(-1, 2),
+        origin_m=np.zeros(2),
+        free_m=np.full(BEARINGS, free) if free.ndim == 0 else free,
     )
 
 

@@ -1,7 +1,5 @@
 """The same office with ceilings of different height: twins in the plane, told apart by points in space."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """Two rooms with the same plan, of which one is higher, as points; and a robot's scans of one of them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,13 +1,12 @@
 """Results in a notebook: one short line each, and a picture or table where there is one."""
 
-from __future__ import annotations
-
 import ast
 import base64
 import fcntl
 import math
 import re
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -177,17 +176,11 @@ def test_no_hint_names_an_option_of_the_command_line_in_python() -> None:
     [
         ("--set read.up=y says so", "config=Config(read={'up': 'y'}) says so"),
         ("--set read.floor_z=-0.4 (metres)", "config=Config(read={'floor_z': -0.4}) (metres)"),
-        (
-            "such as --topic /front,/rear, or one",
-            "such as config=Config(read={'topic': '/front,/rear'}), or one",
-        ),
+        ("such as --topic /front,/rear, or", "such as config=Config(read={'topic': '/front,/rear'}), or"),
         ("check --start and --duration", "check span=TimeSpan(start_s, duration_s)"),
         ("--recover reads what is whole", "recover=True reads what is whole"),
         ("`pc2grid db copy --recover` keeps the rest", "`pc2grid db copy --recover` keeps the rest"),
-        (
-            "make one: `pc2grid convert a.mcap -o b.submaps`",
-            'make one: pc2grid.convert("a.mcap", "b.submaps")',
-        ),
+        ("make: `pc2grid convert a.mcap -o b.submaps`", 'make: pc2grid.convert("a.mcap", "b.submaps")'),
     ],
 )
 def test_options_become_arguments(hint: str, said: str) -> None:
@@ -213,50 +206,28 @@ STILL = Trajectory(stamps_ns=np.arange(3), T_session_base=np.stack([np.eye(4)] *
 
 
 @pytest.mark.parametrize(
-    ("make", "words"),
+    ("kind", "values", "words"),
     [
-        (
-            lambda: Scan(stamp_ns=0, points_m=np.ones((5, 2)), T_base_sensor=np.eye(4), sensor="lidar"),
-            r"Scan\.points_m: expected shape \('N', 3\), got \(5, 2\)",
-        ),
-        (
-            lambda: Trajectory(stamps_ns=np.arange(3), T_session_base=np.stack([np.eye(4)] * 2)),
-            r"Trajectory\.T_session_base: expected shape \(3, 4, 4\), got \(2, 4, 4\)",
-        ),
-        (
-            lambda: Trajectory(
-                stamps_ns=STILL.stamps_ns, T_session_base=STILL.T_session_base, health=(Health.FINE,)
-            ),
-            r"Trajectory\.health: expected 3 entries, got 1",
-        ),
-        (
-            lambda: OccupancyGrid(cells=np.zeros((2, 2)), resolution_m=math.nan, origin_m=(0.0, 0.0)),
-            r"OccupancyGrid\.resolution_m: expected > 0, got nan",
-        ),
-        (
-            lambda: SessionMap(
-                session="a",
-                sensor="map",
-                grid=GRID,
-                submaps=(),
-                trajectory=STILL,
-                loops=(Loop(older=1, newer=3, T_older_newer=SE2(), information=np.eye(3)),),
-            ),
-            r"SessionMap\.loops: expected poses of 0\.\.2, got 1 and 3",
-        ),
-        (
-            lambda: Signature(boundary=np.ones((1, 3)), freespace=np.ones(3), symmetry=np.ones(2)),
-            r"Signature\.boundary: expected shape \('Nb',\), got \(1, 3\)",
-        ),
-        (
-            lambda: SignatureTable.of((), np.empty((0, 2)), submap_id=[1]),
-            r"SignatureTable\.submap_id: expected 0 entries",
-        ),
+        (Scan, {"stamp_ns": 0, "points_m": np.ones((5, 2)), "T_base_sensor": np.eye(4), "sensor": "lidar"},
+         r"Scan\.points_m: expected shape \('N', 3\), got \(5, 2\)"),
+        (Trajectory, {"stamps_ns": np.arange(3), "T_session_base": np.stack([np.eye(4)] * 2)},
+         r"Trajectory\.T_session_base: expected shape \(3, 4, 4\), got \(2, 4, 4\)"),
+        (partial(replace, STILL), {"health": (Health.FINE,)},
+         r"Trajectory\.health: expected 3 entries, got 1"),
+        (partial(replace, GRID), {"resolution_m": math.nan},
+         r"OccupancyGrid\.resolution_m: expected > 0, got nan"),
+        (SessionMap, {"session": "a", "sensor": "map", "grid": GRID, "submaps": (), "trajectory": STILL,
+                      "loops": (Loop(older=1, newer=3, T_older_newer=SE2(), information=np.eye(3)),)},
+         r"SessionMap\.loops: expected poses of 0\.\.2, got 1 and 3"),
+        (Signature, {"boundary": np.ones((1, 3)), "freespace": np.ones(3), "symmetry": np.ones(2)},
+         r"Signature\.boundary: expected shape \('Nb',\), got \(1, 3\)"),
+        (partial(SignatureTable.of, (), np.empty((0, 2))), {"submap_id": [1]},
+         r"SignatureTable\.submap_id: expected 0 entries"),
     ],
-)
-def test_values_that_do_not_fit_together(make: Any, words: str) -> None:
+)  # fmt: skip
+def test_values_that_do_not_fit_together(kind: Any, values: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        make()
+        kind(**values)
 
 
 def test_other_code_cannot_change_the_arrays_of_a_frozen_type() -> None:

@@ -1,7 +1,5 @@
 """What is not installed is said before any work, all of it at once, with the command that installs it."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys
@@ -65,22 +63,14 @@ def test_a_package_that_is_broken_is_missing(tmp_path: Path, monkeypatch: pytest
     ("command", "blocked", "error", "hint"),
     [
         ("compare paper --maps {0} -o {0}/new", ("paper",), ConfigError, "pip install mahotas scikit-learn"),
-        (
-            "convert a.mcap -o postgresql://u:secret@h/d --dask tcp://h:1",
-            ("cluster", "postgres"),
-            ClusterError,
-            "pip install dask distributed 'psycopg[binary]'",
-        ),
+        ("convert a.mcap -o postgresql://u:secret@h/d --dask tcp://h:1", ("cluster", "postgres"),
+         ClusterError, "pip install dask distributed 'psycopg[binary]'"),
         ("export postgresql://h/d --map m", ("postgres",), DatabaseError, "pip install 'psycopg[binary]'"),
-        (
-            "watch ws://robot -d postgresql://h/d",
-            ("live", "postgres"),
-            LiveError,
-            "pip install websockets 'psycopg[binary]'",
-        ),
+        ("watch ws://robot -d postgresql://h/d", ("live", "postgres"), LiveError,
+         "pip install websockets 'psycopg[binary]'"),
         ("view {0}/no.submaps wss://robot", ("live",), LiveError, "pip install websockets"),
     ],
-)
+)  # fmt: skip
 def test_commands_say_all_that_is_missing_before_any_work(
     command: str,
     blocked: tuple[str, ...],

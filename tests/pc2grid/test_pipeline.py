@@ -1,7 +1,5 @@
 """From a recording to a session map."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -26,7 +24,6 @@ from tests.helpers.field import DATA
 from tests.helpers.rooms import RESOLUTION_M
 
 Mapped = tuple[Session, list[tuple[Scan, SE2]], OccupancyGrid, Trajectory]
-
 needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="PC2GRID_DATA is not there")
 
 
@@ -107,19 +104,25 @@ def test_follow_streams_one_planar_scan_a_scan(session: Session) -> None:
     assert all(registered.health is Health.FINE for registered, _ in followed)
 
 
-def test_the_map_of_a_robot_that_was_carried_elsewhere_is_warned_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Its driver started again there, on another floor, five minutes later, and tracking was never lost."""
-    floors = [
+@pytest.fixture(scope="module")
+def floors(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Drives of 10 m on two floors."""
+    laser = LaserConfig(rate_hz=5.0, step_deg=1.0)
+    return [
         simulate_session(
-            tmp_path / f"{floor}.mcap",
+            tmp_path_factory.mktemp("floor") / "drive.mcap",
             sensor="laser",
-            config=SimulationConfig(length_m=10.0, seed=floor, building_seed=floor),
-        )
+            config=SimulationConfig(length_m=10.0, seed=floor, building_seed=floor, laser=laser),
+        ).path
         for floor in (1, 2)
     ]
-    with open_log(floors[0].path) as first, open_log(floors[1].path) as second:
+
+
+def test_the_map_of_a_robot_that_was_carried_elsewhere_is_warned_of(
+    floors: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its driver started again there, on another floor, five minutes later, and tracking was never lost."""
+    with open_log(floors[0]) as first, open_log(floors[1]) as second:
         alone = build_map(second, session="alone")
         upstairs = list(second.scans())
         begin_ns = first.info.end_ns + 300 * 10**9
@@ -132,50 +135,38 @@ def test_the_map_of_a_robot_that_was_carried_elsewhere_is_warned_of(
     assert not any("contradicts itself" in warning for warning in alone.report.warnings)
 
 
-def test_a_ride_in_a_lift_gives_a_map_for_each_floor(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_ride_in_a_lift_gives_a_map_for_each_floor(
+    floors: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its odometry stands still, and for four seconds it looks at another floor before it drives on."""
-    floors = [
-        SimulationConfig(
-            length_m=10.0, seed=floor, building_seed=floor, laser=LaserConfig(rate_hz=5.0, step_deg=1.0)
-        )
-        for floor in (1, 2)
-    ]
-    made = simulate_session(tmp_path / "lift.mcap", sensor="laser", config=floors[0])
-    up = [scan for scan, _ in prepare_session(sensor="laser", config=floors[1]).scans()]
-    with open_log(made.path) as log:
-        scans = list(log.scans())
+    with open_log(floors[0]) as log, open_log(floors[1]) as second:
+        scans, up = list(log.scans()), list(second.scans())
         below, begin_ns = scans[-1], scans[-1].stamp_ns + 2 * 10**8
         assert below.T_odom_base is not None and up[0].T_odom_base is not None
         T = below.T_odom_base @ invert_pose(up[0].T_odom_base)
-        scans += [
-            replace(up[0], stamp_ns=begin_ns + k * 2 * 10**8, T_odom_base=T @ up[0].T_odom_base)
-            for k in range(20)
-        ]
-        for scan in up:
+        waits = [replace(up[0], stamp_ns=up[0].stamp_ns + (k - 20) * 2 * 10**8) for k in range(20)]
+        for scan in (*waits, *up):
             assert scan.T_odom_base is not None
             stamp_ns = begin_ns + 4 * 10**9 + scan.stamp_ns - up[0].stamp_ns
             scans.append(replace(scan, stamp_ns=stamp_ns, T_odom_base=T @ scan.T_odom_base))
         monkeypatch.setattr(log, "scans", lambda *_: iter(scans))
-        first, second = build_maps(log, session="robot")
+        first, above = build_maps(log, session="robot")
     (said,) = [text for text in first.report.warnings if "falls into" in text]
-    found = re.search(
-        r"before (\d+) s after the first scan all walls changed .* cut the recording there", said
-    )
+    words = r"before (\d+) s after the first scan all walls changed .* cut the recording there"
+    found = re.search(words, said)
     assert found is not None
     rode_s = (begin_ns - scans[0].stamp_ns) * 1e-9
     assert rode_s + 3.0 < int(found[1]) < rode_s + 6.0
-    assert not any("contradicts itself" in text for part in (first, second) for text in part.report.warnings)
+    assert not any("contradicts itself" in text for part in (first, above) for text in part.report.warnings)
 
 
 @pytest.mark.parametrize(("rise_m", "warned"), [(3.0, True), (-3.0, True), (0.5, False)])
 def test_a_recording_that_leaves_its_floor_is_to_be_cut(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rise_m: float, warned: bool
+    floors: list[Path], monkeypatch: pytest.MonkeyPatch, rise_m: float, warned: bool
 ) -> None:
     """Its odometry rises in the middle; before the first reading there is no height."""
-    config = SimulationConfig(length_m=1.5, seed=3, laser=LaserConfig(rate_hz=5.0, step_deg=1.0))
-    made = simulate_session(tmp_path / "drive.mcap", sensor="laser", config=config)
-    with open_log(made.path) as log:
-        scans = list(log.scans())
+    with open_log(floors[0]) as log:
+        scans = list(log.scans(0.0, 8.0))
         for k in range(1, len(scans)):
             T_odom_base = np.array(scans[k].T_odom_base)
             T_odom_base[2, 3] = 7.0 + rise_m * (k > len(scans) // 2)

@@ -1,7 +1,5 @@
 """BLAS uses one thread while pc2grid works: on its small matrices more threads only spin."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Points collected block by block, one a voxel."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

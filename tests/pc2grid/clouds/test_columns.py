@@ -1,7 +1,5 @@
 """The map of columns: a room with a table, seen by a camera at the height of a hand that looks down."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The ground plane: found below furniture and with a tilted sensor."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scans of any kind, reduced to the plane."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

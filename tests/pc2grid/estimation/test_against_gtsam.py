@@ -5,8 +5,6 @@ skipped. The robust weights are switched off on both sides, since GTSAM's stop a
 with several; what remains, the factors, their derivatives, the marginalisation and the covariance, agree.
 """
 
-from __future__ import annotations
-
 import itertools
 
 import numpy as np
@@ -16,7 +14,6 @@ from pc2grid.estimation.smoother import PLANAR, SMOOTHER, PoseWithCovariance, Sc
 from pc2grid.geometry import F64, SE2
 
 gtsam = pytest.importorskip("gtsam")
-
 GAUSSIAN = SMOOTHER._replace(
     kernel=1e6, iterations=20, converged=1e-9,
     scale=1e-9, direction_rad=1e-9, yaw_rad_per_m=1e-9, turn=1e-9,

@@ -1,7 +1,5 @@
 """Scan matching in the plane: edge cases, and the compiled functions against their plain twins."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which of several matches is taken, and how far it is believed."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -274,6 +272,13 @@ def test_a_base_that_is_a_little_off_its_footprint_is_on_wheels(
     assert is_rolling(scan) is rolling
 
 
+@pytest.fixture(scope="module")
+def driven() -> list[Scan]:
+    small = LidarConfig(rate_hz=5.0, columns=300)
+    config = SimulationConfig(length_m=4.0, seed=3, clutter=0, lidar=small)
+    return [scan for scan, _ in prepare_session(sensor="lidar", config=config).scans()]
+
+
 def moved(scan: Scan, height_m: float, pitch_deg: float) -> Scan:
     """A scan whose odometry reports the base at a height and a pitch, as an EKF in three dimensions does."""
     assert scan.T_odom_base is not None
@@ -293,11 +298,12 @@ def moved(scan: Scan, height_m: float, pitch_deg: float) -> Scan:
 )
 @pytest.mark.parametrize("standing", [0, 40])
 def test_the_scans_of_the_first_metres_decide_whether_a_robot_is_on_wheels(
-    standing: int, height_m: Callable[[int], float], pitch_deg: Callable[[int], float], carried: bool
+    driven: list[Scan],
+    standing: int,
+    height_m: Callable[[int], float],
+    pitch_deg: Callable[[int], float],
+    carried: bool,
 ) -> None:
-    small = LidarConfig(rate_hz=5.0, columns=300)
-    config = SimulationConfig(length_m=4.0, seed=3, clutter=0, lidar=small)
-    driven = [scan for scan, _ in prepare_session(sensor="lidar", config=config).scans()]
     scans = [moved(scan, height_m(k), pitch_deg(k)) for k, scan in enumerate(driven)]
     assert len(scans) > 35
     beginning = begin(iter([scans[0]] * standing + scans))

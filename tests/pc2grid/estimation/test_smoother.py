@@ -1,7 +1,5 @@
 """The smoother: every fault of odometry is an input of one test, and the oracle is a larger window."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable
 

@@ -1,7 +1,5 @@
 """A camera in the hand: followed in space, with a map in which the floor is free and a table is no wall."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -26,20 +24,19 @@ from pc2grid.observer import Observer
 from pc2grid.pipeline import follow, map_scans
 from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, prepare_session
-from pc2grid.simulate.scene import OPTICAL, Mesh, Scene, prism
+from pc2grid.simulate.scene import Mesh, Scene
 from tests.helpers.field import DATA
-from tests.helpers.flat_by_hand import CORRIDOR, carried, images as drifting_images, rising
+from tests.helpers.flat_by_hand import (
+    CORRIDOR,
+    box,
+    camera_images,
+    carried,
+    images as drifting_images,
+    rising,
+)
 
 ROOMS = DATA / "depth/room"
-T_BASE_CAMERA = np.eye(4)
-T_BASE_CAMERA[:3, :3] = OPTICAL
 TABLE = ((2.0, 1.2), (3.2, 2.8))  # its lowest and highest corner, m
-WIDTH, HEIGHT = 96, 72
-
-
-def box(low: tuple[float, float], high: tuple[float, float], bottom_m: float, top_m: float) -> Mesh:
-    (a, b), (c, d) = low, high
-    return prism(np.array([(a, b), (c, b), (c, d), (a, d)]), bottom_m, top_m)
 
 
 def room() -> Scene:
@@ -69,30 +66,8 @@ def hand(count: int) -> list[F64]:
 
 def images(scene: Scene, poses: Sequence[F64], interval_ns: int = 100_000_000) -> Iterator[tuple[Scan, F64]]:
     """What it sees, 64 x 50 degrees, with noise, holes and flying pixels, and its pose."""
-    rng = np.random.default_rng(1)
-    v, u = np.meshgrid(np.linspace(-0.47, 0.47, HEIGHT), np.linspace(-0.63, 0.63, WIDTH), indexing="ij")
-    rays = np.column_stack((u.ravel(), v.ravel(), np.ones(u.size)))
-    for k, T in enumerate(poses):
-        T_room_camera = T @ T_BASE_CAMERA
-        ahead = rays @ T_room_camera[:3, :3].T
-        start = np.tile(T_room_camera[:3, 3], (len(rays), 1))
-        depth = scene.cast(np.hstack((start, ahead)).astype(np.float32)).astype(np.float64)
-        beside = np.roll(depth, 1)
-        flying = (np.abs(beside - depth) > 0.1) & (rng.random(len(depth)) < 0.3)
-        depth = np.where(flying, 0.5 * (beside + depth), depth)
-        depth += 0.0015 * depth**2 * rng.standard_normal(len(depth))
-        seen = np.isfinite(depth) & (depth < 5.0) & (rng.random(len(depth)) > 0.2)
-        points = (depth[seen, None] * rays[seen]) @ T_BASE_CAMERA[:3, :3].T
-        yield (
-            Scan(
-                stamp_ns=interval_ns * k,
-                points_m=points.astype(np.float32),
-                T_base_sensor=T_BASE_CAMERA,
-                sensor="depth",
-                T_odom_base=T,
-            ),
-            T,
-        )
+    view: Any = {"half": (0.63, 0.47), "noise_per_m": 0.0015, "holes": 0.2, "flying": 0.3}
+    return zip(camera_images(scene, poses, poses, interval_ns=interval_ns, **view), poses, strict=True)
 
 
 class Heard(Observer):

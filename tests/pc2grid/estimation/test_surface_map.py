@@ -1,7 +1,5 @@
 """Registration of a carried sensor to the surfaces that it has seen."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

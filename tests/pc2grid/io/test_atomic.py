@@ -1,7 +1,5 @@
 """Writers of one file in processes that have the same number, as in two containers that share a folder."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

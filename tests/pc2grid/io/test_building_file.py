@@ -1,7 +1,5 @@
 """Clouds and meshes read as points, block by block."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """tf of every kind: moving, late, with two parents, in the place of odometry."""
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import replace
@@ -406,9 +404,6 @@ def test_of_several_static_trees_none_is_the_robot_s(tmp_path: Path) -> None:
         read(write_mcap(tmp_path / "a.mcap", messages))
 
 
-# --- test_absurd_frames ---
-
-
 def moved(message: Message, old: float, new: float) -> Message:
     """The message with one of its numbers replaced."""
     before = struct.pack("<d", old)
@@ -417,8 +412,6 @@ def moved(message: Message, old: float, new: float) -> Message:
 
 
 ABSURD = [1e300, -1e300, 1e39, 1.1e8, float("nan"), float("inf")]
-
-
 NOWHERE = [*((0.25, value) for value in ABSURD), *((1.0, w) for w in (0.0, 1e-200, 1e200, float("nan")))]
 
 
@@ -481,9 +474,6 @@ def test_odometry_that_is_nowhere_on_earth_is_ignored_and_said(tmp_path: Path, v
     found = [scan.T_odom_base[0, 3] for scan in scans if scan.T_odom_base is not None]
     assert found == pytest.approx([0.25 + i for i in range(12)])  # between its neighbours
     assert any("odometry messages are unreadable or not finite" in w for w in report.warnings)
-
-
-# --- test_edges_frames ---
 
 
 def test_odometry_of_a_frame_that_moves_on_the_base(tmp_path: Path) -> None:

@@ -12,8 +12,6 @@ with the time and memory of a small file. What cannot be noticed:
 PC2GRID_FUZZ is the number of mutations of each kind; from 100 on, every outcome must occur.
 """
 
-from __future__ import annotations
-
 import sqlite3
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The last pose in the map that a recording holds, written by an independent encoder."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Maps against a second, independent reading of nav2's rules; trajectories there and back."""
 
-from __future__ import annotations
-
 import io
 import logging
 import math

@@ -1,7 +1,5 @@
 """Which topic is proposed where several hold scans."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -37,9 +35,6 @@ def test_a_sensor_is_not_put_together_with_itself(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", robot_with_copies())
     with pytest.raises(TopicError, match="/a_stable_scan is in frame laser of the first topic"):
         read(path, ReadConfig(topic="/scan,/a_stable_scan"))
-
-
-# --- test_edges_recording ---
 
 
 def test_names_in_a_file_break_no_line(tmp_path: Path) -> None:

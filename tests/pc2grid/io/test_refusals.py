@@ -4,8 +4,6 @@ Each row is a number of the catalogue (tests/test_faults_catalogue.py), an error
 is done with an empty folder, and how much memory that may take.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """Several robots in one recording: only what belongs to the robot of the chosen scans is used."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -191,66 +189,36 @@ def test_the_nearest_odometry_is_taken_and_said(tmp_path: Path) -> None:
     assert words in read(path)[1].warnings
 
 
+def two(*, of: int = 0, **options: object) -> list[list[Message]]:
+    """Two robots with the same options. of : the number that both have."""
+    return [robot(of or k, space=f"/robot{k}", **options) for k in (1, 2)]  # type: ignore[arg-type]
+
+
+ONE, TWO = "/robot1/scan", "/robot2/scan"
+ODOMETRY_OF, TF_OF = "odometry is of the robot of", "transforms are of the robot"
+
+
 @pytest.mark.fault(15)
 @pytest.mark.parametrize(
     ("robots", "topic", "words", "hint"),
     [
-        (fleet("/robot{}", ""), None, "several topics hold scans", "--topic /robot1/scan"),
-        (fleet("/robot{}", ""), "/robot1/scan,/robot2/scan", "of two robots", "--topic /robot1/scan"),
-        (
-            fleet("/robot{}", "robot{}/", shared_tf=True),
-            "/robot1/scan,/robot2/scan",
-            "of two robots",
-            "--topic",
-        ),
-        (
-            [robot(1, space="/robot1", odometry="/odom"), robot(2, space="/robot2", odometry="")],
-            "/robot2/scan",
-            "odometry is of the robot of /robot2/scan: /odom",
-            "--odometry none",
-        ),
-        (
-            [robot(1, space="/robot1", static=False, odometry=""), robot(2, space="/robot2", static=False)],
-            "/robot1/scan",
-            "odometry is of the robot of /robot1/scan: /robot2/odom",
-            "--odometry /robot2/odom",
-        ),
-        (
-            [robot(1, space=f"/robot{k}", odometry="", tf_odometry=True, shared_tf=True) for k in (1, 2)],
-            "/robot1/scan",
-            "odometry is of the robot of /robot1/scan: /tf",
-            "--odometry none",
-        ),
-        (
-            [robot(1, space=f"/robot{k}", odometry="/odom", shared_tf=True) for k in (1, 2)],
-            "/robot1/scan",
-            "odometry is of the robot of /robot1/scan: /odom",
-            "--odometry none",
-        ),
-        (
-            fleet("/robot{}", "", shared_tf=True),
-            "/robot1/scan",
-            "frame laser_link in two places",
-            "--odometry none --set read.base_frame=laser_link",
-        ),
-        (
-            [robot(1, static=False), robot(2, space="/robot2")],
-            "/scan",
-            "transforms are of the robot of /scan: /robot2/tf_static",
-            "assume_identity",
-        ),
-        (
-            [
-                robot(1, space="/robot1"),
-                robot(2, space="/robot2"),
-                robot(3, static=False, scans="laser/scan"),
-            ],
-            "/laser/scan",
-            "transforms are of the robot",
-            "assume_identity",
-        ),
+        (fleet("/robot{}", ""), None, "several topics hold scans", f"--topic {ONE}"),
+        (fleet("/robot{}", ""), f"{ONE},{TWO}", "of two robots", f"--topic {ONE}"),
+        (fleet("/robot{}", "robot{}/", shared_tf=True), f"{ONE},{TWO}", "of two robots", "--topic"),
+        ([robot(1, space="/robot1", odometry="/odom"), robot(2, space="/robot2", odometry="")],
+         TWO, f"{ODOMETRY_OF} {TWO}: /odom", "--odometry none"),
+        ([robot(1, space="/robot1", static=False, odometry=""), robot(2, space="/robot2", static=False)],
+         ONE, f"{ODOMETRY_OF} {ONE}: /robot2/odom", "--odometry /robot2/odom"),
+        (two(of=1, odometry="", tf_odometry=True, shared_tf=True),
+         ONE, f"{ODOMETRY_OF} {ONE}: /tf", "--odometry none"),
+        (two(of=1, odometry="/odom", shared_tf=True), ONE, f"{ODOMETRY_OF} {ONE}: /odom", "--odometry none"),
+        (fleet("/robot{}", "", shared_tf=True),
+         ONE, "frame laser_link in two places", "--odometry none --set read.base_frame=laser_link"),
+        ([robot(1, static=False), robot(2, space="/robot2")],
+         "/scan", f"{TF_OF} of /scan: /robot2/tf_static", "assume_identity"),
+        ([*two(), robot(3, static=False, scans="laser/scan")], "/laser/scan", TF_OF, "assume_identity"),
     ],
-)
+)  # fmt: skip
 def test_what_cannot_be_told_is_refused_with_the_choice(
     tmp_path: Path, robots: list[list[Message]], topic: str | None, words: str, hint: str
 ) -> None:

@@ -1,7 +1,5 @@
 """Errors of the libraries that read recordings."""
 
-from __future__ import annotations
-
 import gc
 import weakref
 from collections.abc import Iterator
@@ -51,9 +49,6 @@ def test_what_was_read_is_free_once_the_error_is_handled() -> None:
         assert failed()() is None
     finally:
         gc.enable()
-
-
-# --- test_refusals_source ---
 
 
 def test_what_others_raise_becomes_ours_but_for_memory() -> None:

@@ -1,7 +1,5 @@
 """Odd but whole recordings: stamps, gaps, empty and short messages, dialects, schemas, checksums."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -242,15 +240,6 @@ def test_without_odometry_their_times_are_told(tmp_path: Path) -> None:
         np.testing.assert_allclose(scan.points_m[3:] - scan.points_m[:3], [[-1.5, 0.0, 0.0]] * 3, atol=1e-6)
 
 
-def test_a_robot_that_runs_gives_the_same(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", robot(40))
-    with open_log(path, BOTH) as log, open_live(str(path), BOTH) as live:
-        for a, b in zip(log.scans(), live.scans(), strict=True):
-            assert a.stamp_ns == b.stamp_ns
-            np.testing.assert_array_equal(a.points_m, b.points_m)
-        assert "with /rear" in live.choose().reason
-
-
 def test_a_sensor_that_stops_leaves_the_other(tmp_path: Path) -> None:
     messages = [m for i, m in enumerate(robot(20)) if m.topic != "/rear" or i < 30]
     scans, report = read(write_mcap(tmp_path / "a.mcap", messages), BOTH)
@@ -260,23 +249,24 @@ def test_a_sensor_that_stops_leaves_the_other(tmp_path: Path) -> None:
     assert list(report.scans_skipped) == ["/rear: no scan near the first sensor's"]
 
 
-def test_depth_cameras_keep_their_own_calibration(tmp_path: Path) -> None:
-    to, messages = ros(), []
-    for name, x_m in (("a", 1.0), ("b", 2.0)):
-        messages.append(to.tf(T0, "base_link", f"{name}_optical", x_m, topic="/tf_static"))
-    pixels = np.full((2, 2), 1000, np.uint16)
+@pytest.mark.parametrize("names", [("/a", "/b"), ("", "")], ids=["on two topics", "on one topic"])
+def test_depth_cameras_keep_their_own_calibration(tmp_path: Path, names: tuple[str, str]) -> None:
+    """On one topic they are told apart by their frames."""
+    to, pixels = ros(), np.full((2, 2), 1000, np.uint16)
+    mounts = (("first_optical", 1.0), ("second_optical", 2.0))
+    messages = [to.tf(T0, "base_link", frame, x_m, topic="/tf_static") for frame, x_m in mounts]
     for i in range(5):
-        stamp = T0 + i * STEP
-        for name, focal in (("a", 5.0), ("b", 10.0)):
-            messages.append(to.camera(f"/{name}/depth/camera_info", stamp, 2, 2, focal))
-            image = to.image(f"/{name}/depth/image", stamp, pixels, "16UC1", frame=f"{name}_optical")
-            messages.append(image)
-    config = ReadConfig(topic="/a/depth/image,/b/depth/image", depth_stride=1)
+        for name, frame, focal in zip(names, ("first_optical", "second_optical"), (5.0, 10.0), strict=True):
+            camera = to.camera(f"{name}/depth/camera_info", T0 + i * STEP, 2, 2, focal, frame=frame)
+            image = to.image(f"{name}/depth/image", T0 + i * STEP, pixels, "16UC1", frame=frame)
+            messages += [camera, image]
+    topic = ",".join(f"{name}/depth/image" for name in dict.fromkeys(names))
+    config = ReadConfig(topic=topic, depth_stride=1)
     scans, _ = read(write_mcap(tmp_path / "a.mcap", messages), config)
     assert len(scans) == 5
-    a, b = scans[0].points_m[:4], scans[0].points_m[4:]
-    assert np.ptp(a[:, 0]) == pytest.approx(0.2, abs=1e-3)  # 1 m away, a pixel is 1/5 wide
-    assert np.ptp(b[:, 0]) == pytest.approx(0.1, abs=1e-3)
+    for scan in scans:
+        assert np.ptp(scan.points_m[:4, 0]) == pytest.approx(0.2, abs=1e-3)  # 1 m away, a pixel is 1/5 wide
+        assert np.ptp(scan.points_m[4:, 0]) == pytest.approx(0.1, abs=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -296,24 +286,6 @@ def test_mistakes(
     assert getattr(error.value, "hint", None)
     if topic is None:
         assert "--topic /front,/rear" in error.value.in_short
-
-
-def test_cameras_on_one_topic_are_told_apart_by_their_frames(tmp_path: Path) -> None:
-    to, messages = ros(), []
-    pixels = np.full((2, 2), 1000, np.uint16)
-    for name, x_m in (("a", 1.0), ("b", 2.0)):
-        messages.append(to.tf(T0, "base_link", f"{name}_optical", x_m, topic="/tf_static"))
-    for i in range(5):
-        stamp = T0 + i * STEP
-        for name, focal in (("a", 5.0), ("b", 10.0)):
-            frame = f"{name}_optical"
-            messages.append(to.camera("/depth/camera_info", stamp, 2, 2, focal, frame=frame))
-            messages.append(to.image("/depth/image", stamp, pixels, "16UC1", frame=frame))
-    scans, _ = read(write_mcap(tmp_path / "a.mcap", messages), ReadConfig(depth_stride=1))
-    assert len(scans) == 5
-    for scan in scans:
-        assert np.ptp(scan.points_m[:4, 0]) == pytest.approx(0.2, abs=1e-3)
-        assert np.ptp(scan.points_m[4:, 0]) == pytest.approx(0.1, abs=1e-3)
 
 
 # --- several sensors on one topic ---------------------------------------------------------------------
@@ -343,11 +315,15 @@ def test_sensors_of_two_frames_on_one_topic_are_read_as_two_topics(
         assert log.choose().further_frames == ("rear_laser",)
 
 
-def test_a_robot_that_runs_may_have_two_sensors_on_one_topic(tmp_path: Path) -> None:
-    path = write_mcap(tmp_path / "a.mcap", on_one_topic(robot(40)))
-    with open_log(path) as log, open_live(str(path)) as live:
+@pytest.mark.parametrize("one_topic", [False, True])
+def test_a_robot_that_runs_gives_the_same(tmp_path: Path, one_topic: bool) -> None:
+    messages, config = (on_one_topic(robot(36)), None) if one_topic else (robot(36), BOTH)
+    path = write_mcap(tmp_path / "a.mcap", messages)
+    with open_log(path, config) as log, open_live(str(path), config) as live:
         assert live.choose() == log.choose()
+        assert one_topic or "with /rear" in live.choose().reason
         for a, b in zip(log.scans(), live.scans(), strict=True):
+            assert a.stamp_ns == b.stamp_ns
             np.testing.assert_array_equal(a.points_m, b.points_m)
 
 
@@ -503,9 +479,6 @@ def test_a_time_increment_longer_than_the_period_is_ignored(
     scans, report = read(write_mcap(tmp_path / "a.mcap", messages))
     assert all((scan.offsets_s is None) == ignored for scan in scans)
     assert any("time_increment makes a scan longer than 0.11 s" in w for w in report.warnings) == ignored
-
-
-# --- test_absurd_stream ---
 
 
 @pytest.mark.parametrize("seconds", [10**10, 10**30, -(10**30)])

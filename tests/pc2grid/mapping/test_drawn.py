@@ -1,7 +1,5 @@
 """One cloud of a building becomes a levelled occupancy grid."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -133,8 +131,7 @@ def test_floor_that_most_points_lie_on_is_found() -> None:
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (1.0, 0.4, 0.0)])
-@pytest.mark.parametrize("tilt_deg", [20.0, 37.0, 40.0])
-@pytest.mark.parametrize("ceiling", [True, False])
+@pytest.mark.parametrize(("tilt_deg", "ceiling"), [(20.0, True), (40.0, True), (37.0, False)])
 def test_tilted_floor_is_levelled(axis: tuple[float, float, float], tilt_deg: float, ceiling: bool) -> None:
     points = turned(rooms_cloud(ceiling=ceiling), axis, tilt_deg)
     up = turned(np.array([[0.0, 0.0, 1.0]]), axis, tilt_deg)[0]
@@ -238,8 +235,9 @@ def test_nothing_is_said_where_nothing_shows_it() -> None:
         assert not is_upside_down(level(points))
 
 
-@pytest.mark.parametrize(("rise_m", "storeys"), [(2.8, 2), (3.0, 3), (4.0, 2)])
-@pytest.mark.parametrize("ceiling", [True, False])
+@pytest.mark.parametrize(
+    ("rise_m", "storeys", "ceiling"), [(2.8, 2, True), (2.8, 2, False), (3.0, 3, True), (4.0, 2, False)]
+)
 def test_other_floors_are_found(rise_m: float, storeys: int, ceiling: bool) -> None:
     above = [raised(rooms_cloud(ceiling=ceiling), i * rise_m) for i in range(storeys)]
     found = other_floors(level(np.concatenate(above)))

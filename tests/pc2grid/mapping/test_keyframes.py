@@ -1,7 +1,5 @@
 """Keyframes that wait in a file."""
 
-from __future__ import annotations
-
 import errno
 import io
 

@@ -1,7 +1,5 @@
 """The pose graph, and loop closure over it."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -23,10 +21,10 @@ from pc2grid.mapping.loops import (
 )
 from pc2grid.mapping.part_maps import OptimisedKeyframes, interpolate_corrections
 from tests.helpers.rooms import RESOLUTION_M
+from tests.helpers.simulated_drives import flat_scan
 
 Wall = tuple[tuple[float, float], tuple[float, float]]
 """A segment from one point to another."""
-
 INFORMATION = np.diag([1e4, 1e4, 1e5])
 
 
@@ -107,12 +105,7 @@ def scan_of(pose: SE2, walls: list[Wall]) -> PlanarScan:
         ranges = np.where((t > 0) & (u >= 0) & (u <= 1) & (t < ranges), t, ranges)
     seen = np.isfinite(ranges)
     hits = np.column_stack((np.cos(bearings), np.sin(bearings)))[seen] * ranges[seen, None]
-    return PlanarScan.of_hits(
-        stamp_ns=0,
-        hits_m=hits.astype(np.float32),
-        origin_m=np.zeros(2),
-        free_m=np.where(seen, ranges, 0).astype(np.float32),
-    )
+    return flat_scan(hits, np.where(seen, ranges, 0))
 
 
 def closed(

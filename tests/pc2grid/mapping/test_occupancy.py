@@ -1,7 +1,5 @@
 """Planar scans drawn into a growing grid."""
 
-from __future__ import annotations
-
 import dataclasses
 import itertools
 import math
@@ -19,18 +17,14 @@ from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import THING, OccupancyGrid
 from pc2grid.settings import ProjectionConfig
 from tests.helpers.rooms import RESOLUTION_M
+from tests.helpers.simulated_drives import flat_scan
 
 
 def disc(radius_m: float, *, hits: bool = True) -> PlanarScan:
     """A planar scan that looks all around a round room."""
     bearings = np.arange(BEARINGS) * (2 * np.pi / BEARINGS)
     rim = radius_m * np.column_stack((np.cos(bearings), np.sin(bearings)))
-    return PlanarScan.of_hits(
-        stamp_ns=0,
-        hits_m=(rim if hits else np.zeros((0, 2))).astype(np.float32),
-        origin_m=np.zeros(2),
-        free_m=np.full(BEARINGS, radius_m, np.float32),
-    )
+    return flat_scan(rim if hits else [], radius_m)
 
 
 def state(grid: OccupancyGrid, x: float, y: float) -> int:
@@ -54,13 +48,7 @@ def test_round_room_is_free_inside_occupied_at_its_wall_unknown_outside() -> Non
 
 def test_a_person_who_has_left_is_cleared() -> None:
     builder = GridBuilder(ProjectionConfig())
-    person = PlanarScan.of_hits(
-        stamp_ns=0,
-        hits_m=np.array([[1.02, 0.02]], np.float32),
-        origin_m=np.zeros(2),
-        free_m=np.where(np.arange(BEARINGS) < 4, 1.0, 0.0).astype(np.float32),
-    )
-    builder.add(person, SE2())
+    builder.add(flat_scan([(1.02, 0.02)], np.where(np.arange(BEARINGS) < 4, 1.0, 0.0)), SE2())
     assert state(builder.grid(), 1.02, 0.02) >= 65
     for _ in range(5):
         builder.add(disc(2.0), SE2())
@@ -155,10 +143,7 @@ def uneven_walls(seed: int) -> PlanarScan:
     along = np.arange(-1.5, 1.5, 0.02)
     deep = 2.0 + 0.05 * (np.floor(along / 0.15) % 2)
     hits = np.concatenate((np.column_stack((along, deep)), np.column_stack((deep, along))))
-    hits = (hits + rng.normal(size=hits.shape) * 0.003).astype(np.float32)
-    return PlanarScan.of_hits(
-        stamp_ns=0, hits_m=hits, origin_m=np.zeros(2), free_m=np.full(360, 1.5, np.float32)
-    )
+    return flat_scan(hits + rng.normal(size=hits.shape) * 0.003, 1.5)
 
 
 def rms_error_m(parameters: LocalMapParameters) -> float:

@@ -1,7 +1,5 @@
 """A session that was lost in between is divided there; loops join what they can."""
 
-from __future__ import annotations
-
 import functools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A map that is bent is told from a map that is not, by its own scans."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -21,6 +19,7 @@ from pc2grid.mapping.quality import (
 )
 from pc2grid.model import Consistency, Health, Precision, Trajectory
 from pc2grid.settings import ProjectionConfig
+from tests.helpers.simulated_drives import flat_scan
 
 LENGTH_M, WIDTH_M = 20.0, 2.0
 IN_PLACE = SE2()
@@ -36,12 +35,7 @@ def scan_of_corridor(at: SE2) -> PlanarScan:
     range_m = np.minimum(to_end, to_side)
     hit = range_m < 10.0
     points = at.inverse().apply(np.column_stack((at.x + range_m * c, at.y + range_m * s))[hit])
-    return PlanarScan.of_hits(
-        stamp_ns=0,
-        hits_m=points.astype(np.float32),
-        origin_m=np.zeros(2),
-        free_m=np.minimum(range_m, 10.0).astype(np.float32),
-    )
+    return flat_scan(points, np.minimum(range_m, 10.0))
 
 
 def drive(offset: SE2 = IN_PLACE) -> tuple[list[Keyframe], Trajectory]:
@@ -73,6 +67,7 @@ def with_hits(keyframe: Keyframe, more_m: np.ndarray) -> Keyframe:
 def test_a_corridor_driven_twice_agrees_with_its_map() -> None:
     keyframes, trajectory = drive()
     assert measured(keyframes, trajectory) == Consistency()
+    assert consistency_warning(Consistency(), trajectory) is None
 
 
 @pytest.mark.parametrize(
@@ -88,17 +83,10 @@ def test_a_way_back_that_is_drawn_aside_is_found_where_it_lies(offset: SE2) -> N
     assert longest.from_ns < longest.to_ns and longest.length_m > 1.0 and longest.share >= 0.2
     lengths = [stretch.length_m for stretch in found.stretches]
     assert lengths == sorted(lengths, reverse=True)
-
-
-def test_the_warning_is_one_line_that_names_place_and_time() -> None:
-    keyframes, trajectory = drive(SE2(0.0, 0.6, 0.0))
-    found = measured(keyframes, trajectory)
     text = consistency_warning(found, trajectory)
     assert text is not None and "\n" not in text
-    longest = found.stretches[0]
     assert f"x {longest.x_m:.1f}, y {longest.y_m:.1f} m" in text
     assert f"{longest.from_ns / 1e9:.0f} to {longest.to_ns / 1e9:.0f} s" in text and "--start" in text
-    assert consistency_warning(Consistency(), trajectory) is None
     has_it = consistency_warning(found, trajectory, with_odometry=True)
     assert "odometry" in text and has_it is not None and "odometry" not in has_it and "--start" in has_it
 
@@ -184,23 +172,15 @@ def test_repeated_drives_scatter_as_stated(loops: bool) -> None:
     assert abs(np.log(scatter / sigma).mean()) < 0.2
 
 
-def test_a_wing_driven_once_is_known_less_the_farther_it_leads() -> None:
+def test_loops_make_places_surer_and_the_end_of_a_wing_is_known_least() -> None:
     sigma, _ = position_sigmas(TRUTH, edges(TRUTH))
     assert np.all(np.diff(sigma[WING]) > 0.0)
     assert sigma[-1] > 3.0 * np.median(sigma[: 2 * ROUND])
-
-
-def test_loops_make_places_surer() -> None:
-    with_loops, _ = position_sigmas(TRUTH, edges(TRUTH))
     without, _ = position_sigmas(TRUTH, edges(TRUTH, loops=False))
-    assert with_loops.max() < 0.7 * without.max()
-
-
-def test_a_loop_from_the_end_of_the_wing_ties_it() -> None:
+    assert sigma.max() < 0.7 * without.max()
     back = Edge(0, len(TRUTH) - 1, SE2(*TRUTH[0]).inverse() @ SE2(*TRUTH[-1]), LOOP, loop=True)
-    loose, _ = position_sigmas(TRUTH, edges(TRUTH))
     tied, _ = position_sigmas(TRUTH, [*edges(TRUTH), back])
-    assert tied[-1] < 0.5 * loose[-1]
+    assert tied[-1] < 0.5 * sigma[-1]
 
 
 def way(length_m: float = 30.0) -> Trajectory:

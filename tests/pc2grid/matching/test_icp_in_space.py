@@ -1,7 +1,5 @@
 """A planar pose refined in space, and rays that agree with a map or pass through it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

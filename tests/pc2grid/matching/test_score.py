@@ -1,7 +1,5 @@
 """Two-way scores: what supports a pose, what contradicts it, and what does not count."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

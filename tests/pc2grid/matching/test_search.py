@@ -1,7 +1,5 @@
 """The coarse search against brute force, its compiled functions against the plain ones."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

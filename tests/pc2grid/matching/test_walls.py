@@ -1,7 +1,5 @@
 """Wall points, their weights, and thinning, against plain counterparts."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Floor plans, their walls in space, and what is put into them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

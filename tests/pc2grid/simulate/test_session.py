@@ -1,7 +1,5 @@
 """What the sensors see, and the recording that is made of it."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 from typing import Any

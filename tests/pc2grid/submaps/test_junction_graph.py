@@ -1,7 +1,5 @@
 """Thinning, clearance, even sampling and the steps along a skeleton (paper III-A)."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st

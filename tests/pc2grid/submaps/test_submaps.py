@@ -1,7 +1,5 @@
 """Partition into submaps (paper III-A)."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from typing import Any
@@ -203,20 +201,11 @@ def test_graph_comes_back_from_arrays(seed: int | None) -> None:
 @pytest.mark.parametrize(
     ("field", "index", "value"),
     [
-        ("kind", 0, 2),
-        ("edges", (0, 0), -1),
-        ("edges", (0, 1), 10_000),
-        ("edges", (0, 1), 0),
-        ("edges", 1, (0, 0)),
-        ("center_m", (0, 0), np.nan),
-        ("length_m", 0, -1.0),
-        ("length_m", 0, np.inf),
-        ("path_start", 0, 1),
-        ("path_start", -1, 3),
-        ("path_start", 1, -1),
-        ("path_m", (0, 0), np.inf),
+        ("kind", 0, 2), ("edges", (0, 0), -1), ("edges", (0, 1), 10_000), ("edges", (0, 1), 0),
+        ("edges", 1, (0, 0)), ("center_m", (0, 0), np.nan), ("length_m", 0, -1.0), ("length_m", 0, np.inf),
+        ("path_start", 0, 1), ("path_start", -1, 3), ("path_start", 1, -1), ("path_m", (0, 0), np.inf),
     ],
-)
+)  # fmt: skip
 def test_arrays_that_are_no_graph_are_refused(field: str, index: Any, value: Any) -> None:
     arrays = graph_to_arrays(junction_graph(rooms(0)))
     parts = {f.name: np.array(getattr(arrays, f.name)) for f in dataclasses.fields(arrays)}

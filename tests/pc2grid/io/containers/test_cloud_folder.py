@@ -1,7 +1,5 @@
 """Folders of PCD, PLY and KITTI .bin files, as Open3D and plain numpy write them."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 
@@ -199,18 +197,12 @@ def test_mixed_kinds_are_said(tmp_path: Path) -> None:
     assert any("only its .bin files are read" in w for w in report.warnings)
 
 
-# --- test_absurd_clouds ---
-
-
 @pytest.mark.parametrize("name", ["9999999999.5", "9999999999999999999"])
 def test_names_past_all_calendars_are_no_times(tmp_path: Path, name: str) -> None:
     (tmp_path / f"{name}.bin").write_bytes(np.ones((5, 4), "<f4").tobytes())
     scans, report = read(tmp_path)
     assert len(scans) == 1
     assert any("10 clouds a second are assumed" in w for w in report.warnings)
-
-
-# --- test_refusals_clouds ---
 
 
 def test_a_cloud_that_may_not_be_read_or_went_away(tmp_path: Path) -> None:

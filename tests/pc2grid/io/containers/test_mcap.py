@@ -1,11 +1,10 @@
 """MCAP: its index is used as far as it is sound; damage is named, and --recover reads what is certain."""
 
-from __future__ import annotations
-
 import io
 import struct
 import zlib
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -106,46 +105,43 @@ def test_writers_that_leave_parts_out(tmp_path: Path, options: dict[str, Any], w
         assert counts[0] == counts[1]
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        without(STATISTICS),
-        without(CHANNEL),
-        without(CHUNK_INDEX),
-        patched(STATISTICS, 22, "<I", 99),  # more chunks than listed
-        patched(STATISTICS, 10, "<I", 99),  # more channels than listed
-    ],
-)
-@pytest.mark.parametrize("checked", [True, False])
-def test_an_index_that_is_not_complete_costs_nothing(
-    tmp_path: Path, change: Callable[[int, bytes], bytes | None], checked: bool
-) -> None:
-    path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000)
-    path.write_bytes(with_summary(path.read_bytes(), change, checked=checked))
-    scans, report = read(path)
-    check_drive(scans)
-    assert not report.lossy
-    assert any("the index is not usable" in warning for warning in report.warnings)
+def footer_of(whole: bytes, start: int) -> bytes:
+    """The file whose footer says that the summary begins elsewhere."""
+    return whole[: -FOOTER + 9] + struct.pack("<Q", start) + whole[-FOOTER + 17 :]
 
 
-@pytest.mark.parametrize("start", [1 << 60, 3])
-def test_a_footer_that_points_elsewhere_costs_nothing(tmp_path: Path, start: int) -> None:
-    path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000)
-    whole = path.read_bytes()
-    path.write_bytes(whole[: -FOOTER + 9] + struct.pack("<Q", start) + whole[-FOOTER + 17 :])
-    scans, report = read(path)
-    check_drive(scans)
-    assert any("the index is not usable" in warning for warning in report.warnings)
+def another_topic(whole: bytes) -> bytes:
+    at = whole.rindex(b"/tf_static") + 1
+    return whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :]
+
+
+INCOMPLETE = [
+    without(STATISTICS),
+    without(CHANNEL),
+    without(CHUNK_INDEX),
+    patched(STATISTICS, 22, "<I", 99),  # more chunks than listed
+    patched(STATISTICS, 10, "<I", 99),  # more channels than listed
+]
 
 
 @pytest.mark.fault(9)
-def test_a_damaged_summary_renames_no_topic(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    "damaged",
+    [
+        *(partial(with_summary, change=change, checked=True) for change in INCOMPLETE),
+        *(partial(with_summary, change=change, checked=False) for change in INCOMPLETE),
+        *(partial(footer_of, start=start) for start in (1 << 60, 3)),
+        another_topic,
+    ],
+)
+def test_a_summary_that_is_not_usable_costs_nothing(
+    tmp_path: Path, damaged: Callable[[bytes], bytes]
+) -> None:
     path = write_mcap(tmp_path / "a.mcap", drive(), chunk_size=2000)
-    whole = bytearray(path.read_bytes())
-    whole[whole.rindex(b"/tf_static") + 1] ^= 4
-    path.write_bytes(whole)
+    path.write_bytes(damaged(path.read_bytes()))
     scans, report = read(path)
     check_drive(scans)
+    assert not report.lossy
     assert any("the index is not usable" in warning for warning in report.warnings)
 
 
@@ -413,9 +409,6 @@ def test_what_is_allowed_is_read_and_no_more(file: BoundedFile) -> None:
 def test_a_length_that_is_none_is_damage(file: BoundedFile, size: int | None) -> None:
     with pytest.raises(LogCorrupt, match="where a record should begin"):
         file.read(size)
-
-
-# --- test_absurd_mcap ---
 
 
 MIB = 1 << 20

@@ -1,7 +1,5 @@
 """Every container gives the messages of the topics and of the time range that it is asked for, no others."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -26,14 +24,9 @@ from tests.helpers.recordings import (
 
 CONFIG = ReadConfig()
 PARTS: list[tuple[int | None, int | None]] = [
-    (None, None),
-    (T0 + STEP, None),
-    (None, T0 + 5 * STEP),
-    (T0 + 3 * STEP, T0 + 4 * STEP),
-    (T0 + 3 * STEP + 1, T0 + 4 * STEP + 1),
-    (T0 + 99 * STEP, None),
-    (None, T0),
-]
+    (None, None), (T0 + STEP, None), (None, T0 + 5 * STEP), (T0 + 3 * STEP, T0 + 4 * STEP),
+    (T0 + 3 * STEP + 1, T0 + 4 * STEP + 1), (T0 + 99 * STEP, None), (None, T0),
+]  # fmt: skip
 
 
 def at_odd_times(dialect: Dialect = "ros2") -> list[Message]:

@@ -1,7 +1,5 @@
 """What LogWriter writes is read back by the reference MCAP and ROS 2 decoders, field by field."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

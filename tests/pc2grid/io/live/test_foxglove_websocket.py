@@ -2,8 +2,6 @@
 connection.
 """
 
-from __future__ import annotations
-
 import json
 import random
 import socket

@@ -1,7 +1,5 @@
 """Clocks that jump, gaps, and lag, without any network."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections import deque
@@ -167,66 +165,47 @@ class Clock:
         return self.now_s
 
 
-def drain(inbox: Inbox) -> list[tuple[str, int]]:
-    found = []
-    while (arrived := inbox.get(0.0)) is not None:
-        found.append((arrived.message.channel.topic, arrived.message.log_time_ns))
-    return found
-
-
-def fill(inbox: Inbox, clock: Clock, seconds: range) -> None:
+def waiting(inbox: Inbox, clock: Clock, seconds: range) -> dict[str, list[int]]:
+    """When the messages were recorded that still wait after one of each topic came in each second."""
     for now in seconds:
         clock.now_s = float(now)
         inbox.put(RawMessage(SCAN, now, b"x" * 10))
         inbox.put(RawMessage(TF, now, b"x"))
+    found: dict[str, list[int]] = {"/scan": [], "/tf": []}
+    while (arrived := inbox.get(0.0)) is not None:
+        found[arrived.message.channel.topic].append(arrived.message.log_time_ns)
+    return found
 
 
-def test_scans_are_dropped_rather_than_late_and_transforms_are_kept() -> None:
+@pytest.mark.parametrize(
+    ("limits", "prepared", "scans"),
+    [
+        ({"most_lag_s": 2.0, "catch_up_s": 0.0}, True, [7, 8, 9]),  # dropped rather than late
+        ({"most_lag_s": 2.0}, False, [*range(10)]),  # before the preparations are over, none is late
+        ({"most_bytes": 45}, False, [7, 8, 9]),  # but memory is bounded even then
+        ({"most_lag_s": 2.0, "catch_up_s": 20.0}, True, [*range(10)]),  # they may be used up first
+        ({"most_lag_s": 2.0, "catch_up_s": 6.0}, True, [7, 8, 9]),  # but not for ever
+    ],
+)
+def test_scans_are_dropped_and_transforms_are_kept(
+    limits: dict[str, float], prepared: bool, scans: list[int]
+) -> None:
     counts, clock = FeedCounts(), Clock()
-    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0, catch_up_s=0.0), clock=clock)
-    inbox.prepared()
-    fill(inbox, clock, range(10))
-    found = drain(inbox)
-    assert [t for topic, t in found if topic == "/scan"] == [7, 8, 9]
-    assert [t for topic, t in found if topic == "/tf"] == list(range(10))
-    assert (counts.arrived, counts.dropped) == (20, 7)
+    inbox = Inbox(counts, InboxParameters(**limits), clock=clock)  # type: ignore[arg-type]
+    if prepared:
+        inbox.prepared()
+    found = waiting(inbox, clock, range(10))
+    assert found["/scan"] == scans
+    assert found["/tf"] == [*range(10)] or "most_bytes" in limits
+    assert counts.arrived == 20 and counts.dropped == 20 - len(found["/scan"]) - len(found["/tf"])
+    if limits.get("catch_up_s") == 20.0:
+        assert waiting(inbox, clock, range(10, 20))["/scan"] == [17, 18, 19]
 
 
-def test_nothing_is_dropped_before_the_preparations_are_over() -> None:
-    counts, clock = FeedCounts(), Clock()
-    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0), clock=clock)
-    fill(inbox, clock, range(10))
-    assert len(drain(inbox)) == 20
-    assert counts.dropped == 0
-
-
-def test_memory_is_bounded_even_then() -> None:
-    counts, clock = FeedCounts(), Clock()
-    inbox = Inbox(counts, InboxParameters(most_bytes=45), clock=clock)
-    fill(inbox, clock, range(10))
-    found = drain(inbox)
-    assert [t for topic, t in found if topic == "/scan"] == [7, 8, 9]
-    few = Inbox(counts, InboxParameters(most_messages=6), clock=clock)
-    fill(few, clock, range(10))
-    assert len(drain(few)) == 6
-
-
-def test_what_waited_during_the_preparations_may_be_used_up_first() -> None:
-    counts, clock = FeedCounts(), Clock()
-    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0, catch_up_s=20.0), clock=clock)
-    inbox.prepared()
-    fill(inbox, clock, range(10))
-    assert len(drain(inbox)) == 20
-    fill(inbox, clock, range(10, 20))
-    assert [t for topic, t in drain(inbox) if topic == "/scan"] == [17, 18, 19]
-
-
-def test_but_not_for_ever() -> None:
-    counts, clock = FeedCounts(), Clock()
-    inbox = Inbox(counts, InboxParameters(most_lag_s=2.0, catch_up_s=6.0), clock=clock)
-    inbox.prepared()
-    fill(inbox, clock, range(10))
-    assert [t for topic, t in drain(inbox) if topic == "/scan"] == [7, 8, 9]
+def test_the_number_of_messages_is_bounded() -> None:
+    clock = Clock()
+    inbox = Inbox(FeedCounts(), InboxParameters(most_messages=6), clock=clock)
+    assert sum(map(len, waiting(inbox, clock, range(10)).values())) == 6
 
 
 def test_get_waits_for_another_thread() -> None:
@@ -242,8 +221,7 @@ def test_get_waits_for_another_thread() -> None:
 
 @pytest.mark.parametrize("most", [1, 4])
 def test_a_dropped_scan_gives_its_bytes_back(most: int) -> None:
-    counts = FeedCounts()
-    inbox = Inbox(counts, InboxParameters(most_bytes=10 * most))
+    inbox = Inbox(FeedCounts(), InboxParameters(most_bytes=10 * most))
     for k in range(50):
         inbox.put(RawMessage(SCAN, k, b"x" * 10))
-    assert [t for _, t in drain(inbox)] == list(range(50 - most, 50))
+    assert waiting(inbox, Clock(), range(0))["/scan"] == [*range(50 - most, 50)]

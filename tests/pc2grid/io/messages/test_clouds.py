@@ -1,7 +1,5 @@
 """test_clouds."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np
@@ -12,8 +10,6 @@ from pc2grid.io.messages.types import Header, PointCloud2
 from tests.helpers.recordings import T0
 
 HEADER = Header(T0, "lidar")
-
-
 NUMPY = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8", 9: "i8", 10: "u8"}
 
 
@@ -44,8 +40,6 @@ def columns(types: list[str], counts: list[int]) -> list[np.ndarray]:
 
 
 PCD_TYPES = ["i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8", "i8", "u8"]
-
-
 PCD_COUNTS = [1, 3, 2, 1, 4, 1, 2, 1, 1, 2]
 
 

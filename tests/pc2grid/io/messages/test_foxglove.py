@@ -1,7 +1,5 @@
 """Foxglove's messages, written by its own published schemas, in protobuf and JSON."""
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

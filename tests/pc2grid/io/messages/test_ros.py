@@ -1,7 +1,5 @@
 """Definitions of ROS types in recordings: those that ROS publishes, and invalid ones."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest
@@ -17,7 +15,6 @@ TYPES = [
     "sensor_msgs/PointCloud2", "sensor_msgs/LaserScan", "sensor_msgs/Image", "sensor_msgs/CompressedImage",
     "sensor_msgs/CameraInfo", "nav_msgs/Odometry", "tf2_msgs/TFMessage",
 ]  # fmt: skip
-
 LASER_OF_ROS_1 = """\
 # Single scan from a planar laser range-finder
 #
@@ -44,7 +41,6 @@ time stamp
 string frame_id
 
 """
-
 FIELD_WITH_CONSTANTS = """\
 # The type of the "name" is a string.
 uint8 INT8    = 1

@@ -1,10 +1,9 @@
 """PointCloud2 in every layout against a slow oracle that unpacks value by value."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 import struct
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -39,6 +38,13 @@ def cloud(rows: list[list[list[float]]], kind: int, big: bool, gap: int, pad: in
     fields = (*fields, ("time", gap + 3 * size, 8, 1))
     width = len(rows[0]) if rows else 0
     return PointCloud2(Header(STAMP, "lidar"), len(rows), width, fields, big, step, width * step + pad, data)
+
+
+def timed(kind: int, values: Sequence[float], name: str = "t") -> PointCloud2:
+    """Points at (1, 2, 3) with these times, of a datatype."""
+    data = b"".join(struct.pack("<3f" + CODES[kind], 1, 2, 3, v) for v in values)
+    fields, step = (*XYZ, (name, 12, kind, 1)), len(data) // len(values)
+    return PointCloud2(Header(STAMP, ""), 1, len(values), fields, False, step, len(data), data)
 
 
 @st.composite
@@ -96,17 +102,13 @@ def test_round_trip_against_the_oracle(case: tuple[PointCloud2, list[list[float]
     "name", ["t", "time", "timestamp", "timestamps", "offset_time", "Time", "time_stamp"]
 )
 def test_per_point_times_in_every_spelling(kind: int, values: list[float], name: str) -> None:
-    data = b"".join(struct.pack("<3f" + CODES[kind], 1, 2, 3, v) for v in values)
-    fields = (("x", 0, 7, 1), ("y", 4, 7, 1), ("z", 8, 7, 1), (name, 12, kind, 1))
-    found = decode(PointCloud2(Header(STAMP, ""), 1, 3, fields, False, len(data) // 3, len(data), data))
+    found = decode(timed(kind, values, name))
     assert found.offsets_s is not None
     np.testing.assert_allclose(found.offsets_s, [0, 0.05, 0.1], atol=2e-6)
 
 
 def test_times_that_decrease_or_end_at_the_stamp_keep_their_signs() -> None:
-    fields = (*XYZ, ("t", 12, 5, 1))
-    data = b"".join(struct.pack("<3fi", 1, 2, 3, v) for v in (0, -50_000_000, -100_000_000))
-    found = decode(PointCloud2(Header(STAMP, ""), 1, 3, fields, False, 16, 48, data))
+    found = decode(timed(5, (0, -50_000_000, -100_000_000)))
     assert found.offsets_s is not None
     np.testing.assert_allclose(found.offsets_s, [0, -0.05, -0.1], atol=1e-7)
 
@@ -144,11 +146,11 @@ def test_wild_times_decide_no_unit(wild: float, share: float, scale: float, begi
 
 @pytest.mark.fault(31)
 def test_no_times_or_all_the_same_is_no_offsets() -> None:
-    data = b"".join(struct.pack("<4f", 1, 2, 3, 0.5) for _ in range(3))
-    same = decode(PointCloud2(Header(STAMP, ""), 1, 3, (*XYZ, ("t", 12, 7, 1)), False, 16, 48, data))
+    cloud = timed(7, [0.5] * 3)
+    same = decode(cloud)
     assert same.offsets_s is None
     assert "all the same" in same.notes[0]
-    assert decode(PointCloud2(Header(STAMP, ""), 1, 3, XYZ, False, 16, 48, data)).offsets_s is None
+    assert decode(dataclasses.replace(cloud, fields=XYZ)).offsets_s is None
 
 
 def test_an_absurd_size_is_refused_before_anything_is_allocated() -> None:
@@ -170,10 +172,7 @@ def test_an_absurd_size_is_refused_before_anything_is_allocated() -> None:
 )
 def test_times_of_a_known_unit_that_no_scan_can_span(unit: str, kind: int, values: list[float]) -> None:
     """One flipped bit, or another unit than declared: seconds become years."""
-    data = b"".join(struct.pack("<3f" + CODES[kind], 1, 2, 3, v) for v in values)
-    message = PointCloud2(
-        Header(STAMP, ""), 1, 3, (*XYZ, ("t", 12, kind, 1)), False, len(data) // 3, len(data), data
-    )
+    message = timed(kind, values)
     with pytest.raises(PointCloudError, match=rf"field t: times that span .* s, read as {unit}") as caught:
         decode(message, unit=unit)
     assert "read.point_time=" in str(caught.value.hint)
@@ -264,9 +263,6 @@ def test_the_plane_of_a_laser_is_x_y_of_its_frame(tmp_path: Path) -> None:
         scans_of(tmp_path, mount, laser(frame="camera_optical"))
 
 
-# --- test_edges_decode ---
-
-
 def beams(count: int = 5, **changes: float) -> LaserScan:
     start, step = changes.pop("angle_min", -0.2), changes.pop("angle_increment", 0.1)
     known = {
@@ -317,9 +313,6 @@ def test_angles_may_be_off_by_two_beams_or_two_percent(count: int, slack: int) -
     for wrong in (-slack - 0.5, slack + 0.5):
         (note,) = laserscan.decode(declared(wrong), max_points=10_000).notes
         assert "angle_max is ignored" in note
-
-
-# --- test_refusals_decode ---
 
 
 HEADER = Header(T0, "lidar")

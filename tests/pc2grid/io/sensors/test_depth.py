@@ -1,7 +1,5 @@
 """Depth images of every encoding, through a whole log: units, returns, cameras that do not fit."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 
@@ -236,9 +234,6 @@ def test_the_unit_that_a_realsense_bag_names(tmp_path: Path, name: str) -> None:
     assert any("units of 0.0002 m" in w for w in report.warnings)
 
 
-# --- test_absurd_depth ---
-
-
 @pytest.mark.parametrize("value", [float("nan"), float("inf"), 1e30, 1e300])
 @pytest.mark.parametrize("place", range(5))
 def test_cameras_with_absurd_distortion(tmp_path: Path, value: float, place: int) -> None:
@@ -254,9 +249,6 @@ def test_cameras_with_absurd_distortion(tmp_path: Path, value: float, place: int
         assert INFO in error.message
     else:
         assert np.isfinite(scan.points_m).all()
-
-
-# --- test_edges_depth ---
 
 
 def camera(model: str, d: list[float]) -> Message:
