@@ -319,9 +319,17 @@ FAULTS = {
 }
 
 
+LEAST_STEP_M = {"missing before a gap": 1.0, "one scan of fifteen": 0.6, "one scan of four, none": 0.2}
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_faults_of_odometry_lose_no_place(laser, fault):
     pairs = FAULTS[fault](laser)
+    steps = [a.inverse() @ b for (_, a), (_, b) in itertools.pairwise(pairs)]
+    assert max(np.hypot(step.x, step.y) for step in steps) > LEAST_STEP_M.get(fault, 0.0)
+    if "late" in fault or "restarts" in fault:  # by odometry alone, it is elsewhere
+        T_first_odom = invert_pose(pairs[0][0].T_odom_base)
+        assert errors(pairs, [T_first_odom @ scan.T_odom_base for scan, _ in pairs]).max() > 0.25
     registered = follow(scan for scan, _ in pairs)
     assert not any(r.health is Health.LOST for r in registered)
     limit_m = 0.08 if "one scan" in fault else 0.06

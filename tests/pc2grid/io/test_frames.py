@@ -404,6 +404,14 @@ def test_of_several_static_trees_none_is_the_robot_s(tmp_path: Path) -> None:
         read(write_mcap(tmp_path / "a.mcap", messages))
 
 
+@pytest.mark.fault(36)
+def test_tf_that_goes_in_a_circle_is_refused(tmp_path: Path) -> None:
+    there, back = (("base_link", "lidar"), ("lidar", "base_link"))
+    edges = [ros().tf(T0, *edge, 0.2, topic="/tf_static") for edge in (there, back)]
+    with pytest.raises(FrameError, match="tf goes in a circle"):
+        read(write_mcap(tmp_path / "a.mcap", [*edges, *clouds(1)]))
+
+
 def moved(message: Message, old: float, new: float) -> Message:
     """The message with one of its numbers replaced."""
     before = struct.pack("<d", old)
@@ -431,7 +439,6 @@ def test_a_mount_that_is_nowhere_or_turned_nowhere_is_refused_by_name(
     assert any("base_link -> lidar" in warning for warning in report.warnings)
 
 
-@pytest.mark.fault(36)
 def test_a_chain_of_very_many_frames() -> None:
     links = [
         Transform(Header(T0, f"f{i}"), f"f{i + 1}", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))

@@ -112,7 +112,8 @@ def test_missing_keys_are_named(tmp_path: Path, key: str) -> None:
     ("key", "good", "bad"),
     [
         ("resolution", ["1e-3", 100.0], [0.9e-3, 101, 0, ".nan", "[1]"]),
-        ("origin", [[1e8, -1e8, 0], [0, 0, 3.14]], [[1.1e8, 0, 0], [0, 0], [0] * 4, "a", "[0, 0, .inf]"]),
+        ("origin", [[1e8, -1e8, 0], [0, 0, 3.14]], [[1.1e8, 0, 0], [0, 0], [0] * 4, "a"]),
+        ("origin: input should be a finite number", [], [f"[0, 0, {no}]" for no in (".inf", ".nan", "nan")]),
         ("occupied_thresh", [0.196, 1.0], [0.19, 1.01]),
         ("free_thresh", [0.0, 0.65], [-0.01, 0.66]),
         ("negate", [0, 1, "0", "1", True, "false"], [2, -1, "", [0], 0.5, 10**30, "maybe"]),
@@ -120,11 +121,13 @@ def test_missing_keys_are_named(tmp_path: Path, key: str) -> None:
     ],
 )
 def test_values_up_to_their_limits(tmp_path: Path, key: str, good: list[object], bad: list[object]) -> None:
+    """key : of the YAML, and what is said of bad values behind it."""
+    name = key.partition(":")[0]
     for value in good:
-        load_map(grey_map(tmp_path, bytes(6), **{key: value}))
+        load_map(grey_map(tmp_path, bytes(6), **{name: value}))
     for value in bad:
         with pytest.raises(MapFileError, match=r"m\.yaml: .*" + key):
-            load_map(grey_map(tmp_path, bytes(6), **{key: value}))
+            load_map(grey_map(tmp_path, bytes(6), **{name: value}))
 
 
 def test_a_shade_at_a_threshold_is_neither(tmp_path: Path) -> None:
