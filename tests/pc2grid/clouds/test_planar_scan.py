@@ -41,39 +41,35 @@ def planar_scan_of(
     )
 
 
-def test_a_laser_beam_is_a_hit_and_the_free_space_before_it() -> None:
-    planar_scan = planar_scan_of([(3.0, 0.0, 0.0), (0.0, 2.0, 0.0)], ground=None, sensor=(0, 0, 0))
-    assert sorted(map(tuple, planar_scan.hits_m.tolist())) == [(0.0, 2.0), (3.0, 0.0)]
-    assert planar_scan.free_m[bearing(0)] == 3.0 and planar_scan.free_m[bearing(90)] == 2.0
-    assert planar_scan.free_m[bearing(180)] == 0.0
+RING = [(3 * math.cos(math.radians(a)), 3 * math.sin(math.radians(a)), 0.0) for a in (10.0, 11.0, 20.0)]
 
 
-def test_height_band_decides_what_is_an_obstacle() -> None:
-    planar_scan = planar_scan_of([(2.0, 0.0, 0.0), (0.0, 2.0, 1.0), (-2.0, 0.0, 2.5)])
-    assert planar_scan.hits_m.tolist() == [[0.0, 2.0]]
-    assert planar_scan.free_m[bearing(0)] == 2.0  # the floor was seen there, so nothing stands before it
-    assert planar_scan.free_m[bearing(90)] == 2.0
-    # towards the ceiling the ray leaves the band (1.8 m) after 1.1 of its 1.8 m climb
-    assert planar_scan.free_m[bearing(180)] == pytest.approx(2.0 * 1.1 / 1.8, rel=1e-5)
-
-
-def test_an_obstacle_ends_the_free_space_even_when_the_floor_is_seen_behind_it() -> None:
-    planar_scan = planar_scan_of([(1.0, 0.0, 0.3), (4.0, 0.0, 0.0)])
-    assert planar_scan.free_m[0] == 1.0
-
-
-def test_gaps_between_beams_are_closed_but_not_those_of_missing_returns() -> None:
-    angles = np.radians([10.0, 11.0, 20.0])
-    planar_scan = planar_scan_of(
-        np.column_stack((3 * np.cos(angles), 3 * np.sin(angles), 0 * angles)), ground=None
-    )
-    assert planar_scan.free_m[bearing(10.5)] == pytest.approx(3.0)
-    assert planar_scan.free_m[bearing(15)] == 0.0
-
-
-def test_far_returns_give_free_space_but_no_hits() -> None:
-    planar_scan = planar_scan_of([(50.0, 0.0, 0.0)], ground=None)
-    assert len(planar_scan.hits_m) == 0 and planar_scan.free_m[0] == CONFIG.max_range_m
+@pytest.mark.parametrize(
+    ("points", "ground", "hits", "free_m"),
+    [
+        # A beam of a laser is a hit and the free space before it.
+        ([(3.0, 0.0, 0.0), (0.0, 2.0, 0.0)], None, [(3.0, 0.0), (0.0, 2.0)], {0: 3.0, 90: 2.0, 180: 0.0}),
+        # The floor is no obstacle. Towards the ceiling the ray leaves the band (1.8 m)
+        # after 1.1 of its 1.8 m climb.
+        ([(2.0, 0.0, 0.0), (0.0, 2.0, 1.0), (-2.0, 0.0, 2.5)], GROUND, [(0.0, 2.0)],
+         {0: 2.0, 90: 2.0, 180: pytest.approx(2.0 * 1.1 / 1.8, rel=1e-5)}),
+        # An obstacle ends the free space, also if the floor is seen behind it.
+        ([(1.0, 0.0, 0.3), (4.0, 0.0, 0.0)], GROUND, [(1.0, 0.0)], {0: 1.0}),
+        # Gaps between beams are closed, but not those of missing returns.
+        (RING, None, [point[:2] for point in RING], {10.5: pytest.approx(3.0), 15: 0.0}),
+        ([(50.0, 0.0, 0.0)], None, [], {0: CONFIG.max_range_m}),  # far returns give free space but no hits
+    ],
+)  # fmt: skip
+def test_what_is_a_hit_and_what_is_free(
+    points: list[tuple[float, ...]],
+    ground: Ground | None,
+    hits: list[tuple[float, float]],
+    free_m: dict[float, object],
+) -> None:
+    planar_scan = planar_scan_of(points, ground)
+    found = sorted(map(tuple, planar_scan.hits_m.tolist()))
+    assert len(found) == len(hits) and np.allclose(found, sorted(hits), atol=1e-6)
+    assert {degrees: planar_scan.free_m[bearing(degrees)] for degrees in free_m} == free_m
 
 
 # --- A table before a wall, seen by a lidar at 0.9 m: its top is at 0.7 m, rays pass over it and under it ---

@@ -333,7 +333,7 @@ def sweeps(columns: int = 300) -> Iterator[tuple[Scan, F64]]:
 
     The vertical of the IMU errs by a degree and a half, its turns by 0.3 degrees a second.
     """
-    walk = prepare_session(sensor="lidar", config=SimulationConfig(length_m=3.0, seed=1))
+    walk = prepare_session(sensor="lidar", config=SimulationConfig(length_m=2.0, seed=1))
     scene, rng = Scene(walk.mesh()), np.random.default_rng(2)
     times_s = np.arange(columns) * 0.1 / columns
     azimuth = np.linspace(-math.pi, math.pi, columns, endpoint=False)
