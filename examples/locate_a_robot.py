@@ -20,10 +20,9 @@ def main(recording: str, database: str) -> None:
         config = opened.config()
         localizer = pc2grid.Localizer(pc2grid.MapIndex.of(opened, config))
         for registered, planar_scan in pc2grid.follow(log.scans(), config):
-            estimate = localizer.add(registered, planar_scan)
-            if estimate is None:  # the database is searched after every metre of travel
+            answer = localizer.add(registered, planar_scan)
+            if answer is None:  # the database is searched after every metre of travel
                 continue
-            answer = estimate.answer
             print(f"after {answer.path_m:.1f} m: {answer.status}, confidence {answer.confidence:.3f}")
             if answer.T_map_base is not None:
                 x, y, yaw_deg = answer.T_map_base.x, answer.T_map_base.y, math.degrees(answer.T_map_base.yaw)

@@ -9,7 +9,7 @@ each name loads its module when it is first used. `help(signature.relocalize)` a
 ...     config = database.config()
 ...     localizer = signature.Localizer(signature.MapIndex.of(database, config))
 ...     for registered, planar_scan in pc2grid.follow(log.scans(), config):
-...         estimate = localizer.add(registered, planar_scan)  # None but after every metre
+...         found = localizer.add(registered, planar_scan)  # None but after every metre
 >>> answer = localizer.answer()
 >>> answer.status, answer.session
 ('located', 'monday')
@@ -27,7 +27,7 @@ Databases
 
 Answers
     relocalize          where in a database a recording was made: a Found, an Answer that can be drawn
-    Localizer           where registered scans were taken, in a MapIndex: an Estimate after every metre
+    Localizer           where registered scans were taken, in a MapIndex: an Answer after every metre
     locate_map          where a drawn map lies
     Prior               where the robot is known to be, roughly
     check_pose          whether a pose that is believed agrees with the map: a PoseCheck
@@ -48,11 +48,7 @@ if TYPE_CHECKING:
         open_database as open_database,
     )
     from signature.localization.answer import Answer as Answer
-    from signature.localization.localizer import (
-        Estimate as Estimate,
-        Localizer as Localizer,
-        locate_map as locate_map,
-    )
+    from signature.localization.localizer import Localizer as Localizer, locate_map as locate_map
     from signature.localization.map_index import MapIndex as MapIndex
     from signature.localization.pose_check import PoseCheck as PoseCheck, check_pose as check_pose
     from signature.localization.posterior import Prior as Prior
@@ -89,7 +85,6 @@ _HOMES = {
     "PoseCheck": "signature.localization.pose_check",
     "check_pose": "signature.localization.pose_check",
     "Prior": "signature.localization.posterior",
-    "Estimate": "signature.localization.localizer",
     "Localizer": "signature.localization.localizer",
     "locate_map": "signature.localization.localizer",
     "add_session": "signature.sessions",

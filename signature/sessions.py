@@ -34,7 +34,7 @@ from signature.database import Label, Provenance, SubmapDatabase, open_database
 from signature.database.maintenance import exists, store
 from signature.database.postgres import is_url
 from signature.localization.answer import Answer, QueryRecording, followed
-from signature.localization.localizer import Estimate, Localizer, locate_map
+from signature.localization.localizer import Localizer, locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
 from signature.localization.pose_check import PoseCheck
@@ -114,7 +114,7 @@ def relocalize(
     config : its sections `read`, `registration` and `relocalize` are used; see `query_config`.
     span : the part of the recording to use. recover : use the undamaged part of a recording.
     prior : prior knowledge of the robot's pose; other places are no answers.
-    until_located : stop at the first estimate that is `located`; otherwise the recording is read to its end,
+    until_located : stop at the first answer that is `located`; otherwise the recording is read to its end,
         and the answer is about its last metres.
     observer : gets the progress, and each scan with its tracked pose; None: a progress bar on a terminal
         or in a notebook.
@@ -182,7 +182,7 @@ def find(
     recover: bool = False,
     prior: Callable[[Log, TimeSpan], Prior | None] = lambda log, span: None,
     until_located: bool = False,
-    see: Callable[[RegisteredScan, Estimate | None], None] = lambda registered, estimate: None,
+    see: Callable[[RegisteredScan, Answer | None], None] = lambda registered, answer: None,
     observer: Observer = Observer(),
     index: MapIndex | None = None,
 ) -> Found:
@@ -213,11 +213,11 @@ def find(
         localizer, seen = Localizer(index if known is None else index.within(known)), []
         with observer.step("locate", span.length_ns(log.info.start_ns, log.info.end_ns) * 1e-9):
             for registered, planar_scan in tracked(log, config, span, observer):
-                estimate = localizer.add(registered, planar_scan)
+                found = localizer.add(registered, planar_scan)
                 observer.on_scan(registered)
-                see(registered, estimate)
+                see(registered, found)
                 seen.append((registered.scan.stamp_ns, registered.T_session_base, registered.health))
-                if until_located and estimate is not None and localizer.answer().status == "located":
+                if until_located and found is not None and localizer.answer().status == "located":
                     break
             answer = localizer.answer()
         stamps_ns, poses, health = zip(*seen, strict=True)

@@ -30,6 +30,14 @@ from signature.localization.posterior import POSTERIOR, PRIOR
 
 Status = Literal["located", "ambiguous", "not_found"]
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]
+State = Literal["searching", "located", "off_map", "doubtful", "lost", "recovered"]
+"""searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`; and the
+robot was located there before, or the searches in a row that found it there leave no more doubt, multiplied,
+than `PosteriorParameters.certain`. off_map: most likely it is where the map shows too little of what it sees.
+doubtful: none of these; lost: nor is it where it was, as all else together has at least the mass `accept`, or
+it was carried away. What a map shows does not contradict a place that it does not show: off the map, a robot
+is not lost but doubtful until it is located elsewhere. recovered: located elsewhere, or again after it was
+lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -169,6 +177,9 @@ class Answer:
     are in the map frames of their sessions (`signature.localization.answer`).
     in_space : the pose with six degrees of freedom, and whether the points agree; None if either side has
     none. Of a place that was turned down because they contradict it, the pose there.
+    state : of a robot that is followed, what this answer says beside those before (`Localizer.add`); None: it
+    was asked once. T_odometry_base : the base at the last scan in the frame of the robot's own odometry, if
+    it has any. elapsed_s : time of the search.
 
     `pc2grid.relocalize` returns a `Found`, which can be drawn, too.
 
@@ -203,6 +214,9 @@ class Answer:
     map: OccupancyGrid | None = None
     frames: tuple[str | None, ...] = ()
     off_map: tuple[OffMap, ...] = ()
+    state: State | None = None
+    T_odometry_base: SE2 | None = None
+    elapsed_s: float = 0.0
 
     def __repr__(self) -> str:
         sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
@@ -256,6 +270,18 @@ class Answer:
     def T_map_base(self) -> SE2 | None:
         """Return the base at the query's last scan; None unless located."""
         return self.T_map_odom and self.T_map_odom @ self.T_odom_base
+
+    @property
+    def T_map_odometry(self) -> SE2 | None:
+        """Return the frame of the robot's own odometry in the map; None unless located, or without any."""
+        if self.T_map_base is None or self.T_odometry_base is None:
+            return None
+        return self.T_map_base @ self.T_odometry_base.inverse()
+
+    @property
+    def is_told(self) -> bool:
+        """Return whether the place is certain enough to be sent to a robot."""
+        return self.state in ("located", "recovered")
 
     @property
     def covariance(self) -> F64 | None:

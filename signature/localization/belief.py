@@ -37,26 +37,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.matching.score import score_fit
-from signature.localization.answer import Answer, OffMap
+from signature.localization.answer import Answer, OffMap, State
 from signature.localization.hypotheses import Hypothesis, agree, more_exact
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR, PRIOR
 from signature.localization.query import QueryMap
-
-State = Literal["searching", "located", "off_map", "doubtful", "lost", "recovered"]
-"""searching: not located yet. located: one place has at least the mass `RelocalizeConfig.accept`; and the
-robot was located there before, or the searches in a row that found it there leave no more doubt, multiplied,
-than `PosteriorParameters.certain`. off_map: most likely it is where the map shows too little of what it sees.
-doubtful: none of these; lost: nor is it where it was, as all else together has at least the mass `accept`, or
-it was carried away. What a map shows does not contradict a place that it does not show: off the map, a robot
-is not lost but doubtful until it is located elsewhere. recovered: located elsewhere, or again after it was
-lost."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""Scans in, an estimate of the pose after every metre: `Localizer`, and `Follower` beside the tracking.
+"""Scans in, an answer after every metre: `Localizer`, and `Follower` beside the tracking.
 
 Hypotheses are carried along the query's travel: after every metre the old ones are refined on what has been
 seen since, and the database is searched again, so that a wrong first hypothesis is replaced. What was seen
@@ -29,8 +29,8 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
-from signature.localization.answer import Answer, Moment
-from signature.localization.belief import Belief, Masses, State
+from signature.localization.answer import Answer, Moment, State
+from signature.localization.belief import Belief, Masses
 from signature.localization.decision import PriorOf, decide, judge, weighed
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis, moved_to_origin
 from signature.localization.in_space import settle_in_space
@@ -47,40 +47,12 @@ _STANDING_S = 2.0
 start, or since registration was lost; by hand."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
-    """Where the query is after one search of the database.
-
-    state : what the answer says of a robot that was located before. registered : the last scan, which the
-    answer is about. elapsed_s : time of the search.
-    """
-
-    state: State
-    answer: Answer
-    registered: RegisteredScan
-    elapsed_s: float
-
-    @property
-    def is_told(self) -> bool:
-        """Return whether the place is certain enough to be sent to a robot."""
-        return self.state in ("located", "recovered")
-
-    @property
-    def T_map_odom(self) -> SE2 | None:
-        """Return the frame of the robot's own odometry in the map; None without an answer or without
-        odometry."""
-        T_map_base, T_odom_base = self.answer.T_map_base, self.registered.scan.T_odom_base
-        if T_map_base is None or T_odom_base is None:
-            return None
-        return T_map_base @ SE2.from_matrix(T_odom_base).inverse()
-
-
 class Localizer:
     """Takes in the scans of a recording or of a running robot, and says where it is.
 
     Memory does not grow with the travel.
 
-    index : where to look; `MapIndex.within` restricts it to what is known beforehand: estimates from the time
+    index : where to look; `MapIndex.within` restricts it to what is known beforehand: answers from the time
     of the prior on, or, if it has none, `answer` alone.
 
     >>> import pc2grid, signature
@@ -88,7 +60,7 @@ class Localizer:
     ...     config = database.config()
     ...     localizer = Localizer(MapIndex.of(database, config))
     ...     for registered, planar_scan in pc2grid.follow(log.scans(), config):
-    ...         estimate = localizer.add(registered, planar_scan)
+    ...         found = localizer.add(registered, planar_scan)  # None but after every metre
     >>> localizer.answer().status
     'located'
     """
@@ -118,14 +90,14 @@ class Localizer:
     @one_blas_thread
     def add(
         self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True
-    ) -> Estimate | None:
-        """Take in the next scan; returns an estimate if it was time for one.
+    ) -> Answer | None:
+        """Take in the next scan; returns an answer, with its `state`, if it was time for one.
 
         That is after every `relocalize.step_m` of travel, once after a while if the robot stands, and when a
         located robot has not been tracked for some scans. If the robot was likely carried away or tracking
         slipped, only the scans since are used from then on.
 
-        may_search : if not, an estimate that is due is put off until it is true.
+        may_search : if not, an answer that is due is put off until it is true.
         """
         begin = time.perf_counter()
         if not self.take(registered, planar_scan, may_search=may_search):
@@ -134,13 +106,17 @@ class Localizer:
             self.query, answer = self.search(self.query, index=self._on_the_way)
         except NoScans:  # the scans since the start, or since registration was lost, show nothing
             return None
-        query = self.query.map()
-        self._answer = answer if self._on_the_way is self.index else None
+        query, T_odometry_base = self.query.map(), registered.scan.T_odom_base
         self._last_m, self._known = query.path_m, answer.hypotheses
         self._history.append(answer.history[-1])
-        state = self._belief.follow(query, answer)
-        elapsed_s = time.perf_counter() - begin
-        return Estimate(state=state, answer=answer, registered=registered, elapsed_s=elapsed_s)
+        answer = replace(
+            answer,
+            state=self._belief.follow(query, answer),
+            T_odometry_base=None if T_odometry_base is None else SE2.from_matrix(T_odometry_base),
+            elapsed_s=time.perf_counter() - begin,
+        )
+        self._answer = answer if self._on_the_way is self.index else None
+        return answer
 
     def take(self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True) -> bool:
         """Take in the next scan without a search; whether it is time for one."""
@@ -164,7 +140,7 @@ class Localizer:
 
     @one_blas_thread
     def answer(self) -> Answer:
-        """Return where the query is, by the scans so far. Later estimates do not depend on this call.
+        """Return where the query is, by the scans so far. Later answers do not depend on this call.
 
         Raises NoScans if no scan could be used.
         """
@@ -315,11 +291,11 @@ def _told(index: MapIndex, answer: Answer, history: Iterable[Moment], clock: Clo
     )
 
 
-EstimateT = TypeVar("EstimateT")
-EstimateT_co = TypeVar("EstimateT_co", covariant=True)
+ResultT = TypeVar("ResultT")
+ResultT_co = TypeVar("ResultT_co", covariant=True)
 
 
-class Follows(Protocol[EstimateT_co]):
+class Follows(Protocol[ResultT_co]):
     """What follows a robot: a `Localizer` or a `PoseWatch`.
 
     uses_points : whether the scans that `ViewSpacing` takes are needed with their points.
@@ -332,8 +308,8 @@ class Follows(Protocol[EstimateT_co]):
 
     def add(
         self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True
-    ) -> EstimateT_co | None:
-        """Take in the next scan; returns an estimate if there is one after it."""
+    ) -> ResultT_co | None:
+        """Take in the next scan; returns an answer or a judgement if there is one after it."""
         ...
 
     def restart(self) -> None:
@@ -346,13 +322,13 @@ _MOST_WAITING = 2000
 and the points of a scan every 0.2 m where they are used."""
 
 
-class Follower(Generic[EstimateT]):
+class Follower(Generic[ResultT]):
     """Feeds a `Localizer` or a `PoseWatch` with scans, here or in a thread. Use as a context manager.
 
     lock : is held while the database is read; hold it to read the database in between.
     """
 
-    def __init__(self, localizer: Follows[EstimateT], *, beside: bool, step_m: float = 1.0) -> None:
+    def __init__(self, localizer: Follows[ResultT], *, beside: bool, step_m: float = 1.0) -> None:
         """Begin without any scan. beside : search in a thread; otherwise each search is made before `add`
         returns, always after the same scans.
 
@@ -364,10 +340,10 @@ class Follower(Generic[EstimateT]):
         self._last: SE2 | None = None
         self._spacing = ViewSpacing()
         self._waiting: deque[tuple[RegisteredScan, PlanarScan, float] | None] = deque(maxlen=_MOST_WAITING)
-        self._estimates: deque[Future[EstimateT | None]] = deque()
+        self._results: deque[Future[ResultT | None]] = deque()
         self._thread = ThreadPoolExecutor(1, "searches") if beside else None
 
-    def __enter__(self) -> Follower[EstimateT]:
+    def __enter__(self) -> Follower[ResultT]:
         return self
 
     def __exit__(
@@ -395,28 +371,28 @@ class Follower(Generic[EstimateT]):
         self._last, self._spacing = None, ViewSpacing()
         self._hand_over(None)
 
-    def take(self) -> list[EstimateT]:
-        """Return the estimates that are done. Raises what the thread raised."""
+    def take(self) -> list[ResultT]:
+        """Return the results that are done. Raises what the thread raised."""
         taken = []
-        while self._estimates and self._estimates[0].done():
-            estimate = self._estimates.popleft().result()
-            taken += [] if estimate is None else [estimate]
+        while self._results and self._results[0].done():
+            result = self._results.popleft().result()
+            taken += [] if result is None else [result]
         return taken
 
     def finish(self) -> None:
         """Wait until the scans that were handed over are used."""
-        wait(self._estimates)
+        wait(self._results)
 
     def _hand_over(self, item: tuple[RegisteredScan, PlanarScan, float] | None) -> None:
         self._waiting.append(item)
         if self._thread is not None:
-            self._estimates.append(self._thread.submit(self._use_next))
+            self._results.append(self._thread.submit(self._use_next))
             return
-        done: Future[EstimateT | None] = Future()
+        done: Future[ResultT | None] = Future()
         done.set_result(self._use_next())
-        self._estimates.append(done)
+        self._results.append(done)
 
-    def _use_next(self) -> EstimateT | None:
+    def _use_next(self) -> ResultT | None:
         try:
             item = self._waiting.popleft()
         except IndexError:  # left out
@@ -447,10 +423,10 @@ class ResetPolicy:
     _last_s: float | None = None
     _count: int = 0
 
-    def allows(self, state: State) -> bool:
-        """Return whether the pose of an estimate is to be sent; it then counts as sent.
+    def allows(self, state: State | None) -> bool:
+        """Return whether the pose of an answer is to be sent; it then counts as sent.
 
-        state : of each estimate in turn.
+        state : of each answer in turn.
         """
         self._is_due = self._is_due or state in ("lost", "recovered")
         if state not in ("located", "recovered") or not self._is_due:

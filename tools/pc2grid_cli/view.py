@@ -44,7 +44,8 @@ from pc2grid_cli.console import json_text
 from pc2grid_cli.watch import feed
 from signature.config import Config
 from signature.database import SubmapDatabase
-from signature.localization.localizer import Estimate, Follower, Localizer
+from signature.localization.answer import Answer
+from signature.localization.localizer import Follower, Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.page import page
 from signature.sessions import find, query_config
@@ -109,11 +110,11 @@ class Locator:
         events, progress = self.events, Progress(self.events)
         events.publish("begin", {"source": path.name})
 
-        def see(registered: RegisteredScan, estimate: Estimate | None) -> None:
+        def see(registered: RegisteredScan, answer: Answer | None) -> None:
             check()
             progress.add(registered)
-            if estimate is not None:
-                progress.tell(estimate)
+            if answer is not None:
+                progress.tell(answer)
 
         try:
             known = options.KnownPose(near=_near(asked.get("near")), session=asked.get("session"))
@@ -157,8 +158,8 @@ class Locator:
             def poll() -> bool:
                 for sentence in live.news.take():
                     console.warn(sentence)
-                for estimate in follower.take():
-                    progress.tell(estimate)
+                for answer in follower.take():
+                    progress.tell(answer)
                 return False
 
             self.events.publish("begin", {"source": source})
@@ -317,14 +318,14 @@ class Progress:
         if registered is None:
             self._waiting.append([*self._base, 1])
             return
-        self._base = _planar(registered)
+        self._base = _planar(SE2.from_matrix(registered.T_session_base))
         self._waiting.append([*self._base, int(registered.health is Health.LOST)])
         if time.monotonic() - self._sent_s >= _SENT_EVERY_S:
             self.flush()
 
-    def tell(self, estimate: Estimate) -> None:
-        """Publish an estimate; without an answer, the best place all the same."""
-        moment = estimate.answer.history[-1]
+    def tell(self, answer: Answer) -> None:
+        """Publish an answer; if it is not located, with the best place all the same."""
+        moment = answer.history[-1]
         self.flush()
         self.events.publish(
             "moment",
@@ -334,7 +335,7 @@ class Progress:
                 "session": moment.session,
                 "confidence": moment.confidence,
                 "pose": moment.pose and [moment.pose.x, moment.pose.y, moment.pose.yaw],
-                "base": _planar(estimate.registered),
+                "base": _planar(answer.T_odom_base),
             },
         )
 
@@ -345,9 +346,8 @@ class Progress:
         self._waiting, self._sent_s = [], time.monotonic()
 
 
-def _planar(registered: RegisteredScan) -> tuple[float, float, float]:
+def _planar(base: SE2) -> tuple[float, float, float]:
     """Return x, y, yaw of the base in the query's frame, as finely as it can be seen."""
-    base = SE2.from_matrix(registered.T_session_base)
     return round(base.x, 3), round(base.y, 3), round(base.yaw, 4)
 
 

@@ -36,15 +36,15 @@ from pc2grid_cli.documents import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.protocol import BuildingFrame, SessionInfo
-from signature.localization.answer import answer_in_building
+from signature.localization.answer import Answer, answer_in_building
 from signature.localization.joining.building import map_of
-from signature.localization.localizer import Estimate, Follower, Localizer, ResetPolicy
+from signature.localization.localizer import Follower, Localizer, ResetPolicy
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch
 from signature.localization.posterior import Prior
 from signature.sessions import query_config
 
-EstimateT = TypeVar("EstimateT")
+ResultT = TypeVar("ResultT")
 
 
 def run(given: options.Watch, terminal: console.Console) -> int | None:
@@ -95,10 +95,10 @@ class Following:
         """Return the maps, prepared for searches."""
         return MapIndex.of(self.database, self.config, self.terminal)
 
-    def run(self, searcher: Any, use: Callable[[EstimateT, threading.Lock], bool]) -> None:
+    def run(self, searcher: Any, use: Callable[[ResultT, threading.Lock], bool]) -> None:
         """Search after each metre.
 
-        searcher : what `Follower` takes. use : what to do with each estimate, and with the lock that is held
+        searcher : what `Follower` takes. use : what to do with each result, and with the lock that is held
         to read the database; true if that was enough.
         """
         drive, over, step_m = self.drive, False, self.config.relocalize.step_m
@@ -107,8 +107,8 @@ class Following:
             def poll() -> bool:
                 nonlocal over
                 _print_news(drive)
-                for estimate in follower.take():
-                    over = over or use(estimate, follower.lock)
+                for result in follower.take():
+                    over = over or use(result, follower.lock)
                 over = over or time.monotonic() > self.end_s
                 return over
 
@@ -125,14 +125,14 @@ def _search(following: Following, robot: _Robot, prior: Prior | None) -> bool:
     """
     given, index, located = following.given, following.index, False
 
-    def use(estimate: Estimate, lock: threading.Lock) -> bool:
+    def use(found: Answer, lock: threading.Lock) -> bool:
         nonlocal located
-        estimate = replace(estimate, answer=answer_in_building(estimate.answer, robot.frames))
-        published = robot.tell(estimate, lock)
-        document = _document(estimate, following.drive, robot, published)
-        console.print_result(document if given.json else as_text(estimate, published), indent=None)
-        located = estimate.answer.status == "located"
-        return estimate.is_told and given.first
+        answer = answer_in_building(found, robot.frames)
+        published = robot.tell(answer, lock)
+        document = _document(answer, following.drive, robot, published)
+        console.print_result(document if given.json else as_text(answer, published), indent=None)
+        located = answer.status == "located"
+        return answer.is_told and given.first
 
     following.run(Localizer(index if prior is None else index.within(prior)), use)
     return located
@@ -176,44 +176,44 @@ class _Robot:
     resets: ResetPolicy = field(default_factory=ResetPolicy)
     map_session: str | None = None
 
-    def tell(self, estimate: Estimate, lock: threading.Lock) -> list[str]:
-        """Publish what follows from an estimate. Return the topics. lock : is held to read the database."""
-        publisher, live, session = self.publisher, self.following.drive, estimate.answer.session
+    def tell(self, answer: Answer, lock: threading.Lock) -> list[str]:
+        """Publish what follows from an answer. Return the topics. lock : is held to read the database."""
+        publisher, live, session = self.publisher, self.following.drive, answer.session
         if publisher is None or not isinstance(live, LiveLog):
             return []
-        if estimate.state == "lost":
+        if answer.state == "lost":
             publisher.stop_tf()
-        may_reset = self.resets.allows(estimate.state)
-        if session is None or not estimate.is_told:
+        may_reset = self.resets.allows(answer.state)
+        if session is None or not answer.is_told:
             return []
         return [
-            *self._tell_map(publisher, estimate, session, lock),
-            *self._tell_pose(publisher, live, estimate, may_reset),
+            *self._tell_map(publisher, answer, session, lock),
+            *self._tell_pose(publisher, live, answer, may_reset),
         ]
 
     def _tell_map(
-        self, publisher: Nav2Publisher, estimate: Estimate, session: str, lock: threading.Lock
+        self, publisher: Nav2Publisher, answer: Answer, session: str, lock: threading.Lock
     ) -> list[str]:
         if not self.following.given.publish_map or session == self.map_session:
             return []
         self.map_session = session
         with lock:
             grid = map_of(self.following.database, session, self.frames)
-        publisher.map(estimate.registered.scan.stamp_ns, grid)
+        publisher.map(answer.stamp_ns, grid)
         return ["/map"]
 
     def _tell_pose(
-        self, publisher: Nav2Publisher, live: LiveLog, estimate: Estimate, may_reset: bool
+        self, publisher: Nav2Publisher, live: LiveLog, answer: Answer, may_reset: bool
     ) -> list[str]:
         publish = self.following.given.publish
         if publish == "initialpose" and may_reset:
-            assert estimate.answer.covariance is not None
-            stamp_ns, T_map_base = _now(estimate, live)
-            publisher.initialpose(stamp_ns, T_map_base, estimate.answer.covariance)
+            assert answer.covariance is not None
+            stamp_ns, T_map_base = _now(answer, live)
+            publisher.initialpose(stamp_ns, T_map_base, answer.covariance)
             return ["/initialpose"]
         if publish != "tf":
             return []
-        T_map_odom, odom_frame = estimate.T_map_odom, live.odometry_frame
+        T_map_odom, odom_frame = answer.T_map_odometry, live.odometry_frame
         if T_map_odom is None or odom_frame is None:
             console.warn("--publish tf: the robot has no odometry; nothing is published")
             return []
@@ -238,12 +238,12 @@ def _robot_of(following: Following) -> Iterator[_Robot]:
         yield robot
 
 
-def _now(estimate: Estimate, live: LiveLog) -> tuple[int, SE2]:
-    """Return the stamp of the newest odometry, and the pose of the base there: the estimate is older."""
-    T_map_odom, newest = estimate.T_map_odom, live.newest_odometry()
+def _now(answer: Answer, live: LiveLog) -> tuple[int, SE2]:
+    """Return the stamp of the newest odometry, and the pose of the base there: the answer is older."""
+    T_map_odom, newest = answer.T_map_odometry, live.newest_odometry()
     if T_map_odom is None or newest is None:
-        assert estimate.answer.T_map_base is not None
-        return estimate.registered.scan.stamp_ns, estimate.answer.T_map_base
+        assert answer.T_map_base is not None
+        return answer.stamp_ns, answer.T_map_base
     stamp_ns, T_odom_base = newest
     return stamp_ns, T_map_odom @ SE2.from_matrix(T_odom_base)
 
@@ -268,10 +268,9 @@ def _summarize(drive: ScanSource, terminal: console.Console) -> None:
         )
 
 
-def as_text(estimate: Estimate, published: list[str]) -> str:
-    """Return an estimate in one line."""
-    answer = estimate.answer
-    begin = f"after {answer.path_m:.1f} m: {estimate.state.replace('_', ' the ')}"
+def as_text(answer: Answer, published: list[str]) -> str:
+    """Return an answer in one line."""
+    begin = f"after {answer.path_m:.1f} m: {str(answer.state).replace('_', ' the ')}"
     away = answer.beside_map
     if away is not None:
         fit = away.hypothesis.fit
@@ -287,15 +286,15 @@ def as_text(estimate: Estimate, published: list[str]) -> str:
     pose = answer.T_map_base
     told = f", published {' and '.join(published)}" if published else ""
     yaw_deg = math.degrees(pose.yaw)
-    begin += "" if estimate.is_told else ", perhaps"
+    begin += "" if answer.is_told else ", perhaps"
     return one_line(
         f"{begin} in {answer.session}: x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {yaw_deg:.1f} deg,"
         f" confidence {probability(answer.confidence)}{told}"
     )
 
 
-def _document(estimate: Estimate, drive: ScanSource, robot: _Robot, published: list[str]) -> Any:
-    answer, session = estimate.answer, estimate.answer.session
+def _document(answer: Answer, drive: ScanSource, robot: _Robot, published: list[str]) -> Any:
+    session = answer.session
     watched = None
     if session is not None:
         watched = {
@@ -306,19 +305,19 @@ def _document(estimate: Estimate, drive: ScanSource, robot: _Robot, published: l
             "digest": robot.sessions[session].digest,
         }
     document = {
-        "state": estimate.state,
+        "state": answer.state,
         "status": answer.status,
         "stamp_ns": answer.stamp_ns,
         "path_m": answer.path_m,
         "map": watched,
         "frame": robot.frames[session].name if session and session in robot.frames else None,
         "pose": answer.stamped_pose,
-        "T_map_odom": estimate.T_map_odom,
+        "T_map_odom": answer.T_map_odometry,
         "in_space": None if answer.in_space is None else answer.in_space.to_json(),
         "off_map": answer.off_map_pose,
         "confidence": answer.confidence,
         "published": published,
-        **live(drive, estimate.elapsed_s),
+        **live(drive, answer.elapsed_s),
     }
     return plain(document)
 
@@ -421,7 +420,7 @@ def feed(
 
 
 def live(drive: ScanSource, elapsed_s: float) -> Document:
-    """Return how it is followed so far. elapsed_s : time that the estimate took."""
+    """Return how it is followed so far. elapsed_s : time that the search took."""
     return {
         "scans": drive.report().scans_read,
         "dropped": drive.counts.dropped,

@@ -19,7 +19,7 @@ from signature.localization import localizer as follower_module
 from signature.localization.answer import Answer, OffMap
 from signature.localization.belief import Belief
 from signature.localization.decision import anywhere, decide, weighed
-from signature.localization.localizer import Estimate, Follower, Localizer
+from signature.localization.localizer import Follower, Localizer
 from signature.localization.posterior import Prior
 from signature.localization.query import query_of
 from tests.helpers.simulated_drives import building, drive, office, plan
@@ -51,7 +51,7 @@ def stretch(
         yield moved, planar_scan, truth
 
 
-def estimates_of(localizer: Localizer, steps: list[Step]) -> list[tuple[Estimate, SE2]]:
+def estimates_of(localizer: Localizer, steps: list[Step]) -> list[tuple[Answer, SE2]]:
     found = []
     for registered, planar_scan, truth in steps:
         estimate = localizer.add(registered, planar_scan)
@@ -98,9 +98,9 @@ def test_a_place_is_the_less_certain_the_likelier_tracking_slipped() -> None:
     )
 
 
-def check_poses(estimates: list[tuple[Estimate, SE2]]) -> None:
+def check_poses(estimates: list[tuple[Answer, SE2]]) -> None:
     for estimate, truth in estimates:
-        pose = estimate.answer.T_map_base
+        pose = estimate.T_map_base
         assert pose is not None or not estimate.is_told
         assert pose is None or math.dist((pose.x, pose.y), (truth.x, truth.y)) < 0.15
 
@@ -117,7 +117,7 @@ def test_a_robot_that_drives_on_stays_located() -> None:
 
 def test_the_odometry_frame_in_the_map_does_not_change_while_the_robot_drives() -> None:
     estimates = estimates_of(Localizer(OFFICE), list(stretch(FIRST)))
-    frames = [estimate.T_map_odom for estimate, _ in estimates if estimate.state == "located"]
+    frames = [estimate.T_map_odometry for estimate, _ in estimates if estimate.state == "located"]
     poses = np.array([(f.x, f.y) for f in frames if f is not None])
     assert len(poses) > 2
     assert np.ptp(poses, axis=0).max() < 0.2
@@ -214,7 +214,7 @@ def test_a_robot_that_leaves_the_map_is_told_so_and_is_located_when_it_comes_bac
     check_poses([(estimate, truth) for estimate, truth in estimates if estimate.is_told])
     sigmas_m = []
     for estimate, truth in estimates:
-        said = estimate.answer.to_json()["off_map"]
+        said = estimate.to_json()["off_map"]
         assert (said is not None) == (estimate.state == "off_map")
         if said is not None:
             assert math.dist((said["x"], said["y"]), (truth.x, truth.y)) < 0.15
@@ -229,9 +229,7 @@ def test_a_robot_that_leaves_the_map_is_told_so_and_is_located_when_it_comes_bac
 def test_a_robot_elsewhere_is_never_located() -> None:
     estimates = estimates_of(Localizer(OFFICE), list(stretch([(2, 2), (2, 4.5)], grid=OTHER)))
     assert {estimate.state for estimate, _ in estimates} == {"searching"}
-    assert all(
-        estimate.answer.T_map_base is None and estimate.T_map_odom is None for estimate, _ in estimates
-    )
+    assert all(estimate.T_map_base is None and estimate.T_map_odometry is None for estimate, _ in estimates)
 
 
 def test_a_robot_that_stands_is_looked_for_once() -> None:
@@ -242,7 +240,7 @@ def test_a_robot_that_stands_is_looked_for_once() -> None:
         steps.append((replace(first[0], scan=scan), first[1], first[2]))
     estimates = estimates_of(Localizer(OFFICE), steps)
     assert len(estimates) == 1
-    assert estimates[0][0].answer.path_m == 0.0
+    assert estimates[0][0].path_m == 0.0
     check_poses(estimates)
 
 
@@ -258,7 +256,7 @@ def test_a_robot_that_stands_after_registration_was_lost_is_looked_for_at_once()
     localizer = Localizer(OFFICE)
     assert estimates_of(localizer, steps)[-1][0].state == "located"
     ((estimate, _),) = estimates_of(localizer, since)
-    assert estimate.state in ("lost", "recovered") and estimate.answer.path_m == 0.0
+    assert estimate.state in ("lost", "recovered") and estimate.path_m == 0.0
 
 
 def test_after_a_restart_a_located_robot_is_recovered() -> None:
@@ -276,11 +274,11 @@ def test_one_place_in_two_sessions_is_one_if_they_are_joined() -> None:
     both = building({"monday": office(), "tuesday": office()})
     estimates = estimates_of(Localizer(both), list(stretch(FIRST)))
     assert {estimate.state for estimate, _ in estimates} == {"searching"}
-    last = estimates[-1][0].answer
+    last = estimates[-1][0]
     assert last.status == "ambiguous" and last.masses[:2] == (last.masses[0],) * 2
     both = building({"monday": office(), "tuesday": office()}, joined={"monday": HERE, "tuesday": HERE})
     estimates = estimates_of(Localizer(both), list(stretch(FIRST)))
-    assert len({estimate.answer.session for estimate, _ in estimates if estimate.state == "located"}) == 1
+    assert len({estimate.session for estimate, _ in estimates if estimate.state == "located"}) == 1
     assert "doubtful" not in {estimate.state for estimate, _ in estimates}
 
 
@@ -297,14 +295,14 @@ def test_a_prior_is_about_the_beginning_and_is_forgotten_when_the_search_begins_
     ):
         localizer = Localizer(index_of)
         estimates = estimates_of(localizer, steps)
-        found = {estimate.answer.status for estimate, _ in estimates}
+        found = {estimate.status for estimate, _ in estimates}
         if where == "unknown":
             assert "located" not in found
             continue
         assert "located" in found  # although it has left the disc in which it began
         check_poses(estimates)
         localizer.restart()
-        again = {estimate.answer.status for estimate, _ in estimates_of(localizer, steps)}
+        again = {estimate.status for estimate, _ in estimates_of(localizer, steps)}
         assert "located" not in again
 
 
@@ -331,15 +329,15 @@ STEPS = [
 FACTS = ("stamp_ns", "path_m", "session", "T_map_base")
 
 
-def facts(found: list[Estimate]) -> list[tuple[object, ...]]:
-    return [(k.state, *(getattr(k.answer, name) for name in FACTS)) for k in found]
+def facts(found: list[Answer]) -> list[tuple[object, ...]]:
+    return [(k.state, *(getattr(k, name) for name in FACTS)) for k in found]
 
 
 def test_a_thread_makes_the_same_looks() -> None:
     found = []
     for beside in (False, True):
         with Follower(Localizer(OFFICE), beside=beside) as follower:
-            estimates: list[Estimate] = []
+            estimates: list[Answer] = []
             for registered, planar_scan in STEPS:
                 follower.add(registered, planar_scan)
                 follower.finish()  # no travel waits, so no estimate is left out

@@ -19,7 +19,7 @@ from signature.database import Label
 from signature.localization.answer import Answer
 from signature.localization.hypotheses import HYPOTHESES, Hypothesis
 from signature.localization.in_space import SPACE, log_odds_in_space, masses_of, settle_in_space
-from signature.localization.localizer import Estimate, Follower, Localizer
+from signature.localization.localizer import Follower, Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
@@ -260,7 +260,7 @@ def maps() -> dict[str, MapSurface]:
 @pytest.mark.parametrize(("height_m", "name"), [(LOW_M, "low"), (HIGH_M, "high")])
 def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict[str, MapSurface]) -> None:
     plain, spatial = Localizer(TWINS), Localizer(with_points(TWINS, maps))
-    answers: list[Estimate] = []
+    answers: list[Answer] = []
     for registered, planar_scan, _ in lidar_drive(height_m):
         in_plane = plain.add(registered, planar_scan)
         assert in_plane is None or in_plane.answer.status != "located"
@@ -268,8 +268,8 @@ def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict
         answers += [] if estimate is None else [estimate]
     located = [estimate for estimate in answers if estimate.state == "located"]
     assert located
-    assert {estimate.answer.session for estimate in located} == {name}
-    assert all(estimate.answer.in_space is not None for estimate in located)
+    assert {estimate.session for estimate in located} == {name}
+    assert all(estimate.in_space is not None for estimate in located)
 
 
 def test_a_thread_refines_a_located_robot(maps: dict[str, MapSurface]) -> None:
@@ -283,13 +283,11 @@ def test_a_thread_refines_a_located_robot(maps: dict[str, MapSurface]) -> None:
         follower.finish()
         estimates = follower.take()
     for estimate in estimates:
-        if estimate.answer.T_map_base is None:
+        if estimate.T_map_base is None:
             continue
-        assert estimate.answer.in_space is not None and estimate.answer.in_space.status == "agrees"
-        true = truth[estimate.registered.scan.stamp_ns]
-        errors_m.append(
-            math.hypot(estimate.answer.T_map_base.x - true.x, estimate.answer.T_map_base.y - true.y)
-        )
+        assert estimate.in_space is not None and estimate.in_space.status == "agrees"
+        true = truth[estimate.stamp_ns]
+        errors_m.append(math.hypot(estimate.T_map_base.x - true.x, estimate.T_map_base.y - true.y))
     assert errors_m and max(errors_m) < 0.04
 
 
@@ -298,4 +296,4 @@ def test_without_points_nothing_is_done_in_space() -> None:
     localizer = Localizer(with_points(ALONE, {}))
     estimates = [localizer.add(registered, planar_scan) for registered, planar_scan, _ in lidar_drive(LOW_M)]
     located = [estimate for estimate in estimates if estimate is not None and estimate.state == "located"]
-    assert located and all(estimate.answer.in_space is None for estimate in located)
+    assert located and all(estimate.in_space is None for estimate in located)

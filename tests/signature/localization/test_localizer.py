@@ -71,7 +71,7 @@ def test_an_answer_is_one_search_and_asking_changes_nothing(monkeypatch: pytest.
         answer = asked.answer() if estimate or number % 20 == 10 else None
         assert len(searched) == (answer is not None and estimate is None)
         if estimate and told and answer:
-            assert (answer.confidence, answer.T_map_base) == (told.answer.confidence, told.answer.T_map_base)
+            assert (answer.confidence, answer.T_map_base) == (told.confidence, told.T_map_base)
             assert answer.history[-1].stamp_ns == registered.scan.stamp_ns
 
 

@@ -170,7 +170,7 @@ def estimates(index: MapIndex) -> tuple[list[tuple[int, str, float]], Answer]:
     for registered, planar_scan, _ in driven(in_office=False):
         estimate = localizer.add(registered, planar_scan)
         if estimate is not None:
-            found.append((registered.scan.stamp_ns, estimate.answer.status, estimate.answer.confidence))
+            found.append((registered.scan.stamp_ns, estimate.status, estimate.confidence))
     return found, localizer.answer()
 
 

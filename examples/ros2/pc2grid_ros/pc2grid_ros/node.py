@@ -9,7 +9,6 @@ import contextlib
 import importlib
 import threading
 from collections.abc import Hashable, Mapping
-from dataclasses import replace
 from typing import Any
 
 import rclpy
@@ -23,9 +22,9 @@ from pc2grid.io.live.live_log import Feed, LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.source import RawMessage, TopicInfo
 from pc2grid.settings import ReadConfig
-from signature.localization.answer import answer_in_building
+from signature.localization.answer import Answer, answer_in_building
 from signature.localization.joining.building import map_of
-from signature.localization.localizer import Estimate, Follower, ResetPolicy
+from signature.localization.localizer import Follower, ResetPolicy
 
 PARAMETERS = {"database": "", "topic": "", "publish": "initialpose", "publish_map": False, "map_frame": "map"}
 """With their defaults; `config/pc2grid.yaml` explains them."""
@@ -39,7 +38,7 @@ LEVELS = {
     "doubtful": DiagnosticStatus.WARN,
     "lost": DiagnosticStatus.ERROR,
 }
-"""How bad each state of an estimate is."""
+"""How bad each state of an answer is."""
 
 
 def qos(*, reliable: bool, kept: bool, depth: int) -> QoSProfile:
@@ -120,7 +119,7 @@ class Pc2gridNode(LifecycleNode):
         profile = qos(reliable=True, kept=False, depth=1)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", profile)
         self.create_timer(1.0, self._tell_state)
-        self._estimate: Estimate | None = None
+        self._answer: Answer | None = None
         self._problem = ""
         self._stop = threading.Event()
 
@@ -145,7 +144,7 @@ class Pc2gridNode(LifecycleNode):
 
     def on_activate(self, state: Any) -> TransitionCallbackReturn:
         """Follow the robot from now on."""
-        self._estimate, self._problem, self._map_of = None, "", None
+        self._answer, self._problem, self._map_of = None, "", None
         self._resets = ResetPolicy()
         topic = self._set("topic") or None
         self._feed = RclpyFeed(self, topic)
@@ -193,22 +192,21 @@ class Pc2gridNode(LifecycleNode):
                 self._problem = str(error)
                 self.get_logger().error(self._problem)
 
-    def _poll(self, follower: Follower[Estimate]) -> bool:
+    def _poll(self, follower: Follower[Answer]) -> bool:
         for sentence in self._feed.news.take():
             self.get_logger().warning(sentence)
-        for estimate in follower.take():
-            self._tell(estimate, follower.lock)
+        for answer in follower.take():
+            self._tell(answer, follower.lock)
         return self._stop.is_set()
 
-    def _tell(self, estimate: Estimate, lock: threading.Lock) -> None:
-        """Publish what follows from an estimate. lock : is held to read the database."""
-        answer = answer_in_building(estimate.answer, self._frames)
-        self._estimate = estimate = replace(estimate, answer=answer)
-        self.get_logger().info(f"{estimate.state} after {answer.path_m:.1f} m")
-        if estimate.state == "lost":
+    def _tell(self, found: Answer, lock: threading.Lock) -> None:
+        """Publish what follows from an answer. lock : is held to read the database."""
+        self._answer = answer = answer_in_building(found, self._frames)
+        self.get_logger().info(f"{answer.state} after {answer.path_m:.1f} m")
+        if answer.state == "lost":
             self._nav2.stop_tf()
-        may_reset = self._resets.allows(estimate.state)
-        if not estimate.is_told or answer.session is None:
+        may_reset = self._resets.allows(answer.state)
+        if not answer.is_told or answer.session is None:
             return
         if answer.T_map_base is None or answer.covariance is None:
             return
@@ -217,7 +215,7 @@ class Pc2gridNode(LifecycleNode):
             self._map_of = answer.session
             with lock:
                 self._nav2.map(stamp_ns, map_of(self._database, answer.session, self._frames))
-        T_map_odom, odom_frame = estimate.T_map_odom, self._live.odometry_frame
+        T_map_odom, odom_frame = answer.T_map_odometry, self._live.odometry_frame
         if self._set("publish") == "tf" and T_map_odom is not None and odom_frame is not None:
             self._nav2.start_tf(odom_frame, T_map_odom, self._live.now_ns)
         if self._set("publish") == "initialpose" and may_reset:
@@ -228,19 +226,18 @@ class Pc2gridNode(LifecycleNode):
 
     def _tell_state(self) -> None:
         """Publish the state for `diagnostic_aggregator` and rqt."""
-        estimate = self._estimate
-        state = "searching" if estimate is None else estimate.state
+        answer = self._answer
+        state = "searching" if answer is None else answer.state
         status = DiagnosticStatus(level=LEVELS[state], name="pc2grid: localization", message=state)
         if self._problem:
             status.level, status.message = DiagnosticStatus.ERROR, self._problem
-        if estimate is not None:
-            answer = estimate.answer
+        if answer is not None:
             facts = {
                 "session": answer.session or "",
                 "pose": "" if answer.T_map_base is None else str(answer.T_map_base),
                 "confidence": f"{answer.confidence:.2f}",
                 "travel_m": f"{answer.path_m:.1f}",
-                "search_s": f"{estimate.elapsed_s:.2f}",
+                "search_s": f"{answer.elapsed_s:.2f}",
                 "scans_dropped": str(self._live.counts.dropped),
             }
             status.values = [KeyValue(key=key, value=value) for key, value in facts.items()]
