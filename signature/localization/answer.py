@@ -23,9 +23,10 @@ from pydantic import Field
 from pc2grid.display import html_picture, html_table, map_png, plain, probability, short
 from pc2grid.geometry import F64, I64, SE2, frozen_arrays, wrap_angle
 from pc2grid.matching.evidence import Evidence
+from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.hypotheses import HYPOTHESES, Hypothesis
+from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.posterior import POSTERIOR, PRIOR
 
 Status = Literal["located", "ambiguous", "not_found"]
@@ -113,12 +114,12 @@ class OffMap:
     """A place to which odometry has carried the robot from one that the map shows; of what is seen there the
     map shows too little to tell.
 
-    hypothesis : its `fit.covariance` is that of the base now, grown since. mass : probability of it.
+    hypothesis : its `covariance` is that of the base now, grown since. mass : probability of it.
     seen_m, T_odom_seen, seen : metres driven, the base, and its covariance (3, 3) where the map showed the
     place last.
     """
 
-    hypothesis: Hypothesis
+    hypothesis: Fit
     mass: float
     seen_m: float
     T_odom_seen: SE2
@@ -169,7 +170,7 @@ class Answer:
     history : how the answer came to be.
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with. views_m :
     where it was described by signatures, in that frame. map : of the session of the best hypothesis.
-    sessions, labels : all of the database, that `Hypothesis.session_index` counts.
+    sessions, labels : all of the database, that `Fit.session_index` counts.
     prior : what became of the prior, None if there was none. Not used: "lapsed", registration was lost after
     the time that it is about; "ahead", its time lies after the last scan. excluded : the best place that the
     prior excludes, if nothing that it allows is certain and this fits better.
@@ -194,7 +195,7 @@ class Answer:
 
     status: Status
     confidence: float
-    hypotheses: tuple[Hypothesis, ...]
+    hypotheses: tuple[Fit, ...]
     places: tuple[int, ...]
     evidence: Evidence
     stamp_ns: int
@@ -223,7 +224,7 @@ class Answer:
         if self.T_map_base is None:
             places = len(set(self.places))
             return f"Answer({self.status}, {places} {'place' if places == 1 else 'places'}, {sure})"
-        return f"Answer(located in {short(self.session)} at {_pose(self.T_map_base)}, {sure})"
+        return f"Answer(located in {short(self.session)} at {pose_text(self.T_map_base)}, {sure})"
 
     def _repr_html_(self) -> str:
         located = self.T_map_base is not None
@@ -231,8 +232,8 @@ class Answer:
             (
                 place,
                 self.sessions[hypothesis.session_index],
-                _pose(hypothesis.fit.T_map_query @ self.T_odom_base),
-                f"{hypothesis.fit.score:.2f}",
+                pose_text(hypothesis.T_map_query @ self.T_odom_base),
+                f"{hypothesis.score:.2f}",
                 "the answer" if located and row == 0 else "",
             )
             for row, (place, hypothesis) in enumerate(zip(self.places, self.hypotheses, strict=True))
@@ -248,11 +249,11 @@ class Answer:
         if self.map is None:
             return None
         walls_m = self.local_map.to_point(np.argwhere(self.local_map.occupied))
-        there_m = self.hypotheses[0].fit.T_map_query.apply(walls_m)
+        there_m = self.hypotheses[0].T_map_query.apply(walls_m)
         return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
 
     @property
-    def located(self) -> Hypothesis | None:
+    def located(self) -> Fit | None:
         """Return the hypothesis that is the answer; None unless one place is certain."""
         return self.hypotheses[0] if self.status == "located" else None
 
@@ -264,7 +265,7 @@ class Answer:
     @property
     def T_map_odom(self) -> SE2 | None:
         """Return what puts the whole query trajectory into the map; None unless located."""
-        return None if self.located is None else self.located.fit.T_map_query
+        return None if self.located is None else self.located.T_map_query
 
     @property
     def T_map_base(self) -> SE2 | None:
@@ -286,7 +287,7 @@ class Answer:
     @property
     def covariance(self) -> F64 | None:
         """Return that of the pose, (3, 3) of x, y, yaw; None unless located."""
-        return None if self.located is None else self.located.fit.covariance
+        return None if self.located is None else self.located.covariance
 
     @property
     def moment(self) -> Moment:
@@ -297,11 +298,11 @@ class Answer:
             path_m=self.path_m,
             status=self.status,
             session=self.sessions[best.session_index] if best else None,
-            pose=best.fit.T_map_query @ self.T_odom_base if best else None,
+            pose=best.T_map_query @ self.T_odom_base if best else None,
             confidence=self.confidence,
         )
 
-    def place(self, number: int) -> tuple[Hypothesis, ...]:
+    def place(self, number: int) -> tuple[Fit, ...]:
         """Return the hypotheses of one place."""
         return tuple(h for h, of in zip(self.hypotheses, self.places, strict=True) if of == number)
 
@@ -317,7 +318,7 @@ class Answer:
             return None
         firsts = [self.hypotheses[self.places.index(place)] for place in range(len(self.masses))]
         here = [h.session_index == firsts[0].session_index for h in firsts]
-        bases = [h.fit.T_map_query @ self.T_odom_base for h in compress(firsts, here)]
+        bases = [h.T_map_query @ self.T_odom_base for h in compress(firsts, here)]
         return ambiguous_line(bases, list(compress(self.masses, here)))
 
     @property
@@ -325,7 +326,7 @@ class Answer:
         """Return building and floor of the session it was located in, as far as they are known."""
         return Label() if self.located is None else self.labels[self.located.session_index]
 
-    def frame_of(self, hypothesis: Hypothesis) -> str | None:
+    def frame_of(self, hypothesis: Fit) -> str | None:
         """Return the frame of the building that a hypothesis is in; None: the map frame of its session."""
         return self.frames[hypothesis.session_index] if self.frames else None
 
@@ -352,8 +353,8 @@ class Answer:
         return {
             "session": self.sessions[h.session_index],
             "frame": self.frame_of(h),
-            **_planar(h.fit.T_map_query @ self.T_odom_base),
-            "covariance": h.fit.covariance.tolist(),
+            **_planar(h.T_map_query @ self.T_odom_base),
+            "covariance": h.covariance.tolist(),
             "probability": away.mass,
         }
 
@@ -377,9 +378,9 @@ class Answer:
                     "floor": self.labels[h.session_index].floor,
                     "submap_id": submap_id if submap_id >= 0 else None,
                     "place": place,
-                    **_planar(h.fit.T_map_query @ self.T_odom_base),
-                    "score": h.fit.score,
-                    "overlap": h.fit.overlap,
+                    **_planar(h.T_map_query @ self.T_odom_base),
+                    "score": h.score,
+                    "overlap": h.overlap,
                 }
                 for h, submap_id, place in zip(self.hypotheses, self.submap_ids, self.places, strict=True)
             ],
@@ -401,7 +402,8 @@ _SHOWN = 6
 """Hypotheses in the table of a notebook, as many as in the picture of the command line."""
 
 
-def _pose(pose: SE2) -> str:
+def pose_text(pose: SE2) -> str:
+    """Return a pose as a person reads it."""
     return f"x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg"
 
 
@@ -514,12 +516,11 @@ def covariance_in_building(covariance: F64, T_session_base: SE2, frame: Building
     return np.asarray(turn @ covariance @ turn.T + J @ np.array(frame.covariance) @ J.T)
 
 
-def _hypothesis(hypothesis: Hypothesis, frame: BuildingFrame, T_odom_base: SE2) -> Hypothesis:
-    fit = hypothesis.fit
-    T_map_base = fit.T_map_query @ T_odom_base
-    T_building_query = frame.at(T_map_base.x, T_map_base.y) @ fit.T_map_query
-    covariance = covariance_in_building(fit.covariance, T_map_base, frame)
-    return replace(hypothesis, fit=replace(fit, T_map_query=T_building_query, covariance=covariance))
+def _hypothesis(hypothesis: Fit, frame: BuildingFrame, T_odom_base: SE2) -> Fit:
+    T_map_base = hypothesis.T_map_query @ T_odom_base
+    T_building_query = frame.at(T_map_base.x, T_map_base.y) @ hypothesis.T_map_query
+    covariance = covariance_in_building(hypothesis.covariance, T_map_base, frame)
+    return replace(hypothesis, T_map_query=T_building_query, covariance=covariance)
 
 
 def _moment(moment: Moment, frames: Mapping[str, BuildingFrame]) -> Moment:

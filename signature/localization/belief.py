@@ -41,9 +41,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pc2grid.geometry import SE2
-from pc2grid.matching.score import score_fit
+from pc2grid.matching.score import Fit, score_fit
 from signature.localization.answer import Answer, OffMap, State
-from signature.localization.hypotheses import Hypothesis, agree, more_exact
+from signature.localization.hypotheses import agree, more_exact
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR, PRIOR
 from signature.localization.query import QueryMap
@@ -70,9 +70,7 @@ class Masses:
         for number, mass in enumerate(found.masses):
             place = found.place(number)
             for k, away in enumerate(beside):
-                if place[0].fit.overlap < POSTERIOR.shown and agree(
-                    query.T_odom_base, away.hypothesis, place[0]
-                ):
+                if place[0].overlap < POSTERIOR.shown and agree(query.T_odom_base, away.hypothesis, place[0]):
                     places.append((replace(beside.pop(k), mass=away.mass + mass),))
                     break
             else:
@@ -88,7 +86,7 @@ class Masses:
         places = tuple(tuple(_carried(one, now, odds) for one in place) for place in self.places)
         return replace(self, path_m=now.path_m, T_odom_base=now.T_odom_base, places=places)
 
-    def mass(self, place: Iterable[Hypothesis]) -> float:
+    def mass(self, place: Iterable[Fit]) -> float:
         """Return the mass of the places that put the robot where one of these hypotheses does."""
         hypotheses = tuple(place)
         return sum(
@@ -107,31 +105,30 @@ class Masses:
         """Whether the map shows too little of the first place."""
         return self.places[0][0].seen_m < self.path_m
 
-    def prior(self, place: Sequence[Hypothesis]) -> float:
+    def prior(self, place: Sequence[Fit]) -> float:
         """Return the prior of a place relative to that of "nowhere", as the masses are (`Belief.before`)."""
-        shown = place[0].fit.overlap >= POSTERIOR.shown
+        shown = place[0].overlap >= POSTERIOR.shown
         found = (known for known in self.places if shown or more_exact(place[0], known[0].hypothesis))
         return 1.0 + replace(self, places=tuple(found)).mass(place)
 
 
-def _seen(h: Hypothesis, mass: float, query: QueryMap) -> OffMap:
+def _seen(h: Fit, mass: float, query: QueryMap) -> OffMap:
     """Return a place that the map shows now."""
     return OffMap(
-        hypothesis=h, mass=mass, seen_m=query.path_m, T_odom_seen=query.T_odom_base, seen=h.fit.covariance
+        hypothesis=h, mass=mass, seen_m=query.path_m, T_odom_seen=query.T_odom_base, seen=h.covariance
     )
 
 
 def _carried(place: OffMap, now: QueryMap | Masses, odds: float) -> OffMap:
     """Return the place with the covariance of the base now, by the odometry since the map showed it."""
-    fit = place.hypothesis.fit
+    fit = place.hypothesis
     begin, end = fit.T_map_query @ place.T_odom_seen, fit.T_map_query @ now.T_odom_base
     J = np.eye(3)
     J[:2, 2] = begin.y - end.y, end.x - begin.x
     way_m = (now.path_m - place.seen_m) / PRIOR.sigmas
     drift = np.array([PRIOR.drift, PRIOR.drift, PRIOR.drift_rad_m]) * way_m
     covariance = np.asarray(J @ place.seen @ J.T + np.diag(drift**2))
-    hypothesis = replace(place.hypothesis, fit=replace(fit, covariance=covariance))
-    return replace(place, hypothesis=hypothesis, mass=odds * place.mass)
+    return replace(place, hypothesis=replace(fit, covariance=covariance), mass=odds * place.mass)
 
 
 def kept(query: QueryMap) -> float:
@@ -174,9 +171,11 @@ class Belief:
             for place, *_ in known.places:
                 h = place.hypothesis
                 walls = index.maps_for(query)[h.session_index].walls
-                fit = score_fit(walls, query.walls, h.fit.T_map_query, h.fit.covariance)
+                fit = score_fit(walls, query.walls, h.T_map_query, h.covariance)
                 if place.mass >= 1.0 - POSTERIOR.certain and fit.overlap < POSTERIOR.shown:
-                    beside.append(replace(place, hypothesis=replace(h, fit=fit)))
+                    beside.append(
+                        replace(place, hypothesis=replace(fit, session_index=h.session_index, row=h.row))
+                    )
         return known, tuple(beside)
 
     def _before(self, query: QueryMap) -> list[Masses]:

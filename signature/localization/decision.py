@@ -15,11 +15,11 @@ from dataclasses import replace
 from pc2grid.matching.evidence import LEFT, NO_EVIDENCE, evidence_of, masses
 from pc2grid.matching.score import Fit
 from signature.localization.answer import Answer, OffMap, Status
-from signature.localization.hypotheses import Hypothesis, agree, more_exact, same_pose
+from signature.localization.hypotheses import agree, more_exact, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 
-Place = tuple[Hypothesis, ...]
+Place = tuple[Fit, ...]
 PriorOf = Callable[[Place], float]
 """Prior of a place, relative to that of "not in this map"."""
 
@@ -32,9 +32,9 @@ def anywhere(place: Place) -> float:
 def decide(
     index: MapIndex,
     query: QueryMap,
-    known: tuple[Hypothesis, ...] = (),
+    known: tuple[Fit, ...] = (),
     prior_of: PriorOf = anywhere,
-) -> tuple[Answer, tuple[Hypothesis, ...]]:
+) -> tuple[Answer, tuple[Fit, ...]]:
     """Return the answer by the hypotheses that are known and those that the search finds, and all of these.
     The search ends when one place is certain and the right one likely searched, or when what is left has too
     little mass to matter."""
@@ -47,7 +47,7 @@ def decide(
 
 
 def judge(
-    index: MapIndex, query: QueryMap, hypotheses: Sequence[Hypothesis], prior_of: PriorOf = anywhere
+    index: MapIndex, query: QueryMap, hypotheses: Sequence[Fit], prior_of: PriorOf = anywhere
 ) -> Answer:
     """Return the posterior over the places of the hypotheses, see `signature.localization.posterior`.
 
@@ -56,7 +56,7 @@ def judge(
     certain.
     """
     places, rivals = _allowed(index, query, places_of(index, query, hypotheses))
-    evidence_for = evidence_of([place[0].fit for place in places], query.likeness, rivals)
+    evidence_for = evidence_of([place[0] for place in places], query.likeness, rivals)
     known = list(zip(places, map(prior_of, places), evidence_for, strict=True))
     known.sort(key=lambda each: -math.log(each[1]) - each[2].log_odds())
     mass = masses([each[2] for each in known], [each[1] for each in known]).tolist()
@@ -116,11 +116,11 @@ def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple
     """Return the places that the prior of the index allows, and the fits of the others, which show what wrong
     places score."""
     inside = [tuple(h for h in place if index.allows(query, h)) for place in places]
-    excluded = [place[0].fit for place, left in zip(places, inside, strict=True) if not left]
+    excluded = [place[0] for place, left in zip(places, inside, strict=True) if not left]
     return [place for place in inside if place], excluded
 
 
-def places_of(index: MapIndex, query: QueryMap, hypotheses: Iterable[Hypothesis]) -> list[Place]:
+def places_of(index: MapIndex, query: QueryMap, hypotheses: Iterable[Fit]) -> list[Place]:
     """Return the hypotheses by place, best first. Hypotheses in the maps of joined sessions are one place if
     they put the query at one pose of their building; a place has one hypothesis a session."""
     places: list[Place] = []
@@ -135,9 +135,9 @@ def places_of(index: MapIndex, query: QueryMap, hypotheses: Iterable[Hypothesis]
     return places
 
 
-def _one_place(index: MapIndex, query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
+def _one_place(index: MapIndex, query: QueryMap, a: Fit, b: Fit) -> bool:
     """Return whether two hypotheses in the maps of two sessions are one pose of the building of both."""
     frames = index.joined(a.session_index, b.session_index)
     return frames is not None and same_pose(
-        *(at.placed(h.fit.T_map_query @ query.T_odom_base) for at, h in zip(frames, (a, b), strict=True))
+        *(at.placed(h.T_map_query @ query.T_odom_base) for at, h in zip(frames, (a, b), strict=True))
     )

@@ -1,4 +1,4 @@
-"""Hypotheses: where the query may lie, each verified by aligning its walls on the map."""
+"""Hypotheses: where the query may lie, each verified by aligning its walls on the map: a `Fit`."""
 
 from __future__ import annotations
 
@@ -64,26 +64,13 @@ ONE_PLACE = float(chdtri(3, 1.0 - 0.999))
 """Squared Mahalanobis distance of x, y, yaw within which 99.9 % of all poses of one place lie."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Hypothesis:
-    """The query lies in a session as `fit` says.
-
-    session_index : index into the database's sessions. row : row of the signature table of the place that
-    proposed it, -1 if the whole map was searched.
-    """
-
-    session_index: int
-    row: int
-    fit: Fit
-
-
 def align(
     query: QueryMap,
     batches: Iterable[Iterable[Area]],
     places: Places,
     maps: Sequence[SearchMap],
     config: RelocalizeConfig,
-) -> Iterator[tuple[Hypothesis, ...]]:
+) -> Iterator[tuple[Fit, ...]]:
     """Align the query with any heading wherever the robot may stand; yields what fits in each batch of areas.
 
     batches : likeliest first; what is clearly less than the best so far is not looked for in the next.
@@ -119,7 +106,7 @@ def align(
         )
 
 
-def best_around(query: QueryMap, h: Hypothesis, target: SearchMap) -> Hypothesis:
+def best_around(query: QueryMap, h: Fit, target: SearchMap) -> Fit:
     """Return the best hypothesis within `HypothesisParameters.around_m` and `around_rad` of a given one."""
     p, center_m = HYPOTHESES, query.center_m
     at = _at(query, h)
@@ -135,15 +122,15 @@ def best_around(query: QueryMap, h: Hypothesis, target: SearchMap) -> Hypothesis
         fitted(query, h.session_index, h.row, target, _about(center_m, SE2(x, y, yaw)))
         for x, y, yaw, _ in poses.tolist()
     )
-    return max((h, *found), key=lambda one: one.fit.score)
+    return max((h, *found), key=lambda one: one.score)
 
 
-def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Hypothesis:
+def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Fit:
     """Return the hypothesis that the query lies at a pose, which is refined first."""
     pose, covariance = _refined(query, target, T_map_query)
     covariance = covariance + np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
     fit = score_fit(target.walls, query.walls, pose, covariance)
-    return Hypothesis(session_index=session_index, row=row, fit=fit)
+    return replace(fit, session_index=session_index, row=row)
 
 
 def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2, F64]:
@@ -165,13 +152,13 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
     return pose, turn @ covariance @ turn.T
 
 
-def distinct(query: QueryMap, hypotheses: Iterable[Hypothesis]) -> tuple[Hypothesis, ...]:
+def distinct(query: QueryMap, hypotheses: Iterable[Fit]) -> tuple[Fit, ...]:
     """Return the hypotheses best first, without those that are one peak with a better one.
 
     The best one takes over the `row` of the others if it has none.
     """
-    kept: list[Hypothesis] = []
-    for candidate in sorted(hypotheses, key=lambda h: -h.fit.score):
+    kept: list[Fit] = []
+    for candidate in sorted(hypotheses, key=lambda h: -h.score):
         better = next((i for i, other in enumerate(kept) if _one_peak(query, candidate, other)), None)
         if better is None:
             kept.append(candidate)
@@ -180,7 +167,7 @@ def distinct(query: QueryMap, hypotheses: Iterable[Hypothesis]) -> tuple[Hypothe
     return tuple(kept)
 
 
-def _one_peak(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
+def _one_peak(query: QueryMap, a: Fit, b: Fit) -> bool:
     """Return whether a search around one of two hypotheses has seen the other."""
     here, there = _at(query, a), _at(query, b)
     p, off_m = HYPOTHESES, max(abs(here.x - there.x), abs(here.y - there.y))
@@ -188,22 +175,22 @@ def _one_peak(query: QueryMap, a: Hypothesis, b: Hypothesis) -> bool:
     return a.session_index == b.session_index and off_m <= p.around_m and turned <= p.around_rad
 
 
-def _at(query: QueryMap, h: Hypothesis) -> SE2:
+def _at(query: QueryMap, h: Fit) -> SE2:
     """Return where a hypothesis puts `QueryMap.center_m`, to which its covariance refers."""
-    return h.fit.T_map_query @ SE2(*query.center_m, 0.0)
+    return h.T_map_query @ SE2(*query.center_m, 0.0)
 
 
-def agree(T_odom_base: SE2, a: Hypothesis, b: Hypothesis) -> bool:
+def agree(T_odom_base: SE2, a: Fit, b: Fit) -> bool:
     """Return whether two hypotheses put the base at one place, by the covariances of both."""
-    one, other = (h.fit.T_map_query @ T_odom_base for h in (a, b))
+    one, other = (h.T_map_query @ T_odom_base for h in (a, b))
     off = np.array([one.x - other.x, one.y - other.y, wrap_angle(one.yaw - other.yaw)])
-    squared = float(off @ np.linalg.solve(a.fit.covariance + b.fit.covariance, off))
+    squared = float(off @ np.linalg.solve(a.covariance + b.covariance, off))
     return a.session_index == b.session_index and squared <= ONE_PLACE
 
 
-def more_exact(a: Hypothesis, b: Hypothesis) -> bool:
+def more_exact(a: Fit, b: Fit) -> bool:
     """Return whether one hypothesis has the smaller covariance of the base than another."""
-    return bool(np.trace(a.fit.covariance[:2, :2]) < np.trace(b.fit.covariance[:2, :2]))
+    return bool(np.trace(a.covariance[:2, :2]) < np.trace(b.covariance[:2, :2]))
 
 
 def same_pose(a: SE2, b: SE2) -> bool:

@@ -31,9 +31,10 @@ import numpy as np
 
 from pc2grid.geometry import F64, SE2
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, Unfit, register_in_space
+from pc2grid.matching.score import Fit
 from signature.database import SubmapDatabase
 from signature.localization.answer import Answer, PoseInSpace, SpaceStatus, Status
-from signature.localization.hypotheses import HYPOTHESES, Hypothesis
+from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.query import QueryInSpace
 
 
@@ -118,9 +119,9 @@ def _compared(
     return fits, masses, best
 
 
-def fit_in_space(query: QueryInSpace, surface: MapSurface | None, place: Hypothesis) -> SpatialFit | Unfit:
+def fit_in_space(query: QueryInSpace, surface: MapSurface | None, place: Fit) -> SpatialFit | Unfit:
     """Return the fit of a query at a place. surface : the points of its map; None: there are none."""
-    return "unknown" if surface is None else register_in_space(query.views, surface, place.fit.T_map_query)
+    return "unknown" if surface is None else register_in_space(query.views, surface, place.T_map_query)
 
 
 def masses_of(masses: Sequence[float], fits: Mapping[int, SpatialFit | Unfit]) -> tuple[F64, int]:
@@ -192,8 +193,8 @@ def _settled(
     if located and in_space is not None:
         planar = np.ix_((0, 1, 5), (0, 1, 5))
         T_map_query = SE2.from_matrix(in_space.T_map_base) @ SE2.from_matrix(T_odom_base).inverse()
-        refined = replace(hypotheses[0].fit, T_map_query=T_map_query, covariance=in_space.covariance[planar])
-        hypotheses[0] = replace(hypotheses[0], fit=refined)
+        covariance = in_space.covariance[planar]
+        hypotheses[0] = replace(hypotheses[0], T_map_query=T_map_query, covariance=covariance)
     numbers = {k: n for n, k in enumerate(dict.fromkeys(answer.places[k] for k in order))}
     likely: Status = "ambiguous" if masses[best] >= 1.0 - masses.sum() else "not_found"
     return replace(

@@ -28,11 +28,12 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread
+from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.localization.answer import Answer, Moment, State
 from signature.localization.belief import Belief, Masses
 from signature.localization.decision import PriorOf, decide, judge, weighed
-from signature.localization.hypotheses import HYPOTHESES, Hypothesis, moved_to_origin
+from signature.localization.hypotheses import HYPOTHESES, moved_to_origin
 from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR, slip_of
@@ -77,7 +78,7 @@ class Localizer:
         prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
         self.query = Query(index.made_with, index.config, prior_ns=prior_ns, in_space=self.uses_points)
         # Of the last search: part of the query, metres driven in it, and hypotheses.
-        self._part, self._last_m, self._known = 0, 0.0, tuple[Hypothesis, ...]()
+        self._part, self._last_m, self._known = 0, 0.0, tuple[Fit, ...]()
         self._answer: Answer | None = None  # of the last scan
         self._clock = Clock()
         self._stood = False
@@ -164,7 +165,7 @@ class Localizer:
     def search(
         self,
         query: Query,
-        known: tuple[Hypothesis, ...] = (),
+        known: tuple[Fit, ...] = (),
         prior_of: PriorOf | None = None,
         index: MapIndex | None = None,
     ) -> tuple[Query, Answer]:
@@ -187,7 +188,7 @@ class Localizer:
         if answer.hypotheses:
             best = answer.hypotheses[0]
             walls = index.maps_for(seen)[best.session_index].walls
-            slipped, scans = slip_of(seen, best.fit, walls, index.config.step_m)
+            slipped, scans = slip_of(seen, best, walls, index.config.step_m)
             if scans and query is self.query:
                 later = self.search(query.since(scans), index=index)
                 slipped *= _elsewhere(*later, best)
@@ -216,7 +217,7 @@ class Clock:
         self._last = now
 
 
-def _with_prior(index: MapIndex, query: QueryMap, answer: Answer, found: tuple[Hypothesis, ...]) -> Answer:
+def _with_prior(index: MapIndex, query: QueryMap, answer: Answer, found: tuple[Fit, ...]) -> Answer:
     """Return the answer with whether the prior was used, and, if no place that it allows is certain, the best
     place found that it excludes."""
     if index.whole is None or index.region is None:
@@ -228,7 +229,7 @@ def _with_prior(index: MapIndex, query: QueryMap, answer: Answer, found: tuple[H
     return replace(answer, prior="used", excluded=best.moment if excluded else None)
 
 
-def _elsewhere(query: Query, alone: Answer, place: Hypothesis) -> float:
+def _elsewhere(query: Query, alone: Answer, place: Fit) -> float:
     """Return the mass of all that a query can be but one place, as a multiple of the mass of "nowhere"."""
     first = sum(alone.masses[:1])
     if not first:
@@ -266,16 +267,11 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     clock.lap("describe")
     answer, _ = decide(index, query)
     clock.lap("search")
-    at_origin = tuple(_at_origin(h, query.T_odom_base) for h in answer.hypotheses)
+    at_origin = tuple(
+        replace(h, covariance=moved_to_origin(h.covariance, h.T_map_query, query.T_odom_base))
+        for h in answer.hypotheses
+    )
     return _told(index, replace(answer, hypotheses=at_origin, T_odom_base=SE2()), (), clock)
-
-
-def _at_origin(hypothesis: Hypothesis, at: SE2) -> Hypothesis:
-    """Return the hypothesis with its covariance at the query's origin, given that at the point `at` of the
-    query."""
-    fit = hypothesis.fit
-    covariance = moved_to_origin(fit.covariance, fit.T_map_query, at)
-    return replace(hypothesis, fit=replace(fit, covariance=covariance))
 
 
 def _told(index: MapIndex, answer: Answer, history: Iterable[Moment], clock: Clock) -> Answer:

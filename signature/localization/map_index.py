@@ -17,12 +17,13 @@ from pc2grid.geometry import I64
 from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.evidence import EVIDENCE
 from pc2grid.matching.icp_in_space import MapSurface
+from pc2grid.matching.score import Fit
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.hypotheses import Hypothesis, align, best_around, distinct, fitted
+from signature.localization.hypotheses import align, best_around, distinct, fitted
 from signature.localization.in_space import SurfaceOf, surface_reader
 from signature.localization.posterior import Prior, Region
 from signature.localization.query import QueryMap
@@ -205,16 +206,14 @@ class MapIndex:
         lapsed = self.region is None or self.region.T_odom_prior(query) is None
         return None if lapsed else self.region
 
-    def allows(self, query: QueryMap, h: Hypothesis) -> bool:
+    def allows(self, query: QueryMap, h: Fit) -> bool:
         """Return whether the prior allows the place of a hypothesis; true if there is none that applies."""
         region = self._region_for(query)
         return region is None or (
-            h.session_index == region.session_index and region.allows(query, h.fit.T_map_query)
+            h.session_index == region.session_index and region.allows(query, h.T_map_query)
         )
 
-    def search(
-        self, query: QueryMap, known: tuple[Hypothesis, ...] = ()
-    ) -> Iterator[tuple[tuple[Hypothesis, ...], float]]:
+    def search(self, query: QueryMap, known: tuple[Fit, ...] = ()) -> Iterator[tuple[tuple[Fit, ...], float]]:
         """Yield hypotheses for the query, best first, again and again: the known ones, refined, and those
         found next to more and more places, the likeliest first; with a prior, anywhere in its region at once.
         Beside them the share 0..1 of the mass, by the signatures, that is not searched yet.
@@ -234,7 +233,7 @@ class MapIndex:
             found, left = self._worth_keeping(query, fits, found), left - float(mass[part].sum())
             yield found, left
 
-    def in_region(self, query: QueryMap, known: tuple[Hypothesis, ...] = ()) -> tuple[Hypothesis, ...]:
+    def in_region(self, query: QueryMap, known: tuple[Fit, ...] = ()) -> tuple[Fit, ...]:
         """Return `known` and what fits anywhere in the region of the prior."""
         fits = next(align(query, [self._allowed(query)], self.places, self.maps_for(query), self.config))
         return self._worth_keeping(query, (*self._fitted(query, known), *fits))
@@ -246,12 +245,10 @@ class MapIndex:
             squares_m = region.squares(query, self.places.ground[region.session_index][0], SQUARE_M)
             yield Area(region.session_index, squares_m)
 
-    def _fitted(self, query: QueryMap, known: Iterable[Hypothesis]) -> list[Hypothesis]:
+    def _fitted(self, query: QueryMap, known: Iterable[Fit]) -> list[Fit]:
         """Return the known hypotheses, refined."""
         maps = self.maps_for(query)
-        return [
-            fitted(query, h.session_index, h.row, maps[h.session_index], h.fit.T_map_query) for h in known
-        ]
+        return [fitted(query, h.session_index, h.row, maps[h.session_index], h.T_map_query) for h in known]
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
         """Return the maps as they are searched for a query: to one in a lower plane, their free space is
@@ -264,23 +261,23 @@ class MapIndex:
         return LazySequence(facing, len(self.maps), 0)
 
     def _worth_keeping(
-        self, query: QueryMap, new: Sequence[Hypothesis], kept: Sequence[Hypothesis] = ()
-    ) -> tuple[Hypothesis, ...]:
+        self, query: QueryMap, new: Sequence[Fit], kept: Sequence[Fit] = ()
+    ) -> tuple[Fit, ...]:
         """Return the new and the earlier hypotheses that score enough beside the best one to be reported
         (`PosteriorParameters.longest_lead`), best first, each the best around itself; those that a prior
         excludes are kept beside them."""
         maps, share = self.maps_for(query), 1.0 - EVIDENCE.longest_lead
-        worth: list[Hypothesis] = []
+        worth: list[Fit] = []
         for inside in (True, False):
             found = [h for h in kept if self.allows(query, h) is inside]
-            best = max((h.fit.score for h in found), default=0.0)
-            for h in sorted((h for h in new if self.allows(query, h) is inside), key=lambda h: -h.fit.score):
-                if h.fit.score >= share * best:
+            best = max((h.score for h in found), default=0.0)
+            for h in sorted((h for h in new if self.allows(query, h) is inside), key=lambda h: -h.score):
+                if h.score >= share * best:
                     found.append(best_around(query, h, maps[h.session_index]))
-                    best = max(best, found[-1].fit.score)
-            enough = (h for h in distinct(query, found) if h.fit.score >= share * best)
+                    best = max(best, found[-1].score)
+            enough = (h for h in distinct(query, found) if h.score >= share * best)
             worth += islice(enough, self.config.hypotheses)
-        return tuple(sorted(worth, key=lambda h: -h.fit.score))
+        return tuple(sorted(worth, key=lambda h: -h.score))
 
     def joined(self, a: int, b: int) -> tuple[BuildingFrame, BuildingFrame] | None:
         """Return where two sessions lie in the building in which they are joined; None if they are not."""

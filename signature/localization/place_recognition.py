@@ -82,12 +82,12 @@ class SessionRecognizer:
         rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
         maps = LazySequence(self._map, len(self._stored), most=0)
         found = distinct(query, next(align(query, [places.areas(rows)], places, maps, self._config)))
-        odds = [evidence.log_odds() for evidence in evidence_of([h.fit for h in found], query.likeness)]
+        odds = [evidence.log_odds() for evidence in evidence_of(found, query.likeness)]
         return [
             Recognition(
                 older=h.session_index,
                 newer=len(self._stored),
-                T_older_newer=best_around(query, h, maps[h.session_index]).fit.T_map_query,
+                T_older_newer=best_around(query, h, maps[h.session_index]).T_map_query,
                 log_odds=log_odds,
             )
             for h, log_odds in zip(found, odds, strict=True)

@@ -33,7 +33,6 @@ from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
 from signature.localization.belief import kept
-from signature.localization.hypotheses import Hypothesis
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import Prior
@@ -141,8 +140,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     number = near.region.session_index
     T_map_query = T_map_base @ seen.T_odom_base.inverse()
     walls = index.maps_for(seen)[number].walls
-    fit = score_fit(walls, seen.walls, T_map_query, np.zeros((3, 3)))
-    believed = Hypothesis(session_index=number, row=-1, fit=fit)
+    believed = replace(score_fit(walls, seen.walls, T_map_query, np.zeros((3, 3))), session_index=number)
     # All mass was near the pose before what was seen lately. So of two equal rooms it is in the nearer one.
     _, answer = localizer.search(
         localizer.query,
@@ -150,14 +148,14 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
         lambda place: 1.0 / (1.0 - kept(seen)) if any(near.allows(seen, h) for h in place) else 1.0,
     )
     apart = [
-        (place, *_apart(T_map_base, h.fit.T_map_query @ answer.T_odom_base))
+        (place, *_apart(T_map_base, h.T_map_query @ answer.T_odom_base))
         for h, place in zip(answer.hypotheses, answer.places, strict=True)
         if near.allows(seen, h)
     ]
     here = {place for place, *off in apart if _within_tolerance(*off)}
     mass_here = sum(answer.masses[place] for place in here)
     # Where the map knows too little to contradict the pose, "at no place of this map" does not exclude it.
-    at_most = mass_here if log_likelihood(fit) < 0.0 else 1.0 - sum(answer.masses) + mass_here
+    at_most = mass_here if log_likelihood(believed) < 0.0 else 1.0 - sum(answer.masses) + mass_here
     status = _status(mass_here, at_most, index.config.accept)
     _, off_m, off_rad = apart[0] if apart else (None, None, None)
     return PoseCheck(

@@ -14,15 +14,14 @@ from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
 from signature.database.maintenance import store
 from signature.localization.answer import Answer
-from signature.localization.hypotheses import Hypothesis
 from tests.helpers.databases import make_entry
 
 LONGEST_LINE = 200
 SEEN = OccupancyGrid(cells=np.zeros((4, 4), np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
 
 
-def hypothesis(x: float, session: int, score: float) -> Hypothesis:
-    fit = Fit(
+def hypothesis(x: float, session: int, score: float) -> Fit:
+    return Fit(
         T_map_query=SE2(x, 2.0 / 3.0, 0.1),
         forward=score,
         backward=score,
@@ -31,8 +30,8 @@ def hypothesis(x: float, session: int, score: float) -> Hypothesis:
         looked_at=100,
         score=score,
         covariance=np.eye(3),
+        session_index=session,
     )
-    return Hypothesis(session_index=session, row=-1, fit=fit)
 
 
 def answer(status: str, confidence: float) -> Answer:

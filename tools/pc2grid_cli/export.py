@@ -300,7 +300,7 @@ def _write_map_message(
 
 def _hypotheses(answer: Answer) -> Marker:
     """Return markers of the hypotheses, the best first."""
-    poses = [hypothesis.fit.T_map_query @ answer.T_odom_base for hypothesis in answer.hypotheses]
+    poses = [hypothesis.T_map_query @ answer.T_odom_base for hypothesis in answer.hypotheses]
     same = [answer.sessions[h.session_index] == answer.session for h in answer.hypotheses]
     points = [(pose.x, pose.y) for pose, here in zip(poses, same, strict=True) if here]
     return Marker(name="hypotheses", kind="spheres", points_m=_lift(points), size_m=0.4, color=_PURPLE)

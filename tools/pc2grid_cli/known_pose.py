@@ -22,6 +22,7 @@ from pc2grid_cli.documents import Document
 from pc2grid_cli.options import KnownPose
 from signature.config import Config
 from signature.database import SubmapDatabase
+from signature.localization.answer import pose_text
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, check_pose
 from signature.localization.posterior import Prior
@@ -153,9 +154,7 @@ def judgement(checked: PoseCheck, where: str) -> Document:
 
 def as_text(checked: PoseCheck) -> str:
     """Return the judgement in one or two lines."""
-    pose = checked.T_map_base
-    where = f"x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {math.degrees(pose.yaw):.1f} deg"
-    told = f"{checked.status}: {where} in {one_line(checked.session)}"
+    told = f"{checked.status}: {pose_text(checked.T_map_base)} in {one_line(checked.session)}"
     if checked.lapsed:
         return f"{told}: registration was lost after that pose, so it cannot be compared"
     told += f", right with probability {_bound(checked)}"
@@ -164,10 +163,9 @@ def as_text(checked: PoseCheck) -> str:
     told += f", after {checked.path_m:.1f} m of travel"
     better = checked.better
     if better is not None and better.T_map_base is not None:
-        pose = better.T_map_base
         told += (
-            f"\n  better, in {one_line(better.session or '')}: x {pose.x:.2f} m, y {pose.y:.2f} m,"
-            f" yaw {math.degrees(pose.yaw):.1f} deg, confidence {probability(better.confidence)}"
+            f"\n  better, in {one_line(better.session or '')}: {pose_text(better.T_map_base)},"
+            f" confidence {probability(better.confidence)}"
         )
     return told
 

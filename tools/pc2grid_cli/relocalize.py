@@ -27,6 +27,7 @@ from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import stamp_text, write_trajectory
 from pc2grid.mapping.drawn import is_drawn_map
 from pc2grid.mapping.quality import PRECISION
+from pc2grid.matching.score import Fit
 from pc2grid.model import SENSOR_MODELS, Trajectory
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console, known_pose, options, output
@@ -36,8 +37,7 @@ from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.maintenance import is_database
 from signature.database.protocol import BuildingFrame
-from signature.localization.answer import AmbiguousLine, Answer, answer_in_building
-from signature.localization.hypotheses import Hypothesis
+from signature.localization.answer import AmbiguousLine, Answer, answer_in_building, pose_text
 from signature.localization.map_index import MapIndex
 from signature.localization.shown.page import Found, write_report
 from signature.localization.shown.picture import draw_answer, draw_answers
@@ -404,13 +404,11 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
     after = "" if is_map else f" after {answer.path_m:.1f} m"
     near = " near the given one" if answer.prior == "used" else ""
     if answer.T_map_base is not None:
-        pose = answer.T_map_base
         of_what = "for the map's own frame" if is_map else "at the last scan"
         travel = "" if is_map else f", after {answer.path_m:.1f} m of travel"
         return (
             f"located in {_named(answer, answer.hypotheses[0])}:{_frame(answer)}"
-            f" x {pose.x:.2f} m, y {pose.y:.2f} m,"
-            f" yaw {math.degrees(pose.yaw):.1f} deg {of_what},"
+            f" {pose_text(answer.T_map_base)} {of_what},"
             f" confidence {probability(answer.confidence)}{travel}" + _in_space(answer)
         )
     lines = [
@@ -420,8 +418,8 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
         }[answer.status]
     ]
     for h in answer.hypotheses[:5]:
-        pose = h.fit.T_map_query @ answer.T_odom_base
-        lines.append(f"  {_named(answer, h)}: x {pose.x:.2f} m, y {pose.y:.2f} m, score {h.fit.score:.2f}")
+        pose = h.T_map_query @ answer.T_odom_base
+        lines.append(f"  {_named(answer, h)}: x {pose.x:.2f} m, y {pose.y:.2f} m, score {h.score:.2f}")
     if answer.line is not None:
         lines.append(_on_line(answer.line))
     return "\n".join(lines) + _in_space(answer)
@@ -458,7 +456,7 @@ def _frame(answer: Answer) -> str:
     return "" if inside else one_line(f" in the frame of {answer.frame},")
 
 
-def _named(answer: Answer, hypothesis: Hypothesis) -> str:
+def _named(answer: Answer, hypothesis: Fit) -> str:
     """Return the session whose map a hypothesis is in, with its building and floor if they are known."""
     session = answer.sessions[hypothesis.session_index]
     label = answer.labels[hypothesis.session_index]

@@ -36,7 +36,7 @@ from pc2grid_cli.documents import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.protocol import BuildingFrame, SessionInfo
-from signature.localization.answer import Answer, answer_in_building
+from signature.localization.answer import Answer, answer_in_building, pose_text
 from signature.localization.joining.building import map_of
 from signature.localization.localizer import Follower, Localizer, ResetPolicy
 from signature.localization.map_index import MapIndex
@@ -273,22 +273,20 @@ def as_text(answer: Answer, published: list[str]) -> str:
     begin = f"after {answer.path_m:.1f} m: {str(answer.state).replace('_', ' the ')}"
     away = answer.beside_map
     if away is not None:
-        fit = away.hypothesis.fit
-        at, sigmas = fit.T_map_query @ answer.T_odom_base, np.sqrt(np.diag(fit.covariance))
+        fit = away.hypothesis
+        sigmas = np.sqrt(np.diag(fit.covariance))
         return one_line(
-            f"{begin} of {answer.sessions[away.hypothesis.session_index]}: by odometry x {at.x:.2f} m,"
-            f" y {at.y:.2f} m, yaw {math.degrees(at.yaw):.1f} deg, give or take {sigmas[:2].max():.2f} m and"
+            f"{begin} of {answer.sessions[fit.session_index]}: by odometry"
+            f" {pose_text(fit.T_map_query @ answer.T_odom_base)}, give or take {sigmas[:2].max():.2f} m and"
             f" {math.degrees(sigmas[2]):.1f} deg, confidence {probability(away.mass)}"
         )
     if answer.T_map_base is None:
         places = len(set(answer.places))
         return f"{begin}, {places} places fit" if answer.status == "ambiguous" else f"{begin}, no place fits"
-    pose = answer.T_map_base
     told = f", published {' and '.join(published)}" if published else ""
-    yaw_deg = math.degrees(pose.yaw)
     begin += "" if answer.is_told else ", perhaps"
     return one_line(
-        f"{begin} in {answer.session}: x {pose.x:.2f} m, y {pose.y:.2f} m, yaw {yaw_deg:.1f} deg,"
+        f"{begin} in {answer.session}: {pose_text(answer.T_map_base)},"
         f" confidence {probability(answer.confidence)}{told}"
     )
 

@@ -310,7 +310,7 @@ def located_rows(
         T_map_query = T_map_base @ answer.T_odom_base.inverse()
         right, error_m = False, None
         if answer.hypotheses:
-            pose = answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
+            pose = answer.hypotheses[0].T_map_query @ answer.T_odom_base
             right, error_m = is_right(pose, T_map_base, JUDGEMENT.right_m)
         mapped = own and score_fit(index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
         yield QueryRow(

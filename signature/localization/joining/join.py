@@ -405,10 +405,9 @@ def proposals(target: MapIndex, pieces: Sequence[Piece]) -> list[Proposal]:
 def _places_of(target: MapIndex, piece: Piece) -> list[Proposal]:
     """Look a piece up in the target."""
     found, _ = next(target.search(piece.query))
-    fits = [hypothesis.fit for hypothesis in found]
     return [
         Proposal(T_target_source=fit.T_map_query, at_m=piece.center_m, log_odds=evidence.log_odds())
-        for fit, evidence in zip(fits, evidence_of(fits, piece.query.likeness), strict=True)
+        for fit, evidence in zip(found, evidence_of(found, piece.query.likeness), strict=True)
     ]
 
 

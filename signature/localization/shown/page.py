@@ -329,7 +329,7 @@ def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dic
         "hypotheses": [
             {
                 **shown,
-                "T": [h.fit.T_map_query.x, h.fit.T_map_query.y, h.fit.T_map_query.yaw],
+                "T": [h.T_map_query.x, h.T_map_query.y, h.T_map_query.yaw],
                 "support": "".join(map(str, points.support.tolist())),
                 "shares": _short([points.share(kind) for kind in Support], 4),
                 "missed": _short(np.ravel(points.missed_m), 2),
@@ -478,7 +478,7 @@ def why_here(answer: Answer, database: SubmapDatabase) -> dict[str, Any] | None:
     for number in (0,) if rival is None else (0, rival):
         hypothesis = answer.hypotheses[number]
         grid = database.grid(answer.sessions[hypothesis.session_index])
-        views = compare_views(answer.local_map, answer.views_m, grid, hypothesis.fit.T_map_query, sight_m)
+        views = compare_views(answer.local_map, answer.views_m, grid, hypothesis.T_map_query, sight_m)
         compared.append((number, views))
     ratios = np.array([[view.log_ratio for view in views] for _, views in compared], np.float64)
     apart = ratios[0] - ratios[-1] if len(ratios) > 1 else ratios[0]

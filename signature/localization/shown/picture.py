@@ -14,13 +14,12 @@ import numpy as np
 from pc2grid.display import counted, probability
 from pc2grid.geometry import F64, SE2, U8
 from pc2grid.io.atomic import replace_file
-from pc2grid.matching.score import Agreement, Support, agreement
+from pc2grid.matching.score import Agreement, Fit, Support, agreement
 from pc2grid.matching.walls import Walls
 from pc2grid.model import OccupancyGrid, Trajectory
 from signature.database import SubmapDatabase
 from signature.database.protocol import BuildingFrame
 from signature.localization.answer import Answer
-from signature.localization.hypotheses import Hypothesis
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -79,7 +78,7 @@ def agreements(answer: Answer, database: SubmapDatabase) -> tuple[Agreement, ...
         if index in {hypothesis.session_index for hypothesis in answer.hypotheses}
     }
     return tuple(
-        agreement(maps[hypothesis.session_index], query, hypothesis.fit.T_map_query)
+        agreement(maps[hypothesis.session_index], query, hypothesis.T_map_query)
         for hypothesis in answer.hypotheses
     )
 
@@ -167,10 +166,10 @@ def answer_figure(
     compared = None
     if best is not None:
         walls = Walls.of(grid, drawn=way is not None and not len(way))
-        compared = agreement(walls, Walls.of(answer.local_map), best.fit.T_map_query)
+        compared = agreement(walls, Walls.of(answer.local_map), best.T_map_query)
     whole, close = _known(grid), None
     if best is not None and compared is not None and len(compared.points_m):
-        close = _box(best.fit.T_map_query.apply(compared.points_m), _CLOSE_MARGIN_M)
+        close = _box(best.T_map_query.apply(compared.points_m), _CLOSE_MARGIN_M)
         whole = _box(np.concatenate((whole, close)))
         if np.ptp(close, axis=0).max() > _CLOSE_SHARE * np.ptp(whole, axis=0).max():
             close = None
@@ -314,9 +313,9 @@ def _draw_way(axes: Any, way: Trajectory | None) -> None:
         axes.plot(*way.planar()[:, :2].T, color=GREY, lw=0.7, label="path of the map's robot")
 
 
-def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_size: float) -> None:
+def _draw_agreement(axes: Any, best: Fit, compared: Agreement, *, point_size: float) -> None:
     """Draw the query's walls at a hypothesis, and the map's walls that it should have seen."""
-    points_m = best.fit.T_map_query.apply(compared.points_m)
+    points_m = best.T_map_query.apply(compared.points_m)
     for kind in (Support.FITS, Support.CONTRADICTED, Support.UNKNOWN):
         chosen = points_m[compared.support == kind]
         if len(chosen):
@@ -333,15 +332,15 @@ def _draw_agreement(axes: Any, best: Hypothesis, compared: Agreement, *, point_s
         )
 
 
-def _draw_robot(axes: Any, best: Hypothesis, answer: Answer, poses: Trajectory) -> None:
+def _draw_robot(axes: Any, best: Fit, answer: Answer, poses: Trajectory) -> None:
     """Draw the path of the query at a hypothesis, and an arrow where it ends; of a map, its frame."""
     if len(poses):
-        path = best.fit.T_map_query.apply(poses.planar()[:, :2])
+        path = best.T_map_query.apply(poses.planar()[:, :2])
         label = (
             "query: path as located" if answer.status == "located" else "query: path at the best hypothesis"
         )
         axes.plot(path[:, 0], path[:, 1], color=PURPLE, lw=1.8, label=label)
-    pose = best.fit.T_map_query @ answer.T_odom_base
+    pose = best.T_map_query @ answer.T_odom_base
     if not _in_panel(axes, pose):
         return
     _draw_arrow(axes, pose, PURPLE)
@@ -366,7 +365,7 @@ def _draw_arrow(axes: Any, pose: SE2, colour: str) -> None:
 def _draw_rivals(axes: Any, answer: Answer, session: str) -> None:
     """Draw the next hypotheses in this session, where they lie within the panel."""
     places = [
-        h.fit.T_map_query @ answer.T_odom_base
+        h.T_map_query @ answer.T_odom_base
         for h in answer.hypotheses[1:6]
         if answer.sessions[h.session_index] == session
     ]

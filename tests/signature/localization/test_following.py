@@ -70,12 +70,12 @@ def test_what_odometry_says_counts_for_the_place_where_walls_say_it_more_exactly
     verdict, _ = decide(OFFICE, query)
     first = verdict.hypotheses[0]
     moved = replace(
-        first.fit,
-        T_map_query=SE2(aside_m, 0.0, 0.0) @ first.fit.T_map_query,
+        first,
+        T_map_query=SE2(aside_m, 0.0, 0.0) @ first.T_map_query,
         covariance=np.eye(3) * sigma_m**2,
     )
     away = OffMap(
-        hypothesis=replace(first, fit=moved),
+        hypothesis=moved,
         mass=1e3 * math.exp(verdict.evidence.log_odds()),
         seen_m=0.0,
         T_odom_seen=query.T_odom_base,
@@ -157,7 +157,7 @@ def test_a_robot_that_is_carried_away_unseen_is_recovered_all_the_same(
     at = states.index("recovered")
     assert before[-1][0].state == "located" and at <= 2
     assert set(states[at + 1 :]) == {"located"}
-    assert localizer.query.map().slipped_m >= before[-1][0].answer.path_m  # none of the scans before counts
+    assert localizer.query.map().slipped_m >= before[-1][0].path_m  # none of the scans before counts
     check_poses([*before, *estimates[at:]])
 
 
@@ -184,10 +184,7 @@ def test_a_place_is_told_when_a_second_search_agrees() -> None:
     localizer = Localizer(OFFICE)
     estimates_of(localizer, list(stretch(FIRST)))
     query, here = localizer.query.map(), localizer.answer()
-    moved = [
-        replace(h, fit=replace(h.fit, T_map_query=SE2(3.0, 0.0, 0.0) @ h.fit.T_map_query))
-        for h in here.hypotheses
-    ]
+    moved = [replace(h, T_map_query=SE2(3.0, 0.0, 0.0) @ h.T_map_query) for h in here.hypotheses]
     there = replace(here, hypotheses=tuple(moved))
     for looks, expected in (
         ([(here, 0.9), (here, 0.85), (here, 0.8)], ["searching", "searching", "located"]),

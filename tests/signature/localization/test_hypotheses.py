@@ -19,7 +19,6 @@ from signature.localization.answer import ambiguous_line
 from signature.localization.decision import decide
 from signature.localization.hypotheses import (
     HYPOTHESES,
-    Hypothesis,
     best_around,
     coarse_points,
     distinct,
@@ -57,7 +56,7 @@ def test_a_room_has_near_walls_only() -> None:
 def test_a_pose_is_not_stated_more_exactly_than_the_map_is_drawn() -> None:
     """The map on itself: the alignment alone states 2 to 4 cm along rooms and some millimetres across."""
     query = query_of(office(), np.empty((0, 2)), Config(), Config().relocalize)
-    fit = fitted(query, 0, -1, SearchMap.of(office()), SE2(0.04, -0.03, 0.01)).fit
+    fit = fitted(query, 0, -1, SearchMap.of(office()), SE2(0.04, -0.03, 0.01))
     stated = np.sqrt(np.diag(fit.covariance))
     assert np.all(stated >= (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad))
     assert np.all(stated < (0.1, 0.1, 0.01))  # a tenth of a robot's width: what is aligned is known
@@ -71,7 +70,7 @@ def test_tables_that_a_lidar_has_seen_over_and_under_hide_no_place_from_a_laser(
         config = Config()
         asked = query_of(query, np.empty((0, 2)), config, config.relocalize)
         searched = building({"map": target}, config).maps_for(asked)[0]
-        return fitted(asked, 0, -1, searched, at_map).fit.known_agreement_both_ways
+        return fitted(asked, 0, -1, searched, at_map).known_agreement_both_ways
 
     plain = replace(of_lidar, heights=None)
     assert agreement(of_laser, of_lidar) > 0.9 > agreement(of_laser, plain)
@@ -83,17 +82,15 @@ def test_a_shoulder_is_led_to_its_peak_and_is_no_place_of_its_own() -> None:
     target = SearchMap.of(office())
     peak = fitted(query, 0, -1, target, SE2())
     aside = SE2(0.6, -0.5, 0.06)
-    shoulder = Hypothesis(
-        session_index=0, row=3, fit=score_fit(target.walls, query.walls, aside, peak.fit.covariance)
-    )
+    shoulder = replace(score_fit(target.walls, query.walls, aside, peak.covariance), row=3)
     assert distinct(query, (shoulder, peak)) == (replace(peak, row=3),)
     led = best_around(query, shoulder, target)
-    pose = led.fit.T_map_query
-    assert abs(pose.x) + abs(pose.y) < 0.05 and led.fit.score > shoulder.fit.score
+    pose = led.T_map_query
+    assert abs(pose.x) + abs(pose.y) < 0.05 and led.score > shoulder.score
     (one,) = distinct(query, (led, peak))
     assert one.row == 3  # of the place that proposed it
     elsewhere = replace(led, session_index=1)
-    farther = replace(shoulder, fit=replace(shoulder.fit, T_map_query=SE2(0.9, 0.0, 0.0)))
+    farther = replace(shoulder, T_map_query=SE2(0.9, 0.0, 0.0))
     for other in (elsewhere, farther):
         assert len(distinct(query, (other, peak))) == 2
 
@@ -109,7 +106,7 @@ def test_a_search_goes_on_until_it_is_sure(by: ShortlistBy, monkeypatch: pytest.
     assert len(steps) > 1 and steps == sorted(steps, reverse=True) and abs(steps[-1]) < 1e-9
     verdict, _ = decide(index, query)
     assert verdict.status == "located"
-    pose = verdict.hypotheses[0].fit.T_map_query
+    pose = verdict.hypotheses[0].T_map_query
     assert abs(pose.x - 15.0) + abs(pose.y - 5.0) < 0.1
 
 
@@ -124,7 +121,7 @@ def test_the_looks_of_a_robot_search_one_part_after_the_other(monkeypatch: pytes
     assert parts > 2 and all(len(look) == 2 for look in looks)
     (_, left), *_ = looks[0]
     assert sum(first - second for (_, first), (_, second) in looks) == pytest.approx(left)
-    best = [found[0].fit for _, (found, _) in looks if found]
+    best = [found[0] for _, (found, _) in looks if found]
     assert sum(abs(fit.T_map_query.x - 15.0) + abs(fit.T_map_query.y - 5.0) < 0.1 for fit in best) == 1
 
 

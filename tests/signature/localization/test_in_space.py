@@ -17,7 +17,7 @@ from pc2grid.matching.score import Fit
 from pc2grid.model import Health, PointMap
 from signature.database import Label
 from signature.localization.answer import Answer
-from signature.localization.hypotheses import HYPOTHESES, Hypothesis
+from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.in_space import SPACE, log_odds_in_space, masses_of, settle_in_space
 from signature.localization.localizer import Follower, Localizer
 from signature.localization.map_index import MapIndex
@@ -41,19 +41,15 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
     last, T_room_base = scans[-1]
     T_room_odom = SE2.from_matrix(T_room_base @ invert_pose(last.T_session_base))
     hypotheses = tuple(
-        Hypothesis(
-            session_index=0,
-            row=-1,
-            fit=Fit(
-                T_map_query=SE2(x_m, 0.0, 0.0) @ T_room_odom,
-                forward=0.9,
-                backward=0.9,
-                overlap=0.9,
-                compared=90.0,
-                score=0.9,
-                looked_at=100.0,
-                covariance=np.eye(3) * 1e-4,
-            ),
+        Fit(
+            T_map_query=SE2(x_m, 0.0, 0.0) @ T_room_odom,
+            forward=0.9,
+            backward=0.9,
+            overlap=0.9,
+            compared=90.0,
+            score=0.9,
+            looked_at=100.0,
+            covariance=np.eye(3) * 1e-4,
         )
         for x_m in rooms_x_m
     )
@@ -86,7 +82,7 @@ def other_walls() -> MapSurface:
 def base_of(verdict: Answer, query: QueryInSpace) -> SE2:
     """The base at the first hypothesis, in the plane."""
     assert query.T_odom_base is not None
-    return verdict.hypotheses[0].fit.T_map_query @ SE2.from_matrix(query.T_odom_base)
+    return verdict.hypotheses[0].T_map_query @ SE2.from_matrix(query.T_odom_base)
 
 
 @pytest.mark.parametrize(("height_m", "x_m"), [(HEIGHTS_M[0], 0.0), (HEIGHTS_M[1], APART_M)])
@@ -119,7 +115,7 @@ def test_furniture_does_not_tell_twins_apart() -> None:
     """The query is in the second room, or in the first one, into which a cupboard was brought since."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M, cupboard=True)
     points = MapSurface(furnished_map())
-    fits = [register_in_space(query.views, points, h.fit.T_map_query) for h in verdict.hypotheses]
+    fits = [register_in_space(query.views, points, h.T_map_query) for h in verdict.hypotheses]
     assert isinstance(fits[0], SpatialFit) and isinstance(fits[1], SpatialFit)
     assert fits[1].on - fits[0].on > 0.05
     assert fits[1].compared.patches_over(fits[0].compared) == 0
@@ -130,13 +126,13 @@ def test_furniture_does_not_tell_twins_apart() -> None:
 def test_a_located_pose_is_refined_and_becomes_surer(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     first = verdict.hypotheses[0]
-    moved = replace(first, fit=replace(first.fit, T_map_query=first.fit.T_map_query @ SE2(0.1, -0.05, 0.03)))
+    moved = replace(first, T_map_query=first.T_map_query @ SE2(0.1, -0.05, 0.03))
     settled = settle_in_space(replace(verdict, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
     at = settled.in_space
     assert settled.status == "located" and settled.confidence > 0.99
     # Not surer than the map.
     assert at is not None
-    for covariance in (at.covariance, settled.hypotheses[0].fit.covariance):
+    for covariance in (at.covariance, settled.hypotheses[0].covariance):
         assert np.sqrt(np.diag(covariance)[:2]).min() > HYPOTHESES.map_m
     error = base_of(verdict, query).inverse() @ base_of(settled, query)
     assert np.hypot(error.x, error.y) < 0.02
@@ -165,7 +161,7 @@ def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: Map
 
 def test_a_place_that_is_not_compared_keeps_its_odds(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
-    fit = register_in_space(query.views, points, verdict.hypotheses[0].fit.T_map_query)
+    fit = register_in_space(query.views, points, verdict.hypotheses[0].T_map_query)
     assert isinstance(fit, SpatialFit)
     masses, best = masses_of((0.3, 0.3), {1: fit})
     factor = math.exp(log_odds_in_space(fit))
@@ -185,7 +181,7 @@ def test_a_place_that_icp_leaves_is_turned_down(points: MapSurface) -> None:
 
 def test_what_stands_in_the_way_contradicts_more_than_what_is_gone(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
-    fit = register_in_space(query.views, points, verdict.hypotheses[0].fit.T_map_query)
+    fit = register_in_space(query.views, points, verdict.hypotheses[0].T_map_query)
     assert isinstance(fit, SpatialFit)
     gone = replace(fit, on=fit.on - 0.1, through=fit.through + 0.1)
     stands = replace(fit, on=fit.on - 0.1, before=fit.before + 0.1)
@@ -263,7 +259,7 @@ def test_twins_that_differ_in_height_only(height_m: float, name: str, maps: dict
     answers: list[Answer] = []
     for registered, planar_scan, _ in lidar_drive(height_m):
         in_plane = plain.add(registered, planar_scan)
-        assert in_plane is None or in_plane.answer.status != "located"
+        assert in_plane is None or in_plane.status != "located"
         estimate = spatial.add(registered, planar_scan)
         answers += [] if estimate is None else [estimate]
     located = [estimate for estimate in answers if estimate.state == "located"]

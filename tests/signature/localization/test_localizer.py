@@ -105,7 +105,7 @@ def test_two_identical_rooms_are_ambiguous_with_both_named() -> None:
     twins = plan(12, 6, [(6, 0, 6, 6), *bent, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in bent]])
     answer, truth = ask(building({"twins": twins}), twins, [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)])
     assert answer.status == "ambiguous" and answer.T_map_base is None
-    places = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    places = [h.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
     for expected in (truth, SE2(truth.x + 6, truth.y, truth.yaw)):
         assert any(math.dist((p.x, p.y), (expected.x, expected.y)) < 0.25 for p in places)
     line, document = answer.line, answer.to_json()["line"]
@@ -120,7 +120,7 @@ def test_a_symmetric_room_reports_both_headings() -> None:
     room = plan(8, 5, [])
     answer, truth = ask(building({"room": room}), room, [(2.0, 2.0), (6.0, 2.0)])
     assert answer.status == "ambiguous"
-    poses = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    poses = [h.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
     turned = SE2(8 - truth.x, 5 - truth.y, truth.yaw + math.pi)
     for expected in (truth, turned):
         assert any(

@@ -32,7 +32,7 @@ def driven_through_the_office() -> tuple[MapIndex, QueryMap, Fit]:
     for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
         query.add(registered, planar_scan)
     seen = query.map()
-    fit = decide(index, seen)[0].hypotheses[0].fit
+    fit = decide(index, seen)[0].hypotheses[0]
     return index, seen, fit
 
 
@@ -113,7 +113,7 @@ def test_of_two_rooms_that_are_alike_the_prior_names_one(room: float) -> None:
     assert answer.status == "located" and answer.confidence >= 0.9 and answer.prior == "used"
     assert distance(answer.T_map_base, SE2(truth.x + room, truth.y, truth.yaw)) < 0.1
     assert answer.excluded is None
-    inside = [h.fit.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
+    inside = [h.T_map_query @ answer.T_odom_base for h in answer.hypotheses]
     assert all(math.dist((p.x, p.y), (3.0 + room, 2.0)) <= 3.0 for p in inside)
 
 
@@ -123,7 +123,7 @@ def test_where_the_robot_is_not_it_is_not_found_and_the_place_is_named() -> None
     assert answer.excluded is not None and answer.excluded.status == "located"
     assert distance(answer.excluded.pose, truth) < 0.1
     for h in answer.hypotheses:
-        pose = h.fit.T_map_query @ answer.T_odom_base
+        pose = h.T_map_query @ answer.T_odom_base
         assert distance(pose, SE2(17.0, 2.0)) <= 2.0
 
 

@@ -76,7 +76,7 @@ def test_a_place_that_the_proposals_lack_is_found_before_the_answer_is_certain()
         last = list(islice(log.scans(326.6, 5.0), 6))[-1]
     expected = true_pose(truth, last)
     assert answer.status != "not_found" and expected is not None
-    pose = answer.hypotheses[0].fit.T_map_query @ answer.T_odom_base
+    pose = answer.hypotheses[0].T_map_query @ answer.T_odom_base
     assert math.dist((pose.x, pose.y), (expected.x, expected.y)) < 0.1
     assert abs(math.remainder(pose.yaw - expected.yaw, 2.0 * math.pi)) < math.radians(2.0)
 

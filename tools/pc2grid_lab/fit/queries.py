@@ -38,6 +38,7 @@ from pc2grid.geometry import F32, F64, SE2
 from pc2grid.io.maps import load_map
 from pc2grid.io.recording import open_log
 from pc2grid.matching.evidence import evidence_of
+from pc2grid.matching.score import Fit
 from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.observer import TimeSpan
 from pc2grid.pipeline import follow
@@ -52,7 +53,6 @@ from pc2grid_lab.sensors import PlanMap, RegisteredSession
 from pc2grid_lab.truth import apart
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.hypotheses import Hypothesis
 from signature.localization.in_space import SPACE, fit_in_space, terms_in_space
 from signature.localization.joining.join import JOIN
 from signature.localization.map_index import MapIndex
@@ -225,8 +225,8 @@ def _asked(
 ) -> dict[str, Any]:
     """Return the evidence of each place that is found, and how far it is from the truth."""
     *_, (found, _) = index.search(query)
-    evidence = evidence_of([h.fit for h in found], query.likeness)
-    bases = [h.fit.T_map_query @ query.T_odom_base for h in found]
+    evidence = evidence_of(found, query.likeness)
+    bases = [h.T_map_query @ query.T_odom_base for h in found]
     errors = [_error(index, h.session_index, T, truth) for h, T in zip(found, bases, strict=True)]
     row = {"evidence": list(map(asdict, evidence)), "errors": errors}
     if in_space is None or not in_space.views or index.surface_of is None:
@@ -238,14 +238,14 @@ def _asked(
 
 
 def _in_space(
-    index: MapIndex, query: QueryInSpace, place: Hypothesis, truth: Mapping[str, SE2]
+    index: MapIndex, query: QueryInSpace, place: Fit, truth: Mapping[str, SE2]
 ) -> dict[str, Any] | None:
     """Return the evidence of the points for a place, and how far it is then from the truth; None: nothing."""
     assert query.T_odom_base is not None
     fit = fit_in_space(query, index.surface(place.session_index), place)
     if fit == "unknown":
         return None
-    T_map_query = place.fit.T_map_query if fit == "left" else SE2.from_matrix(fit.T_map_query)
+    T_map_query = place.T_map_query if fit == "left" else SE2.from_matrix(fit.T_map_query)
     T_map_base = T_map_query @ SE2.from_matrix(query.T_odom_base)
     return {"terms": terms_in_space(fit), "error": _error(index, place.session_index, T_map_base, truth)}
 

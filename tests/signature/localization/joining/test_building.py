@@ -230,7 +230,7 @@ def test_an_answer_is_moved_with_all_its_poses() -> None:
     assert moved.T_map_base is not None and moved.frame == "ground floor"
     assert (moved.T_map_base.x, moved.T_map_base.y) == pytest.approx((23.0, -1.0), abs=0.1)
     assert moved.T_map_base.yaw == pytest.approx(math.pi / 2, abs=0.02)
-    assert moved.T_map_odom == moved.T_map_base == moved.hypotheses[0].fit.T_map_query
+    assert moved.T_map_odom == moved.T_map_base == moved.hypotheses[0].T_map_query
     assert moved.history[-1].pose == moved.T_map_base
     document = moved.to_json()
     assert document["frame"] == document["hypotheses"][0]["frame"] == "ground floor"
@@ -248,7 +248,7 @@ def test_an_answer_in_a_bent_map_moves_as_its_place_does() -> None:
     # South in the map is east in the building, which is turned by a quarter.
     assert bent.T_map_base.x - straight.T_map_base.x == pytest.approx(0.3, abs=0.02)
     assert bent.T_map_base.y == pytest.approx(straight.T_map_base.y, abs=0.02)
-    assert bent.T_map_odom == bent.T_map_base == bent.hypotheses[0].fit.T_map_query
+    assert bent.T_map_odom == bent.T_map_base == bent.hypotheses[0].T_map_query
     assert bent.history[-1].pose == bent.T_map_base
 
 
