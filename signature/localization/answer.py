@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from itertools import compress
 from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
@@ -110,20 +109,20 @@ class PoseInSpace:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class OffMap:
-    """A place to which odometry has carried the robot from one that the map shows; of what is seen there the
-    map shows too little to tell.
+class Place:
+    """A place that the robot may be at.
 
-    hypothesis : its `covariance` is that of the base now, grown since. mass : probability of it.
-    seen_m, T_odom_seen, seen : metres driven, the base, and its covariance (3, 3) where the map showed the
-    place last.
+    fits : where it lies in the maps that show it, one a session, the best first; each `covariance` is that of
+    the base now. mass : probability of it.
+    seen_m, T_odom_seen, seen : of a place to which odometry has carried the robot: metres driven, the base,
+    and the covariances of the fits (3, 3), where the maps showed the place last.
     """
 
-    hypothesis: Fit
+    fits: tuple[Fit, ...]
     mass: float
-    seen_m: float
-    T_odom_seen: SE2
-    seen: F64
+    seen_m: float = 0.0
+    T_odom_seen: SE2 = field(default_factory=SE2)
+    seen: tuple[F64, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,16 +141,13 @@ class Moment:
 
     def to_json(self) -> dict[str, Any]:
         """Return the moment as plain types."""
-        at = self.pose
-        x, y, yaw = (None, None, None) if at is None else (at.x, at.y, at.yaw)
+        pose = dict.fromkeys(("x", "y", "yaw")) if self.pose is None else _planar(self.pose)
         return {
             "stamp_ns": self.stamp_ns,
             "path_m": self.path_m,
             "status": self.status,
             "session": self.session,
-            "x": x,
-            "y": y,
-            "yaw": yaw,
+            **pose,
             "confidence": self.confidence,
         }
 
@@ -162,15 +158,14 @@ class Answer:
 
     status : located, ambiguous (several places fit) or not_found (none does).
     confidence : mass of the first place, see `signature.localization.posterior`.
-    hypotheses : all that fit, by the mass of their places. places : parallel to them, which of them are the
-    same place, seen in the maps of different sessions; numbered from 0, best first.
-    masses : of each place, by its number. evidence : what tells for the first place.
-    off_map : further places, which the map does not show, the likeliest first; their masses are parts of the
-    same probability.
+    places : all that fit, the likeliest first. evidence : what tells for the first place.
+    off_map : further places, of which the map shows too little to tell; odometry has carried the robot there
+    from places that it shows. The likeliest first; their masses are parts of the same probability.
     history : how the answer came to be.
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with. views_m :
     where it was described by signatures, in that frame. map : of the session of the best hypothesis.
-    sessions, labels : all of the database, that `Fit.session_index` counts.
+    sessions, labels : all of the database, that `Fit.session_index` counts. submap_ids : of each of the
+    `hypotheses`, the place of the database that proposed it; -1: none.
     prior : what became of the prior, None if there was none. Not used: "lapsed", registration was lost after
     the time that it is about; "ahead", its time lies after the last scan. excluded : the best place that the
     prior excludes, if nothing that it allows is certain and this fits better.
@@ -195,8 +190,7 @@ class Answer:
 
     status: Status
     confidence: float
-    hypotheses: tuple[Fit, ...]
-    places: tuple[int, ...]
+    places: tuple[Place, ...]
     evidence: Evidence
     stamp_ns: int
     path_m: float
@@ -207,14 +201,13 @@ class Answer:
     submap_ids: tuple[int, ...] = ()
     history: tuple[Moment, ...] = ()
     timing_ms: dict[str, float] = field(default_factory=dict)
-    masses: tuple[float, ...] = ()
     prior: Literal["used", "lapsed", "ahead"] | None = None
     excluded: Moment | None = None
     in_space: PoseInSpace | None = None
     views_m: tuple[tuple[float, float], ...] = ()
     map: OccupancyGrid | None = None
     frames: tuple[str | None, ...] = ()
-    off_map: tuple[OffMap, ...] = ()
+    off_map: tuple[Place, ...] = ()
     state: State | None = None
     T_odometry_base: SE2 | None = None
     elapsed_s: float = 0.0
@@ -222,7 +215,7 @@ class Answer:
     def __repr__(self) -> str:
         sure = f"confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
         if self.T_map_base is None:
-            places = len(set(self.places))
+            places = len(self.places)
             return f"Answer({self.status}, {places} {'place' if places == 1 else 'places'}, {sure})"
         return f"Answer(located in {short(self.session)} at {pose_text(self.T_map_base)}, {sure})"
 
@@ -230,13 +223,13 @@ class Answer:
         located = self.T_map_base is not None
         rows = [
             (
-                place,
-                self.sessions[hypothesis.session_index],
-                pose_text(hypothesis.T_map_query @ self.T_odom_base),
-                f"{hypothesis.score:.2f}",
+                number,
+                self.sessions[fit.session_index],
+                pose_text(fit.T_map_query @ self.T_odom_base),
+                f"{fit.score:.2f}",
                 "the answer" if located and row == 0 else "",
             )
-            for row, (place, hypothesis) in enumerate(zip(self.places, self.hypotheses, strict=True))
+            for row, (number, fit) in enumerate(self.numbered)
         ]
         status = self.status.replace("_", " ")
         title = f"{status}, confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
@@ -246,16 +239,36 @@ class Answer:
 
     def _repr_png_(self) -> bytes | None:
         """Return the map, with the walls of the query at the best hypothesis; None without one."""
-        if self.map is None:
+        if self.map is None or self.best is None:
             return None
         walls_m = self.local_map.to_point(np.argwhere(self.local_map.occupied))
-        there_m = self.hypotheses[0].T_map_query.apply(walls_m)
+        there_m = self.best.T_map_query.apply(walls_m)
         return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
 
     @property
+    def mass(self) -> float:
+        """Return the probability that it is at one of the places."""
+        return sum(place.mass for place in self.places)
+
+    @property
+    def numbered(self) -> list[tuple[int, Fit]]:
+        """Return all fits with the numbers of their places, from 0 on."""
+        return [(number, fit) for number, place in enumerate(self.places) for fit in place.fits]
+
+    @property
+    def hypotheses(self) -> tuple[Fit, ...]:
+        """Return the fits of all places, the likeliest place first."""
+        return tuple(fit for _, fit in self.numbered)
+
+    @property
+    def best(self) -> Fit | None:
+        """Return the first fit of the likeliest place; None: nothing fits."""
+        return self.places[0].fits[0] if self.places else None
+
+    @property
     def located(self) -> Fit | None:
-        """Return the hypothesis that is the answer; None unless one place is certain."""
-        return self.hypotheses[0] if self.status == "located" else None
+        """Return the fit that is the answer; None unless one place is certain."""
+        return self.best if self.status == "located" else None
 
     @property
     def session(self) -> str | None:
@@ -292,7 +305,7 @@ class Answer:
     @property
     def moment(self) -> Moment:
         """Return the answer as it stands, for the history of those after it."""
-        best = self.hypotheses[0] if self.hypotheses else None
+        best = self.best
         return Moment(
             stamp_ns=self.stamp_ns,
             path_m=self.path_m,
@@ -302,24 +315,20 @@ class Answer:
             confidence=self.confidence,
         )
 
-    def place(self, number: int) -> tuple[Fit, ...]:
-        """Return the hypotheses of one place."""
-        return tuple(h for h, of in zip(self.hypotheses, self.places, strict=True) if of == number)
-
     @property
-    def beside_map(self) -> OffMap | None:
+    def beside_map(self) -> Place | None:
         """Return where the robot is, beside the map, if that is more likely than all else together."""
         return next((away for away in self.off_map if away.mass >= POSTERIOR.likely), None)
 
     @property
     def line(self) -> AmbiguousLine | None:
         """Return the line on which an ambiguous base is likely to be; None: there is none."""
-        if self.status != "ambiguous" or not self.masses:
+        if self.status != "ambiguous" or not self.places:
             return None
-        firsts = [self.hypotheses[self.places.index(place)] for place in range(len(self.masses))]
-        here = [h.session_index == firsts[0].session_index for h in firsts]
-        bases = [h.T_map_query @ self.T_odom_base for h in compress(firsts, here)]
-        return ambiguous_line(bases, list(compress(self.masses, here)))
+        first = self.places[0].fits[0].session_index
+        here = [place for place in self.places if place.fits[0].session_index == first]
+        bases = [place.fits[0].T_map_query @ self.T_odom_base for place in here]
+        return ambiguous_line(bases, [place.mass for place in here])
 
     @property
     def label(self) -> Label:
@@ -349,7 +358,7 @@ class Answer:
         away = self.beside_map
         if away is None:
             return None
-        h = away.hypothesis
+        (h,) = away.fits
         return {
             "session": self.sessions[h.session_index],
             "frame": self.frame_of(h),
@@ -360,7 +369,6 @@ class Answer:
 
     def to_json(self) -> dict[str, Any]:
         """Return the answer as plain types: most of what `pc2grid relocalize --json` prints."""
-        excluded = None if self.excluded is None else self.excluded.to_json()
         about = {
             "status": self.status,
             "session": self.session,
@@ -377,18 +385,19 @@ class Answer:
                     "building": self.labels[h.session_index].building,
                     "floor": self.labels[h.session_index].floor,
                     "submap_id": submap_id if submap_id >= 0 else None,
-                    "place": place,
+                    "place": number,
                     **_planar(h.T_map_query @ self.T_odom_base),
                     "score": h.score,
                     "overlap": h.overlap,
                 }
-                for h, submap_id, place in zip(self.hypotheses, self.submap_ids, self.places, strict=True)
+                for (number, h), submap_id in zip(self.numbered, self.submap_ids, strict=True)
             ],
             "history": [moment.to_json() for moment in self.history],
             "line": self.line,
             "off_map": self.off_map_pose,
-            "prior": None if self.prior is None else {"status": self.prior, "excluded": excluded},
-            "in_space": None if self.in_space is None else self.in_space.to_json(),
+            "prior": self.prior
+            and {"status": self.prior, "excluded": self.excluded and self.excluded.to_json()},
+            "in_space": self.in_space and self.in_space.to_json(),
             "query": {"path_m": self.path_m, "stamp_ns": self.stamp_ns},
             "database": {"sessions": list(self.sessions)},
             "timing_ms": self.timing_ms,
@@ -478,21 +487,19 @@ def answer_in_building(answer: AnswerT, frames: Mapping[str, BuildingFrame]) -> 
     the session is known to lie in its building.
     """
     frame_of = [frames.get(name, _APART) for name in answer.sessions]
-    hypotheses = tuple(
-        _hypothesis(h, frame_of[h.session_index], answer.T_odom_base) for h in answer.hypotheses
-    )
+
+    def placed(fit: Fit) -> Fit:
+        frame, T_map_base = frame_of[fit.session_index], fit.T_map_query @ answer.T_odom_base
+        return replace(
+            fit,
+            T_map_query=frame.at(T_map_base.x, T_map_base.y) @ fit.T_map_query,
+            covariance=covariance_in_building(fit.covariance, T_map_base, frame),
+        )
+
     stated = replace(
         answer,
-        hypotheses=hypotheses,
-        off_map=tuple(
-            replace(
-                away,
-                hypothesis=_hypothesis(
-                    away.hypothesis, frame_of[away.hypothesis.session_index], answer.T_odom_base
-                ),
-            )
-            for away in answer.off_map
-        ),
+        places=fits_changed(answer.places, placed),
+        off_map=fits_changed(answer.off_map, placed),
         history=tuple(_moment(moment, frames) for moment in answer.history),
         excluded=answer.excluded and _moment(answer.excluded, frames),
         frames=tuple(frame.name or None for frame in frame_of),
@@ -500,6 +507,11 @@ def answer_in_building(answer: AnswerT, frames: Mapping[str, BuildingFrame]) -> 
     if stated.located is None or answer.in_space is None:
         return stated
     return replace(stated, in_space=_in_space(answer.in_space, frame_of[stated.located.session_index]))
+
+
+def fits_changed(places: Iterable[Place], change: Callable[[Fit], Fit]) -> tuple[Place, ...]:
+    """Return the places with each of their fits changed."""
+    return tuple(replace(place, fits=tuple(map(change, place.fits))) for place in places)
 
 
 def covariance_in_building(covariance: F64, T_session_base: SE2, frame: BuildingFrame) -> F64:
@@ -514,13 +526,6 @@ def covariance_in_building(covariance: F64, T_session_base: SE2, frame: Building
     J = np.eye(3)
     J[:2, 2] = T.y - there.y, there.x - T.x
     return np.asarray(turn @ covariance @ turn.T + J @ np.array(frame.covariance) @ J.T)
-
-
-def _hypothesis(hypothesis: Fit, frame: BuildingFrame, T_odom_base: SE2) -> Fit:
-    T_map_base = hypothesis.T_map_query @ T_odom_base
-    T_building_query = frame.at(T_map_base.x, T_map_base.y) @ hypothesis.T_map_query
-    covariance = covariance_in_building(hypothesis.covariance, T_map_base, frame)
-    return replace(hypothesis, T_map_query=T_building_query, covariance=covariance)
 
 
 def _moment(moment: Moment, frames: Mapping[str, BuildingFrame]) -> Moment:

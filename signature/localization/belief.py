@@ -42,7 +42,7 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.matching.score import Fit, score_fit
-from signature.localization.answer import Answer, OffMap, State
+from signature.localization.answer import Answer, Place, State
 from signature.localization.hypotheses import agree, more_exact
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR, PRIOR
@@ -53,82 +53,79 @@ from signature.localization.query import QueryMap
 class Masses:
     """The places that a robot may be at, with their masses, at one moment or carried on from it.
 
-    part : of the query, see `QueryMap.part`. places : each as it lies in the maps that show it.
+    part : of the query, see `QueryMap.part`. places : with when a map showed each last.
     """
 
     part: int
     path_m: float
     T_odom_base: SE2
-    places: tuple[tuple[OffMap, ...], ...] = ()
+    places: tuple[Place, ...] = ()
 
     @staticmethod
     def of(query: QueryMap, found: Answer) -> Masses:
         """Return the masses that a query gives, first place first. A place of which the map shows too little
         to align it stays where odometry has carried the robot."""
         beside = list(found.off_map)
-        places: list[tuple[OffMap, ...]] = []
-        for number, mass in enumerate(found.masses):
-            place = found.place(number)
+        places: list[Place] = []
+        for place in found.places:
+            first = place.fits[0]
             for k, away in enumerate(beside):
-                if place[0].overlap < POSTERIOR.shown and agree(query.T_odom_base, away.hypothesis, place[0]):
-                    places.append((replace(beside.pop(k), mass=away.mass + mass),))
+                if first.overlap < POSTERIOR.shown and agree(query.T_odom_base, away.fits[0], first):
+                    places.append(replace(beside.pop(k), mass=away.mass + place.mass))
                     break
             else:
-                places.append(tuple(_seen(h, mass, query) for h in place))
-        places += [(away,) for away in beside]
+                at, covariances = query.T_odom_base, tuple(fit.covariance for fit in place.fits)
+                places.append(replace(place, seen_m=query.path_m, T_odom_seen=at, seen=covariances))
         return Masses(
-            part=query.part, path_m=query.path_m, T_odom_base=query.T_odom_base, places=tuple(places)
+            part=query.part,
+            path_m=query.path_m,
+            T_odom_base=query.T_odom_base,
+            places=(*places, *beside),
         )
 
     def carried(self, now: QueryMap | Masses, odds: float = 1.0) -> Masses:
         """Return the same places where odometry has carried the robot since: with their covariances there,
         and their masses multiplied by `odds`."""
-        places = tuple(tuple(_carried(one, now, odds) for one in place) for place in self.places)
+        places = tuple(_carried(place, now, odds) for place in self.places)
         return replace(self, path_m=now.path_m, T_odom_base=now.T_odom_base, places=places)
 
     def mass(self, place: Iterable[Fit]) -> float:
         """Return the mass of the places that put the robot where one of these hypotheses does."""
         hypotheses = tuple(place)
         return sum(
-            known[0].mass
+            known.mass
             for known in self.places
-            if any(agree(self.T_odom_base, one.hypothesis, h) for one in known for h in hypotheses)
+            if any(agree(self.T_odom_base, fit, h) for fit in known.fits for h in hypotheses)
         )
 
     @property
     def most(self) -> Masses:
         """Return these masses with the likeliest place alone."""
-        return replace(self, places=(max(self.places, key=lambda place: place[0].mass),))
+        return replace(self, places=(max(self.places, key=lambda place: place.mass),))
 
     @property
     def beside(self) -> bool:
         """Whether the map shows too little of the first place."""
-        return self.places[0][0].seen_m < self.path_m
+        return self.places[0].seen_m < self.path_m
 
     def prior(self, place: Sequence[Fit]) -> float:
         """Return the prior of a place relative to that of "nowhere", as the masses are (`Belief.before`)."""
         shown = place[0].overlap >= POSTERIOR.shown
-        found = (known for known in self.places if shown or more_exact(place[0], known[0].hypothesis))
+        found = (known for known in self.places if shown or more_exact(place[0], known.fits[0]))
         return 1.0 + replace(self, places=tuple(found)).mass(place)
 
 
-def _seen(h: Fit, mass: float, query: QueryMap) -> OffMap:
-    """Return a place that the map shows now."""
-    return OffMap(
-        hypothesis=h, mass=mass, seen_m=query.path_m, T_odom_seen=query.T_odom_base, seen=h.covariance
-    )
-
-
-def _carried(place: OffMap, now: QueryMap | Masses, odds: float) -> OffMap:
-    """Return the place with the covariance of the base now, by the odometry since the map showed it."""
-    fit = place.hypothesis
-    begin, end = fit.T_map_query @ place.T_odom_seen, fit.T_map_query @ now.T_odom_base
-    J = np.eye(3)
-    J[:2, 2] = begin.y - end.y, end.x - begin.x
+def _carried(place: Place, now: QueryMap | Masses, odds: float) -> Place:
+    """Return the place with the covariances of the base now, by the odometry since the map showed it."""
     way_m = (now.path_m - place.seen_m) / PRIOR.sigmas
     drift = np.array([PRIOR.drift, PRIOR.drift, PRIOR.drift_rad_m]) * way_m
-    covariance = np.asarray(J @ place.seen @ J.T + np.diag(drift**2))
-    return replace(place, hypothesis=replace(fit, covariance=covariance), mass=odds * place.mass)
+    fits = []
+    for fit, seen in zip(place.fits, place.seen, strict=True):
+        begin, end = fit.T_map_query @ place.T_odom_seen, fit.T_map_query @ now.T_odom_base
+        J = np.eye(3)
+        J[:2, 2] = begin.y - end.y, end.x - begin.x
+        fits.append(replace(fit, covariance=np.asarray(J @ seen @ J.T + np.diag(drift**2))))
+    return replace(place, fits=tuple(fits), mass=odds * place.mass)
 
 
 def kept(query: QueryMap) -> float:
@@ -158,24 +155,23 @@ class Belief:
     @property
     def session_index(self) -> int | None:
         """Return the number of the map in which the robot is taken to be."""
-        return self._place.places[0][0].hypothesis.session_index if self._place else None
+        return self._place.places[0].fits[0].session_index if self._place else None
 
-    def before(self, index: MapIndex, query: QueryMap) -> tuple[Masses, tuple[OffMap, ...]]:
+    def before(self, index: MapIndex, query: QueryMap) -> tuple[Masses, tuple[Place, ...]]:
         """Return the masses before all scans of a query, carried on by odometry, and those of their places of
         which the map shows too little. Masses are relative to that of "nowhere"."""
         known = Masses(part=query.part, path_m=query.path_m, T_odom_base=query.T_odom_base)
         beside, share = [], kept(query)
         for past in self._before(query)[-1:]:
-            odds = share / (1.0 - share * sum(place[0].mass for place in past.places))
+            odds = share / (1.0 - share * sum(place.mass for place in past.places))
             known = past.carried(query, odds)
-            for place, *_ in known.places:
-                h = place.hypothesis
+            for place in known.places:
+                h = place.fits[0]
                 walls = index.maps_for(query)[h.session_index].walls
                 fit = score_fit(walls, query.walls, h.T_map_query, h.covariance)
                 if place.mass >= 1.0 - POSTERIOR.certain and fit.overlap < POSTERIOR.shown:
-                    beside.append(
-                        replace(place, hypothesis=replace(fit, session_index=h.session_index, row=h.row))
-                    )
+                    here = replace(fit, session_index=h.session_index, row=h.row)
+                    beside.append(replace(place, fits=(here,), seen=place.seen[:1]))
         return known, tuple(beside)
 
     def _before(self, query: QueryMap) -> list[Masses]:
@@ -221,4 +217,4 @@ def _mass_there(now: Masses, before: Masses | None) -> float:
     before."""
     if before is None or before.part != now.part:
         return 0.0
-    return now.mass(one.hypothesis for one in before.carried(now).places[0])
+    return now.mass(before.carried(now).places[0].fits)

@@ -14,17 +14,16 @@ from dataclasses import replace
 
 from pc2grid.matching.evidence import LEFT, NO_EVIDENCE, evidence_of, masses
 from pc2grid.matching.score import Fit
-from signature.localization.answer import Answer, OffMap, Status
+from signature.localization.answer import Answer, Place, Status
 from signature.localization.hypotheses import agree, more_exact, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap
 
-Place = tuple[Fit, ...]
-PriorOf = Callable[[Place], float]
-"""Prior of a place, relative to that of "not in this map"."""
+PriorOf = Callable[[Sequence[Fit]], float]
+"""Prior of a place by its fits, relative to that of "not in this map"."""
 
 
-def anywhere(place: Place) -> float:
+def anywhere(fits: Sequence[Fit]) -> float:
     """Return the prior of a place without any knowledge."""
     return 1.0
 
@@ -55,20 +54,17 @@ def judge(
     query, so it remains a rival. Otherwise any place in a small region, which has few rivals, would look
     certain.
     """
-    places, rivals = _allowed(index, query, places_of(index, query, hypotheses))
-    evidence_for = evidence_of([place[0] for place in places], query.likeness, rivals)
-    known = list(zip(places, map(prior_of, places), evidence_for, strict=True))
+    groups, rivals = _allowed(index, query, by_place(index, query, hypotheses))
+    evidence_for = evidence_of([fits[0] for fits in groups], query.likeness, rivals)
+    known = list(zip(groups, map(prior_of, groups), evidence_for, strict=True))
     known.sort(key=lambda each: -math.log(each[1]) - each[2].log_odds())
     mass = masses([each[2] for each in known], [each[1] for each in known]).tolist()
-    ordered = tuple(h for place, *_ in known for h in place)
     in_the_map = any(each[2].log_odds() + math.log(each[1]) >= 0.0 for each in known[:1])
     status: Status = "ambiguous" if in_the_map else "not_found"
     return Answer(
         status="located" if sum(mass[:1]) >= index.config.accept else status,
         confidence=sum(mass[:1]),
-        hypotheses=ordered,
-        places=tuple(number for number, (place, *_) in enumerate(known) for _ in place),
-        masses=tuple(mass),
+        places=tuple(Place(fits=fits, mass=share) for (fits, *_), share in zip(known, mass, strict=True)),
         evidence=known[0][2] if known else NO_EVIDENCE,
         stamp_ns=query.stamp_ns,
         path_m=query.path_m,
@@ -81,7 +77,7 @@ def judge(
 
 
 def weighed(
-    answer: Answer, prior_of: PriorOf, off_map: Sequence[OffMap], slipped: float, accept: float
+    answer: Answer, prior_of: PriorOf, off_map: Sequence[Place], slipped: float, accept: float
 ) -> Answer:
     """Return the answer weighed against what else may be: places that the map does not show, and that the
     robot was carried away or tracking slipped. Of a place beside the map that the map puts where the query
@@ -89,30 +85,32 @@ def weighed(
 
     off_map : with masses relative to "nowhere". slipped : relative to the first place.
     """
-    first, at = answer.place(0), answer.T_odom_base
+    first, at = answer.places[0].fits if answer.places else (), answer.T_odom_base
     odds = 1.0
     if answer.confidence:
-        odds = prior_of(first) * math.exp(answer.evidence.log_odds()) / answer.masses[0]
+        odds = prior_of(first) * math.exp(answer.evidence.log_odds()) / answer.places[0].mass
     share = 1.0 / (odds * (1.0 + slipped * answer.confidence) + sum(away.mass for away in off_map))
-    masses = tuple(mass * odds * share for mass in answer.masses)
+    places = tuple(replace(place, mass=place.mass * odds * share) for place in answer.places)
     here = [
         away
         for away in off_map
-        if any(agree(at, away.hypothesis, h) and more_exact(h, away.hypothesis) for h in first)
+        if any(agree(at, away.fits[0], h) and more_exact(h, away.fits[0]) for h in first)
     ]
-    confidence = sum(masses[:1]) + share * sum(away.mass for away in here)
+    confidence = sum(place.mass for place in places[:1]) + share * sum(away.mass for away in here)
     return replace(
         answer,
         status="ambiguous" if answer.located and confidence < accept else answer.status,
         confidence=confidence,
-        masses=masses,
+        places=places,
         off_map=tuple(
             replace(away, mass=away.mass * share) for away in sorted(off_map, key=lambda away: -away.mass)
         ),
     )
 
 
-def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple[list[Place], list[Fit]]:
+def _allowed(
+    index: MapIndex, query: QueryMap, places: Sequence[tuple[Fit, ...]]
+) -> tuple[list[tuple[Fit, ...]], list[Fit]]:
     """Return the places that the prior of the index allows, and the fits of the others, which show what wrong
     places score."""
     inside = [tuple(h for h in place if index.allows(query, h)) for place in places]
@@ -120,10 +118,10 @@ def _allowed(index: MapIndex, query: QueryMap, places: Sequence[Place]) -> tuple
     return [place for place in inside if place], excluded
 
 
-def places_of(index: MapIndex, query: QueryMap, hypotheses: Iterable[Fit]) -> list[Place]:
+def by_place(index: MapIndex, query: QueryMap, hypotheses: Iterable[Fit]) -> list[tuple[Fit, ...]]:
     """Return the hypotheses by place, best first. Hypotheses in the maps of joined sessions are one place if
     they put the query at one pose of their building; a place has one hypothesis a session."""
-    places: list[Place] = []
+    places: list[tuple[Fit, ...]] = []
     for h in hypotheses:
         for number, place in enumerate(places):
             elsewhere = h.session_index not in {other.session_index for other in place}

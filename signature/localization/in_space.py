@@ -105,15 +105,15 @@ def _compared(
     the likeliest place. The places with the most mass are compared, until no other one can change what is
     certain."""
     fits: dict[int, SpatialFit | Unfit] = {}
-    best, masses = 0, np.array(answer.masses)
-    for place in range(min(len(masses), SPACE.places)):
-        h = answer.hypotheses[answer.places.index(place)]
-        fit = fit_in_space(query, surface_of(h.session_index), h)
+    planar = [place.mass for place in answer.places]
+    best, masses = 0, np.array(planar)
+    for number, place in enumerate(answer.places[: SPACE.places]):
+        fit = fit_in_space(query, surface_of(place.fits[0].session_index), place.fits[0])
         if log_odds_in_space(fit):
-            fits[place] = fit
-            masses, best = masses_of(answer.masses, fits)
+            fits[number] = fit
+            masses, best = masses_of(planar, fits)
         # The places that are left can agree as well as the best one: is that certain all the same?
-        left = sum(answer.masses[place + 1 :]) / max(answer.masses[best], np.finfo(float).tiny)
+        left = sum(planar[number + 1 :]) / max(planar[best], np.finfo(float).tiny)
         if best in fits and masses[best] >= accept * (1.0 + masses[best] * left):
             break
     return fits, masses, best
@@ -186,22 +186,18 @@ def _settled(
     """Return the answer with new masses (P,) of its places, `best` first, at the pose that its points
     give."""
     located = masses[best] >= accept
-    order = sorted(
-        range(len(answer.places)), key=lambda k: (answer.places[k] != best, -masses[answer.places[k]])
-    )
-    hypotheses = [answer.hypotheses[k] for k in order]
+    order = sorted(range(len(masses)), key=lambda k: (k != best, -masses[k]))
+    places = [replace(answer.places[k], mass=float(masses[k])) for k in order]
     if located and in_space is not None:
         planar = np.ix_((0, 1, 5), (0, 1, 5))
         T_map_query = SE2.from_matrix(in_space.T_map_base) @ SE2.from_matrix(T_odom_base).inverse()
-        covariance = in_space.covariance[planar]
-        hypotheses[0] = replace(hypotheses[0], T_map_query=T_map_query, covariance=covariance)
-    numbers = {k: n for n, k in enumerate(dict.fromkeys(answer.places[k] for k in order))}
+        first, *others = places[0].fits
+        first = replace(first, T_map_query=T_map_query, covariance=in_space.covariance[planar])
+        places[0] = replace(places[0], fits=(first, *others))
     likely: Status = "ambiguous" if masses[best] >= 1.0 - masses.sum() else "not_found"
     return replace(
         answer,
         status="located" if located else likely,
         confidence=float(masses[best]),
-        hypotheses=tuple(hypotheses),
-        places=tuple(numbers[answer.places[k]] for k in order),
-        masses=tuple(masses[list(numbers)].tolist()),
+        places=tuple(places),
     )

@@ -30,7 +30,7 @@ from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
-from signature.localization.answer import Answer, Moment, State
+from signature.localization.answer import Answer, Moment, State, fits_changed
 from signature.localization.belief import Belief, Masses
 from signature.localization.decision import PriorOf, decide, judge, weighed
 from signature.localization.hypotheses import HYPOTHESES, moved_to_origin
@@ -185,15 +185,15 @@ class Localizer:
         clock.lap("search")
         answer = _with_prior(index, seen, answer, found)
         slipped, later = 0.0, None
-        if answer.hypotheses:
-            best = answer.hypotheses[0]
+        best = answer.best
+        if best is not None:
             walls = index.maps_for(seen)[best.session_index].walls
             slipped, scans = slip_of(seen, best, walls, index.config.step_m)
             if scans and query is self.query:
                 later = self.search(query.since(scans), index=index)
                 slipped *= _elsewhere(*later, best)
         answer = weighed(answer, prior_of, off_map, slipped, index.config.accept)
-        if later and slipped * answer.masses[0] >= POSTERIOR.likely:
+        if later and slipped * answer.places[0].mass >= POSTERIOR.likely:
             return later
         answer = _in_map(answer, self._belief.session_index)
         clock.lap("decide")
@@ -224,27 +224,26 @@ def _with_prior(index: MapIndex, query: QueryMap, answer: Answer, found: tuple[F
         return answer
     if not index.prior_applies(query):
         return replace(answer, prior="ahead" if index.region.is_ahead(query) else "lapsed")
-    best = judge(index.whole, query, () if answer.located else found)
-    excluded = best.hypotheses and not index.allows(query, best.hypotheses[0])
-    return replace(answer, prior="used", excluded=best.moment if excluded else None)
+    everywhere = judge(index.whole, query, () if answer.located else found)
+    excluded = everywhere.best is not None and not index.allows(query, everywhere.best)
+    return replace(answer, prior="used", excluded=everywhere.moment if excluded else None)
 
 
 def _elsewhere(query: Query, alone: Answer, place: Fit) -> float:
     """Return the mass of all that a query can be but one place, as a multiple of the mass of "nowhere"."""
-    first = sum(alone.masses[:1])
-    if not first:
+    if not alone.places or not alone.places[0].mass:
         return 1.0
     here = Masses.of(query.map(), alone).mass([place])
-    return 1.0 + math.exp(alone.evidence.log_odds()) / first * (sum(alone.masses) - here)
+    return 1.0 + math.exp(alone.evidence.log_odds()) / alone.places[0].mass * (alone.mass - here)
 
 
 def _in_map(answer: Answer, session_index: int | None) -> Answer:
     """Return the answer in which, of each place, the hypothesis in the map of one session comes first."""
-    ordered = sorted(
-        zip(answer.places, answer.hypotheses, strict=True),
-        key=lambda each: (each[0], each[1].session_index != session_index),
-    )
-    return replace(answer, hypotheses=tuple(h for _, h in ordered))
+    places = [
+        replace(place, fits=tuple(sorted(place.fits, key=lambda fit: fit.session_index != session_index)))
+        for place in answer.places
+    ]
+    return replace(answer, places=tuple(places))
 
 
 @one_blas_thread
@@ -267,21 +266,21 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     clock.lap("describe")
     answer, _ = decide(index, query)
     clock.lap("search")
-    at_origin = tuple(
-        replace(h, covariance=moved_to_origin(h.covariance, h.T_map_query, query.T_odom_base))
-        for h in answer.hypotheses
-    )
-    return _told(index, replace(answer, hypotheses=at_origin, T_odom_base=SE2()), (), clock)
+
+    def at_origin(fit: Fit) -> Fit:
+        return replace(fit, covariance=moved_to_origin(fit.covariance, fit.T_map_query, query.T_odom_base))
+
+    places = fits_changed(answer.places, at_origin)
+    return _told(index, replace(answer, places=places, T_odom_base=SE2()), (), clock)
 
 
 def _told(index: MapIndex, answer: Answer, history: Iterable[Moment], clock: Clock) -> Answer:
     """Return an answer, of which nothing is decided any more, with what shows it."""
-    ids = index.places.table.submap_id
-    best = answer.hypotheses[:1]
+    ids, best = index.places.table.submap_id, answer.best
     return replace(
         answer,
         submap_ids=tuple(int(ids[h.row]) if h.row >= 0 else -1 for h in answer.hypotheses),
-        map=index.grids[best[0].session_index] if best else None,
+        map=None if best is None else index.grids[best.session_index],
         history=(*history, answer.moment),
         timing_ms=dict(clock.total_ms),
     )

@@ -148,14 +148,14 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
         lambda place: 1.0 / (1.0 - kept(seen)) if any(near.allows(seen, h) for h in place) else 1.0,
     )
     apart = [
-        (place, *_apart(T_map_base, h.T_map_query @ answer.T_odom_base))
-        for h, place in zip(answer.hypotheses, answer.places, strict=True)
-        if near.allows(seen, h)
+        (number, *_apart(T_map_base, fit.T_map_query @ answer.T_odom_base))
+        for number, fit in answer.numbered
+        if near.allows(seen, fit)
     ]
-    here = {place for place, *off in apart if _within_tolerance(*off)}
-    mass_here = sum(answer.masses[place] for place in here)
+    here = {number for number, *off in apart if _within_tolerance(*off)}
+    mass_here = sum(answer.places[number].mass for number in here)
     # Where the map knows too little to contradict the pose, "at no place of this map" does not exclude it.
-    at_most = mass_here if log_likelihood(believed) < 0.0 else 1.0 - sum(answer.masses) + mass_here
+    at_most = mass_here if log_likelihood(believed) < 0.0 else 1.0 - answer.mass + mass_here
     status = _status(mass_here, at_most, index.config.accept)
     _, off_m, off_rad = apart[0] if apart else (None, None, None)
     return PoseCheck(

@@ -13,7 +13,7 @@ from pc2grid.matching.score import Fit
 from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
 from signature.database.maintenance import store
-from signature.localization.answer import Answer
+from signature.localization.answer import Answer, Place
 from tests.helpers.databases import make_entry
 
 LONGEST_LINE = 200
@@ -40,8 +40,9 @@ def answer(status: str, confidence: float) -> Answer:
         status=status,  # type: ignore[arg-type]
         stamp_ns=0,
         confidence=confidence,
-        hypotheses=() if status == "not_found" else (best, other),
-        places=() if status == "not_found" else (0, 1),
+        places=()
+        if status == "not_found"
+        else (Place(fits=(best,), mass=0.0), Place(fits=(other,), mass=0.0)),
         history=(),
         T_odom_base=SE2(1.0, 0.0, 0.0),
         path_m=3.25,

@@ -385,9 +385,9 @@ def _warn_of_missing_points(found: Found, database: SubmapDatabase) -> None:
 
 def _warn_of_unjoined(answer: Answer, database: SubmapDatabase) -> None:
     """Warn that the two best places are in sessions that are not joined: they may be one place."""
-    if answer.status != "ambiguous" or 1 not in answer.places:
+    if answer.status != "ambiguous" or len(answer.places) < 2:
         return
-    a, b = sorted(answer.hypotheses[answer.places.index(place)].session_index for place in (0, 1))
+    a, b = sorted(place.fits[0].session_index for place in answer.places[:2])
     one, other = answer.sessions[a], answer.sessions[b]
     frames = database.frames()
     joined = one in frames and other in frames and frames[one].name == frames[other].name
@@ -403,17 +403,17 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
     """Return the answer in a few lines; of a map as the query, the pose is that of its frame."""
     after = "" if is_map else f" after {answer.path_m:.1f} m"
     near = " near the given one" if answer.prior == "used" else ""
-    if answer.T_map_base is not None:
+    if answer.located is not None and answer.T_map_base is not None:
         of_what = "for the map's own frame" if is_map else "at the last scan"
         travel = "" if is_map else f", after {answer.path_m:.1f} m of travel"
         return (
-            f"located in {_named(answer, answer.hypotheses[0])}:{_frame(answer)}"
+            f"located in {_named(answer, answer.located)}:{_frame(answer)}"
             f" {pose_text(answer.T_map_base)} {of_what},"
             f" confidence {probability(answer.confidence)}{travel}" + _in_space(answer)
         )
     lines = [
         {
-            "ambiguous": f"ambiguous: {len(set(answer.places))} places fit{after}",
+            "ambiguous": f"ambiguous: {len(answer.places)} places fit{after}",
             "not_found": f"not found: no place{near} fits well enough{after}",
         }[answer.status]
     ]

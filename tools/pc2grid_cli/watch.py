@@ -273,7 +273,7 @@ def as_text(answer: Answer, published: list[str]) -> str:
     begin = f"after {answer.path_m:.1f} m: {str(answer.state).replace('_', ' the ')}"
     away = answer.beside_map
     if away is not None:
-        fit = away.hypothesis
+        (fit,) = away.fits
         sigmas = np.sqrt(np.diag(fit.covariance))
         return one_line(
             f"{begin} of {answer.sessions[fit.session_index]}: by odometry"
@@ -281,7 +281,7 @@ def as_text(answer: Answer, published: list[str]) -> str:
             f" {math.degrees(sigmas[2]):.1f} deg, confidence {probability(away.mass)}"
         )
     if answer.T_map_base is None:
-        places = len(set(answer.places))
+        places = len(answer.places)
         return f"{begin}, {places} places fit" if answer.status == "ambiguous" else f"{begin}, no place fits"
     told = f", published {' and '.join(published)}" if published else ""
     begin += "" if answer.is_told else ", perhaps"

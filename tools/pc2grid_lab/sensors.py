@@ -309,8 +309,8 @@ def located_rows(
         T_map_base = T_plan_map.inverse() @ SE2(*session.T_world_base[count - 1].tolist())
         T_map_query = T_map_base @ answer.T_odom_base.inverse()
         right, error_m = False, None
-        if answer.hypotheses:
-            pose = answer.hypotheses[0].T_map_query @ answer.T_odom_base
+        if answer.best is not None:
+            pose = answer.best.T_map_query @ answer.T_odom_base
             right, error_m = is_right(pose, T_map_base, JUDGEMENT.right_m)
         mapped = own and score_fit(index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
         yield QueryRow(

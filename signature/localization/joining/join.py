@@ -204,7 +204,7 @@ UNJOINED = Join(
     rivals=0,
     evidence=NO_EVIDENCE,
 )
-"""Two sessions whose graphs propose nothing."""
+"""Two sessions of which no piece proposes a transform."""
 
 
 def join_maps(

@@ -470,9 +470,9 @@ def why_here(answer: Answer, database: SubmapDatabase) -> dict[str, Any] | None:
     hypothesis and for each view `log_ratio`, and [query, map] of each of the three signatures of
     `DrawnSignatures`.
     """
-    if not answer.hypotheses or not answer.views_m:
+    if not answer.places or not answer.views_m:
         return None
-    rival = next((k for k, place in enumerate(answer.places) if place != answer.places[0]), None)
+    rival = len(answer.places[0].fits) if len(answer.places) > 1 else None
     sight_m = database.config().partition.radius_m
     compared = []
     for number in (0,) if rival is None else (0, rival):

@@ -140,8 +140,7 @@ def draw_answer(
 
     truth_m : (N, 2) the query's true path in the map frame, if known.
     """
-    best = answer.hypotheses[0] if answer.hypotheses else None
-    session = answer.sessions[best.session_index if best else 0]
+    session = answer.sessions[answer.best.session_index if answer.best else 0]
     way = database.trajectory(session)
     write_figure(answer_figure(answer, database.grid(session), poses, way=way, truth_m=truth_m), path)
 
@@ -161,7 +160,7 @@ def answer_figure(
     grid : the map. poses : the query in its own frame, empty for a map. way : path of the map's robot, empty
     of a map that somebody else made.
     """
-    best = answer.hypotheses[0] if answer.hypotheses else None
+    best = answer.best
     session = answer.sessions[best.session_index if best else 0]
     compared = None
     if best is not None:

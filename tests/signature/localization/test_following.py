@@ -16,7 +16,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config, RelocalizeConfig
 from signature.localization import localizer as follower_module
-from signature.localization.answer import Answer, OffMap
+from signature.localization.answer import Answer, Place, fits_changed
 from signature.localization.belief import Belief
 from signature.localization.decision import anywhere, decide, weighed
 from signature.localization.localizer import Follower, Localizer
@@ -74,12 +74,12 @@ def test_what_odometry_says_counts_for_the_place_where_walls_say_it_more_exactly
         T_map_query=SE2(aside_m, 0.0, 0.0) @ first.T_map_query,
         covariance=np.eye(3) * sigma_m**2,
     )
-    away = OffMap(
-        hypothesis=moved,
+    away = Place(
+        fits=(moved,),
         mass=1e3 * math.exp(verdict.evidence.log_odds()),
         seen_m=0.0,
         T_odom_seen=query.T_odom_base,
-        seen=moved.covariance,
+        seen=(moved.covariance,),
     )
     assert verdict.status == "located"
     told = weighed(verdict, anywhere, [away], 0.0, 0.75)
@@ -93,7 +93,7 @@ def test_a_place_is_the_less_certain_the_likelier_tracking_slipped() -> None:
     assert verdict.status == "located" and told.status == "ambiguous"
     assert (
         told.confidence
-        == told.masses[0]
+        == told.places[0].mass
         == pytest.approx(verdict.confidence / (1.0 + 2.0 * verdict.confidence))
     )
 
@@ -175,8 +175,8 @@ def test_a_place_is_given_up_when_it_is_as_certain_that_the_robot_is_not_there()
 
 def said(answer: Answer, mass: float, *, located: bool = True) -> Answer:
     """An answer whose first place has a mass; whether that is where it is located."""
-    masses = (mass, *[0.0] * (len(answer.masses) - 1))
-    return replace(answer, masses=masses, confidence=mass, status="located" if located else "not_found")
+    places = tuple(replace(place, mass=0.0 if n else mass) for n, place in enumerate(answer.places))
+    return replace(answer, places=places, confidence=mass, status="located" if located else "not_found")
 
 
 def test_a_place_is_told_when_a_second_search_agrees() -> None:
@@ -184,8 +184,11 @@ def test_a_place_is_told_when_a_second_search_agrees() -> None:
     localizer = Localizer(OFFICE)
     estimates_of(localizer, list(stretch(FIRST)))
     query, here = localizer.query.map(), localizer.answer()
-    moved = [replace(h, T_map_query=SE2(3.0, 0.0, 0.0) @ h.T_map_query) for h in here.hypotheses]
-    there = replace(here, hypotheses=tuple(moved))
+    moved = SE2(3.0, 0.0, 0.0)
+    there = replace(
+        here,
+        places=fits_changed(here.places, lambda fit: replace(fit, T_map_query=moved @ fit.T_map_query)),
+    )
     for looks, expected in (
         ([(here, 0.9), (here, 0.85), (here, 0.8)], ["searching", "searching", "located"]),
         ([(here, 0.9), (there, 0.95), (there, 0.95)], ["searching", "searching", "located"]),
@@ -272,7 +275,7 @@ def test_one_place_in_two_sessions_is_one_if_they_are_joined() -> None:
     estimates = estimates_of(Localizer(both), list(stretch(FIRST)))
     assert {estimate.state for estimate, _ in estimates} == {"searching"}
     last = estimates[-1][0]
-    assert last.status == "ambiguous" and last.masses[:2] == (last.masses[0],) * 2
+    assert last.status == "ambiguous" and last.places[0].mass == last.places[1].mass
     both = building({"monday": office(), "tuesday": office()}, joined={"monday": HERE, "tuesday": HERE})
     estimates = estimates_of(Localizer(both), list(stretch(FIRST)))
     assert len({estimate.session for estimate, _ in estimates if estimate.state == "located"}) == 1

@@ -16,7 +16,7 @@ from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_sp
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, PointMap
 from signature.database import Label
-from signature.localization.answer import Answer
+from signature.localization.answer import Answer, Place
 from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.in_space import SPACE, log_odds_in_space, masses_of, settle_in_space
 from signature.localization.localizer import Follower, Localizer
@@ -40,7 +40,7 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
         query.add(registered)
     last, T_room_base = scans[-1]
     T_room_odom = SE2.from_matrix(T_room_base @ invert_pose(last.T_session_base))
-    hypotheses = tuple(
+    fits = (
         Fit(
             T_map_query=SE2(x_m, 0.0, 0.0) @ T_room_odom,
             forward=0.9,
@@ -58,9 +58,7 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
     verdict = Answer(
         status="located" if alone else "ambiguous",
         confidence=mass,
-        hypotheses=hypotheses,
-        places=tuple(range(len(hypotheses))),
-        masses=(mass,) * len(hypotheses),
+        places=tuple(Place(fits=(fit,), mass=mass) for fit in fits),
         evidence=NO_EVIDENCE,
         stamp_ns=0,
         path_m=0.0,
@@ -96,10 +94,16 @@ def test_twins_in_the_plane_are_told_apart_by_their_height(
     assert in_space is not None and in_space.status == "agrees"
     base = base_of(settled, query)
     assert abs(base.x - x_m - 3.3) < 1.5
-    assert settled.places == (0, 1)
+    assert len(settled.places) == 2
     # The planar pose is that of space; the floor is at z = 0, and the base on it.
     assert base.x == pytest.approx(in_space.T_map_base[0, 3])
     assert in_space.T_map_base[2, 3] == pytest.approx(0.0, abs=0.02)
+
+
+def with_masses(verdict: Answer, *masses: float) -> Answer:
+    """The verdict, located at the first place, with other masses."""
+    places = [replace(place, mass=mass) for place, mass in zip(verdict.places, masses, strict=True)]
+    return replace(verdict, status="located", confidence=masses[0], places=tuple(places))
 
 
 def test_equal_twins_stay_ambiguous(points: MapSurface) -> None:
@@ -108,7 +112,7 @@ def test_equal_twins_stay_ambiguous(points: MapSurface) -> None:
     settled = settle_in_space(verdict, query, lambda _: points, accept=0.9)
     in_space = settled.in_space
     assert settled.status == "ambiguous" and in_space is None
-    assert settled.masses == pytest.approx((0.5, 0.5), abs=0.01)
+    assert [place.mass for place in settled.places] == pytest.approx([0.5, 0.5], abs=0.01)
 
 
 def test_furniture_does_not_tell_twins_apart() -> None:
@@ -120,14 +124,16 @@ def test_furniture_does_not_tell_twins_apart() -> None:
     assert fits[1].on - fits[0].on > 0.05
     assert fits[1].compared.patches_over(fits[0].compared) == 0
     settled = settle_in_space(verdict, query, lambda _: points, accept=0.9)
-    assert settled.status == "ambiguous" and settled.masses == pytest.approx((0.5, 0.5), abs=0.01)
+    assert settled.status == "ambiguous"
+    assert [place.mass for place in settled.places] == pytest.approx([0.5, 0.5], abs=0.01)
 
 
 def test_a_located_pose_is_refined_and_becomes_surer(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     first = verdict.hypotheses[0]
     moved = replace(first, T_map_query=first.T_map_query @ SE2(0.1, -0.05, 0.03))
-    settled = settle_in_space(replace(verdict, hypotheses=(moved,)), query, lambda _: points, accept=0.9)
+    believed = replace(verdict, places=(replace(verdict.places[0], fits=(moved,)),))
+    settled = settle_in_space(believed, query, lambda _: points, accept=0.9)
     at = settled.in_space
     assert settled.status == "located" and settled.confidence > 0.99
     # Not surer than the map.
@@ -151,10 +157,12 @@ def test_a_place_that_the_points_contradict_is_turned_down() -> None:
 def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: MapSurface) -> None:
     """Its mass in the plane is small, as if its things had been moved; a wrong place has more."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M + 3.0)
-    unsure = replace(verdict, status="not_found", confidence=0.2, places=(1, 0), masses=(0.2, 0.02))
+    right, wrong = verdict.places
+    places = (replace(wrong, mass=0.2), replace(right, mass=0.02))
+    unsure = replace(verdict, status="not_found", confidence=0.2, places=places)
     settled = settle_in_space(unsure, query, lambda _: points, accept=0.9)
     in_space = settled.in_space
-    assert settled.status == "located" and settled.places == (0, 1)
+    assert settled.status == "located" and settled.places[0].mass > settled.places[1].mass
     assert in_space is not None and in_space.status == "agrees"
     assert base_of(settled, query).x < 4.9
 
@@ -191,7 +199,7 @@ def test_what_stands_in_the_way_contradicts_more_than_what_is_gone(points: MapSu
 def test_a_place_that_is_turned_down_is_not_kept_for_one_that_is_not_compared() -> None:
     """The map ends before the second place, so that is not compared and stays as unlikely as it was."""
     query, verdict = ask(HEIGHTS_M[0], 0.0, 60.0)
-    believed = replace(verdict, status="located", confidence=0.95, masses=(0.95, 0.01))
+    believed = with_masses(verdict, 0.95, 0.01)
     wrong = other_walls()
     settled = settle_in_space(believed, query, lambda _: wrong, accept=0.9)
     in_space = settled.in_space
@@ -208,7 +216,7 @@ def test_only_what_can_matter_is_compared(points: MapSurface) -> None:
         return points
 
     query, alone = ask(HEIGHTS_M[0], 0.0, APART_M)
-    likely = replace(alone, status="located", confidence=0.95, masses=(0.95, 0.01))
+    likely = with_masses(alone, 0.95, 0.01)
     assert settle_in_space(likely, query, points_of, accept=0.9).status == "located"
     assert len(asked) == 1
     settle_in_space(alone, query, points_of, accept=0.9)
