@@ -124,6 +124,8 @@ READ_PART: dict[str, Callable[[Any], object]] = {
     "graph": lambda database: database.graph("monday"),
     "points": lambda database: database.points("monday"),
     "seen": lambda database: database.seen_places("monday"),
+    "submaps": lambda database: (list(database.submaps("monday")), database.signatures()),
+    "frame": lambda database: database.frames(),
 }
 """What reads a part of the session "monday"."""
 

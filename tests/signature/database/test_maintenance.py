@@ -72,23 +72,20 @@ def test_a_session_split_off_is_as_it_was(place: str | Path, tmp_path: Path) -> 
 
 
 def test_what_is_refused_changes_nothing(place: str | Path, tmp_path: Path) -> None:
-    before = everything(place)
-    with pytest.raises(DatabaseError, match="holds a session 'tuesday' already"):
-        maintenance.rename(place, "monday", "tuesday")
-    with pytest.raises(DatabaseError, match="the name of a session is empty"):
-        maintenance.rename(place, "monday", " ")
-    with pytest.raises(DatabaseError, match="named twice"):
-        maintenance.split(place, ["monday"], place, overwrite=True)
-    for act in (
-        lambda: maintenance.rename(place, "friday", "sunday"),
-        lambda: maintenance.remove(place, ["monday", "friday"]),
-        lambda: maintenance.split(place, ["monday", "friday"], tmp_path / "no.submaps"),
+    before, none = everything(place), tmp_path / "no.submaps"
+    for act, words in (
+        (lambda: maintenance.rename(place, "monday", "tuesday"), "holds a session 'tuesday' already"),
+        (lambda: maintenance.rename(place, "monday", " "), "the name of a session is empty"),
+        (lambda: maintenance.split(place, ["monday"], place, overwrite=True), "named twice"),
+        (lambda: maintenance.rename(place, "friday", "sunday"), "no session 'friday'"),
+        (lambda: maintenance.remove(place, ["monday", "friday"]), "no session 'friday'"),
+        (lambda: maintenance.split(place, ["monday", "friday"], none), "no session 'friday'"),
+        (lambda: maintenance.place(place, {"monday": THERE, "friday": HERE}), "no session 'friday'"),
     ):
-        with pytest.raises(DatabaseError, match="no session 'friday'") as caught:
+        with pytest.raises(DatabaseError, match=words) as caught:
             act()
-        assert caught.value.hint == "there are: 'monday', 'tuesday'"
-    assert everything(place) == before
-    assert not (tmp_path / "no.submaps").exists()
+        assert "friday" not in words or caught.value.hint == "there are: 'monday', 'tuesday'"
+    assert everything(place) == before and not none.exists() and not frames(place)
 
 
 def test_what_is_no_database_is_not_changed(tmp_path: Path) -> None:
@@ -136,17 +133,8 @@ def test_what_was_not_said_contradicts_nothing(a: Label, b: Label, contradict: b
 def test_convert_takes_labels_and_relocalize_names_them(tmp_path: Path) -> None:
     save_map(ROOM, tmp_path / "room")
     made = tmp_path / "d.submaps"
-    arguments = [
-        "convert",
-        str(tmp_path / "room.yaml"),
-        "-o",
-        str(made),
-        "--building",
-        "hall",
-        "--floor",
-        "2",
-    ]
-    assert CliRunner().invoke(app, arguments).exit_code == 0
+    words = f"convert {tmp_path}/room.yaml -o {made} --building hall --floor 2"
+    assert CliRunner().invoke(app, words.split()).exit_code == 0
     with open_database(made) as database:
         answer = locate_map(ROOM, MapIndex.of(database, Config()))
     assert answer.label == Label(building="hall", floor="2")
@@ -215,17 +203,7 @@ def test_frames_go_with_their_sessions(joined: str | Path, tmp_path: Path) -> No
     assert frames(tmp_path / "merged.submaps") == {"tuesday": THERE}
 
 
-def test_a_name_that_is_not_there_changes_nothing(joined: str | Path) -> None:
-    with pytest.raises(DatabaseError, match="no session 'friday'"):
-        maintenance.place(joined, {"monday": THERE, "friday": HERE})
-    assert frames(joined) == FRAMES
-
-
-def test_damage_is_found_and_can_be_left_out(joined: str | Path, tmp_path: Path) -> None:
+def test_a_damaged_frame_costs_no_other(joined: str | Path, tmp_path: Path) -> None:
     sql(joined, "UPDATE part SET crc32 = crc32 + 1 WHERE session_id = 2 AND name = 'frame'")
-    (problem,) = maintenance.check(joined)
-    assert problem.where == "frame of session 'tuesday'"
-    with open_database(joined) as database, pytest.raises(DatabaseCorrupt):
-        database.frames()
     maintenance.copy(joined, tmp_path / "copy.submaps", recover=True)
     assert frames(tmp_path / "copy.submaps") == {"monday": HERE}
