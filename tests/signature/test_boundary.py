@@ -55,20 +55,8 @@ def histogram(cells: np.ndarray, config: SignatureConfig = CONFIG) -> np.ndarray
     return boundary_histogram(points, 8.0, RESOLUTION_M, config)
 
 
-def brute_force(points: np.ndarray, config: SignatureConfig) -> np.ndarray:
-    """Eq. 1-2 pair by pair, exactly: bin k holds k * bin <= d < (k + 1) * bin, in whole cells squared."""
-    bins = boundary_bins(8.0, config)
-    counts = np.zeros(bins)
-    edge_cells = config.boundary_bin_m / RESOLUTION_M
-    edges2 = np.array([round((k * edge_cells) ** 2, 6) for k in range(1, bins)])
-    for i, (r, c) in enumerate(points):
-        for s, d in points[i + 1 :]:
-            counts[np.searchsorted(edges2, (r - s) ** 2 + (c - d) ** 2, side="right")] += 1
-    return counts / max(counts.sum(), 1)
-
-
 def test_number_of_bins_is_that_of_the_paper() -> None:
-    assert boundary_bins(8.0, CONFIG) == 80
+    assert boundary_bins(8.0, CONFIG) == freespace_bins(8.0, CONFIG) == 80
     assert boundary_bins(8.0, SignatureConfig(boundary_bin_m=0.3)) == 54
 
 
@@ -87,20 +75,7 @@ def test_the_longest_distance_counts_in_the_last_bin() -> None:
 def test_three_corners_by_hand() -> None:
     # 3-4-5 triangle in metres: distances 3, 4 and 5 m, a third each.
     found = boundary_histogram(np.array([[0, 0], [0, 60], [80, 0]]), 8.0, RESOLUTION_M, CONFIG)
-    assert {k: round(float(found[k]), 6) for k in np.flatnonzero(found)} == {
-        15: 0.333333,
-        20: 0.333333,
-        25: 0.333333,
-    }
-
-
-@given(seed=st.integers(0, 10_000), count=st.integers(0, 60), bin_m=st.sampled_from([0.1, 0.2, 0.3, 0.25]))
-@settings(max_examples=40, deadline=None)
-def test_matches_brute_force(seed: int, count: int, bin_m: float) -> None:
-    config = SignatureConfig(boundary_bin_m=bin_m)
-    points = np.random.default_rng(seed).integers(0, 226, (count, 2))
-    found = boundary_histogram(points, 8.0, RESOLUTION_M, config)
-    assert found == pytest.approx(brute_force(points, config), abs=1e-6)
+    assert found[[15, 20, 25]] == pytest.approx(1 / 3) and np.count_nonzero(found) == 3
 
 
 @given(
@@ -113,7 +88,7 @@ def test_matches_brute_force(seed: int, count: int, bin_m: float) -> None:
 def test_the_compiled_counts_of_cells_are_those_of_their_distances(
     seed: int, count: int, cell_m: float, bin_m: float
 ) -> None:
-    """Of squares in whole cells as of distances as floating point, bit for bit; some are longer than 2 r."""
+    """Eq. 1-2; of squares in whole cells as of distances, bit for bit; some are longer than 2 r."""
     config = SignatureConfig(boundary_bin_m=bin_m)
     points = np.random.default_rng(seed).integers(0, 400, (count, 2))
     bins = boundary_bins(8.0, config)
@@ -176,10 +151,6 @@ def joined(nodes: np.ndarray, occupied: np.ndarray, config: SignatureConfig = CO
 def adjacency(nodes: np.ndarray, occupied: np.ndarray, config: SignatureConfig = CONFIG) -> np.ndarray:
     """The matrix A of III-C 2, in metres; inf where two nodes are not joined."""
     return nx.to_numpy_array(joined(nodes, occupied, config), weight="length_m", nonedge=np.inf)
-
-
-def test_number_of_freespace_bins_is_that_of_the_paper() -> None:
-    assert freespace_bins(8.0, CONFIG) == 80
 
 
 @given(seed=st.integers(0, 500))

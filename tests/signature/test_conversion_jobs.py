@@ -284,7 +284,8 @@ def test_an_interrupted_conversion_keeps_finished_jobs_and_continues(folder: Pat
     while not asleep.exists():
         assert process.poll() is None
         time.sleep(0.05)
-    assert _sessions(database) == 2
+    with open_database(database) as opened:
+        assert len(opened.sessions()) == 2
     os.killpg(process.pid, signal.SIGINT)
     _, err = process.communicate(timeout=60)
     assert process.returncode == 130
@@ -294,11 +295,6 @@ def test_an_interrupted_conversion_keeps_finished_jobs_and_continues(folder: Pat
     assert "of 4 are stored; the same command continues from there" in lines[0]
     assert run("convert", *inputs(folder, *NAMES), "-o", database) == 0
     assert database.read_bytes() == whole.read_bytes()
-
-
-def _sessions(database: Path) -> int:
-    with open_database(database) as opened:
-        return len(opened.sessions())
 
 
 def test_convert_export_and_maintain_a_fleets_database(

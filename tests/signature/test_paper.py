@@ -87,13 +87,9 @@ def test_a_submap_is_most_similar_to_itself(config: SignatureConfig) -> None:
 
 
 def test_alike_submaps_are_nearer_than_others() -> None:
-    rooms = table(
-        *(
-            describe(submap_of(cells))
-            for cells in (l_shape(), disc(4.0), cross(6.0, 2.0), rectangle(8.0, 5.0))
-        )
-    )
-    for i, cells in enumerate((l_shape(), disc(4.0), cross(6.0, 2.0), rectangle(8.0, 5.0))):
+    shapes = l_shape(), disc(4.0), cross(6.0, 2.0), rectangle(8.0, 5.0)
+    rooms = table(*(describe(submap_of(cells)) for cells in shapes))
+    for i, cells in enumerate(shapes):
         turned = describe(submap_of(np.rot90(cells).copy()))
         assert int(np.argmin(distances(turned, rooms))) == i
 
@@ -132,12 +128,8 @@ def test_empty_tables_and_wrong_shapes() -> None:
     assert distances(room, SignatureTable.of([], np.empty((0, 2)))).shape == (0,)
     with pytest.raises(ValueError, match="bins"):
         histogram_distance(np.ones((1, 80), np.float32) / 80, np.ones((1, 60), np.float32) / 60, CONFIG)
+    rows = {"boundary": np.zeros((2, 80)), "freespace": np.zeros((1, 80)), "symmetry": np.zeros((2, 2))}
     with pytest.raises(ValueError, match="rows"):
         SignatureTable(
-            boundary=np.zeros((2, 80), np.float32),
-            freespace=np.zeros((1, 80), np.float32),
-            symmetry=np.zeros((2, 2), np.float32),
-            session_index=np.zeros(2, np.int32),
-            submap_id=np.zeros(2, np.int32),
-            center_m=np.zeros((2, 2)),
+            **rows, session_index=np.zeros(2, int), submap_id=np.zeros(2, int), center_m=np.zeros((2, 2))
         )

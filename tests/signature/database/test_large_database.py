@@ -49,6 +49,13 @@ def seen() -> dict[str, SeenPlaces]:
     }
 
 
+def large(maps: Mapping[str, OccupancyGrid]) -> MapIndex:
+    """All maps as a database gives them: with their areas, and what is seen in them."""
+    areas_m2 = {name: grid.free_m2 for name, grid in MAPS.items()}
+    made = whole().places.table, whole().made_with, Config()
+    return MapIndex(maps, *made, areas_m2=areas_m2, stored=seen().get)
+
+
 class _Counted(Mapping[str, OccupancyGrid]):
     """The maps, and which of them were asked for."""
 
@@ -74,14 +81,11 @@ def few_places(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_few_maps_are_read_and_the_answer_is_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
-    monkeypatch.setattr(places, "AT_ONCE_M2", 2 * max(areas_m2.values()))
+    monkeypatch.setattr(places, "AT_ONCE_M2", 2 * max(grid.free_m2 for grid in MAPS.values()))
     maps = _Counted()
-    large = MapIndex(
-        maps, whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
-    )
+    index = large(maps)
     assert maps.read == []
-    answer = locate_map(PART, large)
+    answer = locate_map(PART, index)
     assert 1 <= len(maps.read) <= 3 and len(set(maps.read)) == len(maps.read) and "office" in maps.read
     monkeypatch.undo()
     expected = locate_map(PART, whole())
@@ -95,23 +99,17 @@ def test_a_map_larger_than_what_is_searched_at_once_is_still_searched(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(places, "AT_ONCE_M2", 1.0)
-    areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
-    index = MapIndex(
-        _Counted(), whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
-    )
+    index = large(_Counted())
     assert locate_map(PART, index).session == "office"
     rows = index.places.order(query_views(), (0.0, 0.0), index.config).rows
     assert set(index.places.table.session_index[rows].tolist()) == {list(MAPS).index("office")}
 
 
 def test_the_maps_that_were_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
-    areas_m2 = {name: float(grid.free.sum()) * 0.05**2 for name, grid in MAPS.items()}
     monkeypatch.setattr(places, "AT_ONCE_M2", 1.0)
-    monkeypatch.setattr(map_index, "AT_ONCE_M2", 0.25 * sum(areas_m2.values()))
+    monkeypatch.setattr(map_index, "AT_ONCE_M2", 0.25 * sum(grid.free_m2 for grid in MAPS.values()))
     maps = _Counted()
-    index = MapIndex(
-        maps, whole().places.table, whole().made_with, Config(), areas_m2=areas_m2, stored=seen().get
-    )
+    index = large(maps)
     for number in (0, 1, 0, 2, 0, 1):  # two of seven are kept
         assert index.grids[number] is not None
     assert maps.read == ["other0", "other1", "other2", "other1"]

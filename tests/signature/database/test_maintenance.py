@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from pc2grid.errors import DatabaseCorrupt, DatabaseError, NotADatabase, OutputError
+from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from pc2grid.geometry import SE2
 from pc2grid.io.maps import save_map
 from pc2grid_cli.main import app
