@@ -111,11 +111,9 @@ def test_type_checkers_see_the_public_names_where_they_are_loaded_from(package: 
     assert homes == seen
 
 
-@pytest.mark.parametrize("package", ["pc2grid", "signature"])
-def test_importing_a_package_loads_no_library(package: str) -> None:
+def test_importing_the_packages_loads_no_library() -> None:
     code = (
-        "import sys\n"
-        f"import {package}\n"
+        "import sys, pc2grid, signature\n"
         "print([m for m in ('numpy', 'scipy', 'pydantic', 'cv2', 'numba', 'networkx', 'open3d', 'mcap')"
         " if m in sys.modules])"
     )

@@ -49,6 +49,21 @@ def office() -> OccupancyGrid:
     return plan(20, 14, walls)
 
 
+OTHER = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+"""Another building."""
+BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
+TWINS = plan(12, 6, [(6, 0, 6, 6), *BENT, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in BENT]])
+"""Two rooms side by side that are alike: (x, y) of the one is (x + 6, y) of the other."""
+
+
+def changed_part() -> OccupancyGrid:
+    """A part of the office, without the wall from (7, 1) to (7, 3), and with a box."""
+    cells = cut(office(), 4.0, 0.0, 15.0, 12.0).cells.copy()
+    cells[18:62, 58:63] = 0
+    cells[140:148, 110:118] = 100
+    return OccupancyGrid(cells=cells, resolution_m=RESOLUTION_M, origin_m=(0.0, 0.0))
+
+
 def with_tables(grid: OccupancyGrid) -> OccupancyGrid:
     """The map by a lidar that has seen over and under tables of 0.6 x 1 m, which stand wherever the floor is
     free, 0.4 m apart and from walls."""

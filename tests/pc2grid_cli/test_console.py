@@ -232,16 +232,17 @@ def test_a_group_alone_shows_its_help(
 
 
 @pytest.mark.parametrize("shell", ["bash", "zsh", "fish"])
-def test_completion(shell: str) -> None:
+def test_completion(shell: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     environment = {
         "_PC2GRID_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_ARGS": "pc2grid reloc",
         "_TYPER_COMPLETE_FISH_ACTION": "get-args", "COMP_WORDS": "pc2grid reloc", "COMP_CWORD": "1",
     }  # fmt: skip
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tools'}", **environment},
-    )  # fmt: skip
-    assert "relocalize" in done.stdout
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys, "argv", ["pc2grid"])
+    with pytest.raises(SystemExit) as end:
+        main.main()
+    assert end.value.code == 0 and "relocalize" in capsys.readouterr().out
 
 
 def run_until_stopped(command: str) -> subprocess.CompletedProcess[str]:
@@ -363,7 +364,6 @@ MEASURING = {
     "compare recordings own": b"drive.mcap",
 }
 """Print how long it took, so their bytes differ from run to run; with some of these bytes."""
-_NIGHTLY = [command for command in MEASURING if {"paper", "scale", "recordings"} & {*command.split()}]
 
 
 @shared_folder("metre_folder")
@@ -436,7 +436,7 @@ def test_a_terminal_changes_nothing(command: str, work: Path, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(
-    "command", [pytest.param(c, marks=[pytest.mark.nightly] if c in _NIGHTLY else []) for c in MEASURING]
+    "command", [pytest.param(c, marks=[pytest.mark.nightly] if c != "demo" else []) for c in MEASURING]
 )
 def test_a_terminal_takes_nothing_away(command: str, work: Path) -> None:
     with terminal() as stderr:

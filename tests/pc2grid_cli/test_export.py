@@ -23,28 +23,24 @@ from pc2grid.settings import ReadConfig
 from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid_cli.main import app
 from signature.config import Config
-from signature.sessions import add_sessions, provenance
 from tests.helpers.building_clouds import room_cloud
-from tests.helpers.session_maps import LOOPS, session, way
+from tests.helpers.session_maps import LOOPS, session, stored, way
 from tests.helpers.simulated_drives import office
 
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("export") / "office.submaps"
-    config = Config()
-    entry = (session("office", office(), way(), LOOPS), provenance(Path("office.mcap"), "a" * 64, config))
-    add_sessions(path, [entry], config, keep=False)
-    return path
+    return stored(path, session("office", office(), way(), LOOPS))
 
 
 def test_points_of_a_session_are_exported_instead_of_its_walls(tmp_path: Path) -> None:
-    cloud, stored = tmp_path / "room.ply", tmp_path / "room.submaps"
+    cloud, room = tmp_path / "room.ply", tmp_path / "room.submaps"
     write_cloud(cloud, room_cloud(1.7))
     for options in (("--no-points",), ("--set", "projection.points_voxel_m=0.1")):
-        made = ["convert", str(cloud), "-o", str(stored), "--force", *options]
+        made = ["convert", str(cloud), "-o", str(room), "--force", *options]
         assert CliRunner().invoke(app, made, catch_exceptions=False).exit_code == 0
-        said = export(stored, "--cloud", tmp_path / "out.ply", "--mcap", tmp_path / "out.mcap", "--force")
+        said = export(room, "--cloud", tmp_path / "out.ply", "--mcap", tmp_path / "out.mcap", "--force")
         (found,) = building_points(tmp_path / "out.ply", ReadConfig())
         with (tmp_path / "out.mcap").open("rb") as file:
             topics = {c.topic for c in make_reader(file).get_summary().channels.values()}
@@ -180,8 +176,7 @@ def test_an_unknown_suffix_is_refused(tmp_path: Path) -> None:
 
 def test_a_trajectory_that_is_not_there_stops_everything(tmp_path: Path) -> None:
     nowhere = Trajectory(stamps_ns=np.empty(0), T_session_base=np.empty((0, 4, 4)))
-    entry = (session("plan", office(), nowhere), provenance(Path("plan.yaml"), "b" * 64, Config()))
-    add_sessions(tmp_path / "p.submaps", [entry], Config(), keep=False)
+    stored(tmp_path / "p.submaps", session("plan", office(), nowhere))
     for option, name in (("--trajectory", "t.tum"), ("--g2o", "p.g2o")):
         options = ["--map", str(tmp_path / "m"), option, str(tmp_path / name)]
         done = CliRunner().invoke(app, ["export", str(tmp_path / "p.submaps"), *options])

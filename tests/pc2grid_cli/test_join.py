@@ -101,7 +101,7 @@ def test_one_map_of_the_building_is_exported() -> None:
     assert whole.is_free(19.0, 7.0) and whole.is_free(1.0, 7.0)
     run("export joined.submaps --map alone --session east --frame session")
     assert np.array_equal(load_map(Path("alone.yaml")).cells, load_map(Path("east.yaml")).cells)
-    with pytest.raises(DatabaseError, match="holds 2 sessions") as refused:
+    with pytest.raises(DatabaseError, match="holds 2 sessions: west, east") as refused:
         run("export b.submaps --map no")
     assert "db join" in str(refused.value.hint)
     with pytest.raises(DatabaseError, match="--g2o is of one session") as refused:

@@ -64,7 +64,7 @@ COMMANDS = [
     ("relocalize", "relocalize drive.mcap -d b.submaps --set relocalize.accept=0.9999999", 4),
     ("relocalize", "relocalize drive.mcap -d b.submaps --near 99 99 1", 4),
     ("relocalize-check", "relocalize drive.mcap -d b.submaps --check 99 99 0", 4),
-    ("export", "export b.submaps --map out --report out.html", 0),
+    ("export", "export b.submaps --map out --plot out.png --mcap out.mcap", 0),
     ("export", "export b.submaps --report out.html", 0),
     ("db-info", "db info b.submaps", 0),
     ("db-check", "db check b.submaps", 0),
@@ -157,11 +157,7 @@ def test_every_command_shows_an_example_that_parses(name: str, command: Any) -> 
 
 
 @pytest.mark.parametrize(
-    ("command", "option", "values"),
-    [
-        (Simulate, "sensor", SensorKind),
-        (Export, "map_of", MapOf),
-    ],
+    ("command", "option", "values"), [(Simulate, "sensor", SensorKind), (Export, "map_of", MapOf)]
 )
 def test_an_option_takes_all_values_of_its_type(command: Any, option: str, values: Any) -> None:
     """Their types are in modules that help does not load: the declarations repeat the values."""

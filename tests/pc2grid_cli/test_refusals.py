@@ -122,6 +122,7 @@ REFUSED: list[tuple[str, int, type[Exception] | None, tuple[str, ...]]] = [
     (f"{EXPORT} --report a.pdf", 1, OutputError, ("a.pdf: --report",)),
     (f"{EXPORT} --g2o nowhere/a.g2o", 1, OutputError, ("a.g2o: cannot write: no folder nowhere",)),
     (f"{EXPORT} --map nowhere/a", 1, OutputError, ("a.yaml: cannot write: no folder nowhere",)),
+    (f"{EXPORT} --map office", 1, OutputError, ("office.yaml: exists already", "--force")),
     (f"{EXPORT} --plot taken.png", 1, OutputError, ("taken.png: exists already",)),
     (f"{EXPORT} --plot folder", 1, OutputError, ("folder: is a folder",)),
     (f"{LOCATE} --trajectory way.csv", 1, OutputError, ("way.csv: --trajectory",)),

@@ -6,7 +6,7 @@ import json
 import math
 import threading
 import urllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -62,12 +62,13 @@ def messages(path: Path) -> dict[str, list[Any]]:
 def test_a_recording_gives_nav2_and_foxglove_the_same_pose(
     office_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pose, mcap, page = tmp_path / "pose.json", tmp_path / "answer.mcap", tmp_path / "page.html"
-    options = ("--initialpose", pose, "--output", mcap, "--report", page, "--json")
-    code, out, err = called(
-        capsys, "relocalize", office_folder / "drive.mcap", "-d", office_folder / "b.submaps", *options
-    )
+    pose, mcap, page, plot = (tmp_path / f"a.{suffix}" for suffix in ("json", "mcap", "html", "png"))
+    options = ("--initialpose", pose, "--output", mcap, "--report", page, "--plot", plot, "--json")
+    database = office_folder / "b.submaps"
+    before = database.read_bytes()
+    code, out, err = called(capsys, "relocalize", office_folder / "drive.mcap", "-d", database, *options)
     assert code == 0, err
+    assert database.read_bytes() == before and plot.read_bytes().startswith(b"\x89PNG")
     answer, initial = json.loads(out)["pose"], json.loads(pose.read_text())
     assert initial["header"]["frame_id"] == "map"
     stamp = initial["header"]["stamp"]
@@ -127,17 +128,9 @@ def test_no_answer_no_pose_but_a_page(
     office_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pose, page = tmp_path / "pose.json", tmp_path / "page.html"
-    options = ("--duration", "1", "--set", "relocalize.accept=0.999999", "--initialpose", pose)
-    code, _, err = called(
-        capsys,
-        "relocalize",
-        office_folder / "drive.mcap",
-        "-d",
-        office_folder / "b.submaps",
-        *options,
-        "--report",
-        page,
-    )
+    unsure = ("--duration", "1", "--set", "relocalize.accept=0.999999")
+    where = ("relocalize", office_folder / "drive.mcap", "-d", office_folder / "b.submaps")
+    code, _, err = called(capsys, *where, *unsure, "--initialpose", pose, "--report", page)
     assert code == 4 and not pose.exists() and "not written" in err
     assert '"status":"located"' not in page.read_text(encoding="utf-8")
 
@@ -301,50 +294,47 @@ def test_watch_locates_in_space(expected: tuple[Path, Expected]) -> None:
     assert math.dist((last["pose"]["x"], last["pose"]["y"]), (in_map.x, in_map.y)) < 2 * RESOLUTION_M
 
 
-def test_relocalize(expected: tuple[Path, Expected]) -> None:
-    folder, last = expected
-    said = run("relocalize", folder / "tuesday.mcap", "-d", folder / "monday.submaps", "--json")
-    document = json.loads(said)
-    assert_same(document, last)
-    assert document["history"][-1]["x"] == pytest.approx(last["pose"]["x"], abs=1e-9)
+def by_the_command(log: Path, database: Path, _: Path) -> Any:
+    document = json.loads(run("relocalize", log, "-d", database, "--json"))
+    assert document["history"][-1]["x"] == pytest.approx(document["pose"]["x"], abs=1e-9)
+    return document
 
 
-def test_relocalize_of_the_library(expected: tuple[Path, Expected]) -> None:
-    folder, last = expected
-    answer = pc2grid.relocalize(folder / "tuesday.mcap", folder / "monday.submaps")
-    assert_same(answer.to_json(), last)
+def by_a_function(log: Path, database: Path, _: Path) -> Any:
+    return pc2grid.relocalize(log, database).to_json()
 
 
-def test_view(expected: tuple[Path, Expected], tmp_path: Path) -> None:
-    folder, last = expected
-    recording = (folder / "tuesday.mcap").read_bytes()
-    with open_database(folder / "monday.submaps") as database:
-        locator = Locator(database, Config())
-        server = ViewServer(0, locator.events, tmp_path, locator.work, most_bytes=len(recording))
-        thread = threading.Thread(target=server.serve_forever, daemon=True)
-        thread.start()
-        request = urllib.request.Request(f"{server.url}locate?name=tuesday.mcap", data=recording)
+def by_view(log: Path, database: Path, uploads: Path) -> Any:
+    recording = log.read_bytes()
+    with open_database(database) as opened:
+        locator = Locator(opened, Config())
+        server = ViewServer(0, locator.events, uploads, locator.work, most_bytes=len(recording))
+        request = urllib.request.Request(f"{server.url}locate?name={log.name}", data=recording)
+        serving = threading.Thread(target=server.serve_forever, daemon=True)
+        serving.start()
         try:
             with urllib.request.urlopen(request) as reply:
-                document = json.loads(reply.read())
+                return json.loads(reply.read())
         finally:
             server.shutdown()
-            thread.join()
+            serving.join()
             server.stop()
-    assert_same(document, last)
 
 
-def test_localizer_of_the_library(expected: tuple[Path, Expected]) -> None:
-    folder, last = expected
-    with (
-        open_database(folder / "monday.submaps") as database,
-        pc2grid.open_log(folder / "tuesday.mcap") as log,
-    ):
-        config = database.config()
-        localizer = pc2grid.Localizer(pc2grid.MapIndex.of(database, config))
-        for registered, planar_scan in pc2grid.follow(log.scans(), config):
+def by_a_localizer(log: Path, database: Path, _: Path) -> Any:
+    with open_database(database) as opened, pc2grid.open_log(log) as scans:
+        localizer = pc2grid.Localizer(pc2grid.MapIndex.of(opened, opened.config()))
+        for registered, planar_scan in pc2grid.follow(scans.scans(), opened.config()):
             localizer.add(registered, planar_scan)
-        assert_same(localizer.answer().to_json(), last)
+        return localizer.answer().to_json()
+
+
+@pytest.mark.parametrize("ask", [by_the_command, by_a_function, by_view, by_a_localizer])
+def test_by_every_door_comes_the_same_answer(
+    ask: Callable[..., Any], expected: tuple[Path, Expected], tmp_path: Path
+) -> None:
+    folder, last = expected
+    assert_same(ask(folder / "tuesday.mcap", folder / "monday.submaps", tmp_path), last)
 
 
 def relocalize_at_once(folder: Path, *words: object) -> Any:
@@ -354,8 +344,8 @@ def relocalize_at_once(folder: Path, *words: object) -> Any:
     return json.loads(CliRunner().invoke(app, [str(word) for word in (*begin, *at_once, *words)]).stdout)
 
 
-def test_check_of_the_right_pose(expected: tuple[Path, Expected]) -> None:
-    folder, _ = expected
+def test_a_right_pose_is_fine_and_a_wrong_one_tells_the_answer(expected: tuple[Path, Expected]) -> None:
+    folder, watched = expected
     last = relocalize_at_once(folder)
     pose = last["pose"]
     document = relocalize_at_once(folder, "--check", pose["x"], pose["y"], math.degrees(pose["yaw"]))
@@ -364,13 +354,8 @@ def test_check_of_the_right_pose(expected: tuple[Path, Expected]) -> None:
     assert document["probability"] == pytest.approx(last["confidence"], abs=1e-5)
     # The best place near the pose is found in space, too: it is the pose itself.
     assert document["off_m"] == pytest.approx(0.0, abs=1e-6)
-
-
-def test_check_of_a_wrong_pose_tells_the_answer(expected: tuple[Path, Expected]) -> None:
-    folder, watched = expected
-    last = relocalize_at_once(folder)
-    document = relocalize_at_once(folder, "--check", last["pose"]["x"] + 4.0, last["pose"]["y"], 0.0)
+    document = relocalize_at_once(folder, "--check", pose["x"] + 4.0, pose["y"], 0.0)
     assert document["status"] == "lost"
-    assert document["better"]["pose"] == rounded(last["pose"]) == rounded(watched["pose"])
+    assert document["better"]["pose"] == rounded(pose) == rounded(watched["pose"])
     # The pose that is checked was believed, so a little of the mass is there.
     assert document["better"]["confidence"] == pytest.approx(last["confidence"], abs=1e-3)

@@ -525,48 +525,48 @@ BEGUN = {
 }  # fmt: skip
 
 
+def begun(desk: Path, serve: Callable[..., Served], **moment: str) -> tuple[Served, Events]:
+    """A server of the page of the office, which was told how a search begins."""
+    events = Events()
+    served = serve(events=events)
+    with open_database(desk / "office.submaps") as database:
+        served.server.pages[""] = live_page(database)
+    for kind, told in BEGUN.items():
+        events.publish(kind, {**told, **moment} if kind == "moment" else told)
+    return served, events
+
+
 @pytest.mark.parametrize("end", [None, "located", "ambiguous", "error"])
 def test_a_browser_shows_what_happens(
     desk: Path, serve: Callable[..., Served], browser: Browser, end: str | None
 ) -> None:
     unsure = end in ("ambiguous", "error")
-    with open_database(desk / "office.submaps") as database:
-        events = Events()
-        served = serve(events=events)
-        served.server.pages[""] = live_page(database)
-        for kind, told in BEGUN.items():
-            changed = {"status": "ambiguous"} if kind == "moment" and unsure else {}
-            events.publish(kind, {**told, **changed} if isinstance(told, dict) else told)
-        if end == "error":
-            events.publish("end", {"source": "run.mcap", "error": "stopped", "hint": None})
-        elif end:
-            events.publish("end", {"source": "run.mcap", "status": end, "confidence": 0.97})
-        browser.show(served.url)
-        said = {None: "after 2.0 m", "error": "stopped"}.get(end, f"run.mcap: {end}")
-        browser.wait(f"$('told').textContent.startsWith('{said}')")
-        if unsure:
-            browser.evaluate("new Promise(seen => setTimeout(seen, 100))")
-            assert browser.evaluate("$('trace')") is None, "an arrow at a place that is no answer"
-            return
-        if end is None:
-            words = "after 2.0 m: located, confidence 0.97; best place: office, x 5.00 m, y 7.00 m"
-            assert browser.evaluate("$('told').textContent") == words
-        browser.wait("!!$('trace')")
-        # The path of the query, laid on the map: it began 2 m to the left of where the robot is.
-        assert "M3 7 4 7 5 7" in browser.evaluate("$('trace').outerHTML")
+    served, events = begun(desk, serve, **({"status": "ambiguous"} if unsure else {}))
+    if end == "error":
+        events.publish("end", {"source": "run.mcap", "error": "stopped", "hint": None})
+    elif end:
+        events.publish("end", {"source": "run.mcap", "status": end, "confidence": 0.97})
+    browser.show(served.url)
+    said = {None: "after 2.0 m", "error": "stopped"}.get(end, f"run.mcap: {end}")
+    browser.wait(f"$('told').textContent.startsWith('{said}')")
+    if unsure:
+        browser.evaluate("new Promise(seen => setTimeout(seen, 100))")
+        assert browser.evaluate("$('trace')") is None, "an arrow at a place that is no answer"
+        return
+    if end is None:
+        words = "after 2.0 m: located, confidence 0.97; best place: office, x 5.00 m, y 7.00 m"
+        assert browser.evaluate("$('told').textContent") == words
+    browser.wait("!!$('trace')")
+    # The path of the query, laid on the map: it began 2 m to the left of where the robot is.
+    assert "M3 7 4 7 5 7" in browser.evaluate("$('trace').outerHTML")
 
 
 @pytest.mark.parametrize(("size", "dark"), [(DESK, False), (DESK, True), (PHONE, False), (PHONE, True)])
 def test_the_page_is_whole_in_light_in_dark_and_on_a_phone(
     desk: Path, serve: Callable[..., Served], browser: Browser, size: tuple[int, int], dark: bool
 ) -> None:
-    with open_database(desk / "office.submaps") as database:
-        events = Events()
-        served = serve(events=events)
-        served.server.pages[""] = live_page(database)
-        for kind, told in BEGUN.items():
-            events.publish(kind, told)
-        browser.show(served.url, size, dark=dark)
-        browser.wait("!!$('trace')")
-        assert browser.evaluate("innerWidth") == size[0]
-        assert browser.faults() == [] and browser.complaints == []
+    served, _ = begun(desk, serve)
+    browser.show(served.url, size, dark=dark)
+    browser.wait("!!$('trace')")
+    assert browser.evaluate("innerWidth") == size[0]
+    assert browser.faults() == [] and browser.complaints == []

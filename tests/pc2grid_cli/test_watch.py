@@ -71,36 +71,25 @@ def answer_of(looks: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
 
 @pytest.fixture(scope="module")
 def expected(folder: Path) -> list[tuple[Any, ...]]:
-    """The answer for the finished file, in a process of its own."""
-    words = ["watch", "tuesday.mcap", "-d", "plan.submaps", "--json"]
-    run = subprocess.run(
-        [sys.executable, "-c", "from pc2grid_cli.main import main; main()", *words],
-        cwd=folder,
-        stdout=subprocess.PIPE,
-        check=True,
-    )
-    return answer_of([json.loads(line) for line in run.stdout.splitlines()])
+    """The answer for the finished file."""
+    words = ["watch", str(folder / "tuesday.mcap"), "-d", str(folder / "plan.submaps"), "--json"]
+    said = CliRunner().invoke(app, words, catch_exceptions=False).stdout
+    return answer_of([json.loads(line) for line in said.splitlines()])
 
 
-def test_a_robot_is_located_where_it_is(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, looks, _ = watch(capsys, "tuesday.mcap")
-    assert code == 0
-    last = looks[-1]
-    for look in looks:
-        jsonschema.validate(look, closed(schema("watch")))
-    assert (last["state"], last["map"]["session"]) == ("located", "plan")
-    x, y = truth_at(here, last["stamp_ns"])
-    assert math.dist((last["pose"]["x"], last["pose"]["y"]), (x, y)) < 0.1
-    assert last["confidence"] >= 0.9
-    assert len(last["map"]["digest"]) == 64
-
-
-def test_every_scan_of_a_recording_is_used_and_it_says_the_same_each_time(
+def test_a_robot_is_located_where_it_is_each_time(
     here: Path, capsys: pytest.CaptureFixture[str], expected: list[tuple[Any, ...]]
 ) -> None:
+    """Every scan of a recording is used."""
     code, looks, _ = watch(capsys, "tuesday.mcap")
     assert code == 0
     assert answer_of(looks) == expected
+    for look in looks:
+        jsonschema.validate(look, closed(schema("watch")))
+    last = looks[-1]
+    assert (last["state"], last["map"]["session"]) == ("located", "plan")
+    assert math.dist((last["pose"]["x"], last["pose"]["y"]), truth_at(here, last["stamp_ns"])) < 0.1
+    assert last["confidence"] >= 0.9 and len(last["map"]["digest"]) == 64
     with open_log("tuesday.mcap") as log:
         first_ns = next(log.scans()).stamp_ns
         assert looks[-1]["scans"] == sum(scan.stamp_ns <= looks[-1]["stamp_ns"] for scan in log.scans())

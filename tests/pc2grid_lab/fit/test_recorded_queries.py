@@ -8,9 +8,7 @@ from pc2grid_lab.fit.queries import KnownWindow, rows
 from pc2grid_lab.recordings.catalogue import Catalogue
 from signature.config import Config
 from signature.localization.query import Query
-from tests.helpers.simulated_drives import building, drive, office, plan
-
-OTHER = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
+from tests.helpers.simulated_drives import OTHER, building, drive, office
 
 
 def test_each_question_says_what_tells_for_its_places() -> None:

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from click.testing import Result
 from typer.testing import CliRunner
 
 from pc2grid.errors import ConfigError, MapFileError
@@ -59,6 +60,11 @@ def few_resamples(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(BestMatches, "half_widths", partialmethod(BestMatches.half_widths, resamples=4))
 
 
+def compare(maps: Path, out: Path, words: str) -> Result:
+    where = ("--maps", str(maps), "--out", str(out), "--jobs", "1")
+    return runner.invoke(app, [*COMPARE, *where, *words.split()])
+
+
 def test_published_tables_are_whole() -> None:
     assert all(set(row) == set(MAPS) for level in TABLE_3 for row in level.values())
     assert [len(level) for level in TABLE_3] == [7, 7, 7]
@@ -71,9 +77,8 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
     maps: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(console, "_LINE_EVERY_S", 0.0)
-    arguments = [*COMPARE, "--maps", str(maps), "--out", str(tmp_path), "--queries", "4", "--jobs", "1"]
-    arguments += ["--offset", "0.5", "--methods", "proposed", "--methods", "as_used_here"]
-    first = runner.invoke(app, arguments)
+    words = "--queries 4 --offset 0.5 --methods proposed --methods as_used_here"
+    first = compare(maps, tmp_path, words)
     assert first.exit_code == 0, first.output
     assert re.search(r"^pc2grid: \d+ cells of the tables: \d+%", first.stderr, re.MULTILINE)
     document = json.loads((tmp_path / "results.json").read_text())
@@ -82,7 +87,7 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
     assert [c["published"]["auc"] for c in document["cells"] if c["level"] == 2] == [0.955, 0.955]
     assert (tmp_path / "figure-9-offset-0.5.png").read_bytes().startswith(b"\x89PNG")
     written = {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").rglob("*.pickle")}
-    second = runner.invoke(app, arguments)
+    second = compare(maps, tmp_path, words)
     assert second.exit_code == 0, second.output
     assert len(written) == 10
     assert written == {path: path.stat().st_mtime_ns for path in (tmp_path / "cells").rglob("*.pickle")}
@@ -95,11 +100,10 @@ def test_a_run_writes_its_cells_and_the_next_one_only_reads_them(
 
 
 def test_the_tables_answer_one_question_after_the_other(maps: Path, tmp_path: Path) -> None:
-    arguments = [*COMPARE, "--maps", str(maps), "--out", str(tmp_path), "--queries", "3", "--jobs", "1"]
-    arguments += ["--offset", "1.0", "--ablation"]
+    words = "--queries 3 --offset 1.0 --ablation"
     for method in ("unlearned", "proposed_ln_bc", "sdf", "proposed"):
-        arguments += ["--methods", method]
-    shown = runner.invoke(app, arguments).stdout
+        words += f" --methods {method}"
+    shown = compare(maps, tmp_path, words).stdout
     titles = ["does it hold", "Table IV", "its rivals", "What beats it", "What each signature adds"]
     assert sorted(titles, key=shown.index) == titles
     parts = re.split("|".join(titles), shown)
@@ -123,12 +127,8 @@ def test_of_several_maps_the_mean_difference_has_a_narrower_interval(maps: Path,
     ]
     mean_auc = 1000 * np.mean([TABLE_3[0]["proposed"][cell.task.map_name].auc for cell in cells])
     ours = 1000 * cell.measures.auc
-    assert _cell(cells, "auc").split() == [
-        f"{mean_auc:.0f}",
-        f"{ours:.0f}",
-        f"{ours - mean_auc:+.0f}",
-        "+-10",
-    ]
+    expected = [f"{mean_auc:.0f}", f"{ours:.0f}", f"{ours - mean_auc:+.0f}", "+-10"]
+    assert _cell(cells, "auc").split() == expected
 
 
 def test_queries_are_drawn_once_a_level_and_databases_fitted_once(
@@ -168,10 +168,8 @@ def test_queries_are_drawn_once_a_level_and_databases_fitted_once(
 def test_the_ablation_and_any_floor(tmp_path: Path) -> None:
     """A floor that the paper does not have gets its own column, without published figures."""
     save_map(grid_of(np.hstack([cross(6.0, 2.0), rectangle(8.0, 5.0)])), tmp_path / "depot")
-    arguments = [*COMPARE, "--maps", str(tmp_path / "depot.yaml"), "--out", str(tmp_path / "out")]
-    arguments += ["--queries", "3"]
-    arguments += ["--jobs", "1", "--offset", "1.0", "--methods", "proposed", "--ablation"]
-    run = runner.invoke(app, arguments)
+    words = "--queries 3 --offset 1.0 --methods proposed --ablation"
+    run = compare(tmp_path / "depot.yaml", tmp_path / "out", words)
     assert run.exit_code == 0, run.output
     assert "depot" in run.stdout and "boundary_alone" in run.stdout and "R@1" in run.stdout
     cells = json.loads((tmp_path / "out" / "results.json").read_text())["cells"]

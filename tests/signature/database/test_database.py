@@ -38,21 +38,11 @@ def test_what_goes_in_comes_out(place: str | Path) -> None:
             database.add(*make_entry("wednesday", 2))
 
 
-def test_a_session_of_which_nothing_was_measured(place: str | Path) -> None:
-    session_map, signatures, origin = make_entry("old", 5)
-    entry = replace(session_map, consistency=None, odometry=None, precision=None), signatures, origin
-    store(place, [entry], keep=True)
-    with open_database(place) as database:
-        assert database.sessions(["old"])[0].consistency is None
-        assert database.sessions(["old"])[0].precision is None
-        assert database.sessions(["old"])[0].odometry is None
-        assert maintenance.check(database.location) == ()
-
-
-def test_sessions_without_submaps_or_poses(place: str | Path) -> None:
+def test_sessions_of_which_nothing_was_measured_without_submaps_or_poses(place: str | Path) -> None:
     session_map, signatures, origin = make_entry("empty", 5, submaps=0)
     nowhere = Trajectory(stamps_ns=np.empty(0), T_session_base=np.empty((0, 4, 4)))
-    entry = replace(session_map, trajectory=nowhere, loops=()), signatures, origin
+    nothing = {"loops": (), "consistency": None, "odometry": None, "precision": None}
+    entry = replace(session_map, trajectory=nowhere, **nothing), signatures, origin
     for keep in (True, False):
         store(place, [entry], keep=keep)
         with open_database(place) as database:
@@ -85,19 +75,16 @@ def test_a_handle_sees_what_was_there_when_it_was_opened(empty: str | Path) -> N
 
 def test_a_database_can_be_narrowed_to_a_building_or_floor(empty: str | Path) -> None:
     labels = {"a": Label(building="north", floor="1"), "b": Label(building="north"), "c": Label()}
-    entries = []
     for seed, (name, label) in enumerate(labels.items()):
         session_map, signatures, origin = make_entry(name, seed, submaps=30)
-        entries.append((session_map, signatures, replace(origin, label=label)))
-    store(empty, entries, keep=False)
-    filters = [
-        {},
-        {"building": "north"},
-        {"floor": "1"},
-        {"building": "north", "floor": ""},
-        {"building": ""},
-    ]
-    for wanted, sessions in zip(filters, ["abc", "ab", "a", "b", "c"], strict=True):
+        store(empty, [(session_map, signatures, replace(origin, label=label))], keep=True)
+    for wanted, sessions in (
+        ({}, "abc"),
+        ({"building": "north"}, "ab"),
+        ({"floor": "1"}, "a"),
+        ({"building": "north", "floor": ""}, "b"),
+        ({"building": ""}, "c"),
+    ):
         with open_database(empty) as database:
             database.keep_only(**wanted)
             assert "".join(info.name for info in database.sessions()) == sessions
@@ -125,11 +112,8 @@ def test_submaps_are_cut_from_the_map_as_the_settings_say(empty: str | Path) -> 
 
 @pytest.mark.parametrize("other", ["sqlite", "postgres"])
 def test_copy_and_merge_between_engines(place: str | Path, other: str, tmp_path: Path) -> None:
-    targets = (
-        (tmp_path / "y.submaps", tmp_path / "z.submaps")
-        if other == "sqlite"
-        else (postgresql.new_database(), postgresql.new_database())
-    )
+    files = tmp_path / "y.submaps", tmp_path / "z.submaps"
+    targets = files if other == "sqlite" else (postgresql.new_database(), postgresql.new_database())
     assert maintenance.copy(place, targets[0]) == ()
     assert maintenance.check(targets[0]) == ()
     assert everything(targets[0]) == everything(place)

@@ -141,57 +141,39 @@ def in_child(body: Callable[[], object]) -> tuple[int, str]:
 @pytest.mark.fault(40)
 @pytest.mark.nightly
 @pytest.mark.parametrize("part", range(4 if FUZZ else 1))
-def test_fuzz_kill_at_random_moments_of_convert(inputs: Path, tmp_path: Path, part: int) -> None:
+@pytest.mark.parametrize("adding", [False, True])
+def test_fuzz_kill_at_random_moments_of_convert(
+    inputs: Path, tmp_path: Path, part: int, adding: bool
+) -> None:
     """Every second one while the temporary file is there, the others anywhere from the start."""
-    rng = np.random.default_rng([40, part])
-    source, made = ("drive.mcap", "drive.submaps") if FUZZ else ("house.yaml", "house.submaps")
-    source, wanted = inputs / source, (inputs / made).read_bytes()
-    output = tmp_path / "x.submaps"
+    rng, output = np.random.default_rng([40, part]), tmp_path / "x.submaps"
+    source = inputs / ("drive.mcap" if FUZZ and not adding else "house.yaml")
+    old = (inputs / "drive.submaps").read_bytes() if adding else b""
+    new = (inputs / ("both.submaps" if adding else f"{source.stem}.submaps")).read_bytes()
     usual_s = 1.0
     killed = turn = 0
     while killed < (min(FUZZ, 200) // 4 or 5):  # those that were done before they were hit do not count
         turn += 1
-        convert = Convert(source, "-o", output, cwd=tmp_path)
+        if adding:
+            output.write_bytes(old)
+        convert = Convert(source, "-o", output, *["--add"] * adding, cwd=tmp_path)
         if turn % 2:
-            while convert.process.is_alive() and not any(tmp_path.iterdir()):
+            while convert.process.is_alive() and len(list(tmp_path.iterdir())) <= adding:
                 time.sleep(0.002)
             time.sleep(float(rng.uniform(0, 0.01)))
         else:
             time.sleep(float(rng.uniform(0.0, usual_s)))
         convert.process.kill()
         killed += convert.wait() == -signal.SIGKILL
-        if output.exists():
-            assert output.read_bytes() == wanted
+        assert (output.read_bytes() if output.exists() else b"") in (old, new)
         begin = time.monotonic()
-        rerun = Convert(source, "-o", output, "--force", cwd=tmp_path)
+        rerun = Convert(source, "-o", output, "--add" if adding else "--force", cwd=tmp_path)
         assert rerun.wait() == 0, rerun.said()
         usual_s = time.monotonic() - begin
-        assert output.read_bytes() == wanted
+        assert output.read_bytes() == new
         assert list(tmp_path.iterdir()) == [output]
         output.unlink()
     assert turn < 3 * killed + 10
-
-
-@pytest.mark.fault(40)
-@pytest.mark.nightly
-def test_kill_at_random_moments_of_adding(inputs: Path, tmp_path: Path) -> None:
-    """The database is the old one or the new one, whole, and what was left over is swept by the next run."""
-    rng = np.random.default_rng(41)
-    output = tmp_path / "x.submaps"
-    old, new = ((inputs / f"{name}.submaps").read_bytes() for name in ("drive", "both"))
-    for turn in range(6):
-        output.write_bytes(old)
-        convert = Convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path)
-        while convert.process.is_alive() and len(list(tmp_path.iterdir())) < 2:
-            time.sleep(0.001)
-        time.sleep(float(rng.uniform(0.0, 0.03 if turn % 2 else 0.003)))
-        convert.process.kill()
-        convert.wait()
-        assert output.read_bytes() in (old, new)
-        again = Convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path)
-        assert again.wait() == 0, again.said()
-        assert output.read_bytes() == new
-        assert list(tmp_path.iterdir()) == [output]
 
 
 @pytest.mark.fault(40)

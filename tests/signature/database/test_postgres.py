@@ -5,11 +5,14 @@ What it shares with other engines is in test_database.py.
 
 from __future__ import annotations
 
+import functools
 import multiprocessing
 import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable, Iterable
+from typing import Any
 
 import pytest
 
@@ -98,22 +101,15 @@ def _eventually(attempt) -> None:
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
-        (
-            "UPDATE about SET format = 99",
-            DatabaseVersion,
-            r"format 99; this pc2grid reads format 1 \(use a newer",
-        ),
+        ("UPDATE about SET format = 99", DatabaseVersion, r"format 99; .* reads format 1 \(use a newer"),
         ("UPDATE about SET format = 0", DatabaseVersion, r"format 0; .*\(convert the recordings again"),
         ("DELETE FROM about", DatabaseCorrupt, r"pc2grid\.about has 0 rows instead of one"),
     ],
 )
 def test_schema_of_another_version(url: str, change: str, error: type[DatabaseError], words: str) -> None:
     sql(url, change)
-    for attempt in (
-        open_database,
-        maintenance.check,
-        lambda u: store(u, [make_entry("friday", 5)], keep=True),
-    ):
+    add = functools.partial(store, entries=[make_entry("friday", 5)], keep=True)
+    for attempt in (open_database, maintenance.check, add):
         with pytest.raises(error, match=words):
             attempt(url)
 
@@ -175,6 +171,15 @@ def test_rights_that_a_robot_needs(url: str) -> None:
 # --- many at once -------------------------------------------------------------------------------------
 
 
+def at_once(act: Callable[[Any], None], of: Iterable[Any]) -> None:
+    """Each in a thread of its own."""
+    threads = [threading.Thread(target=act, args=(one,)) for one in of]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+
+
 def test_robots_that_write_and_read_at_once() -> None:
     """The tables do not exist at first. All writers store one common session; the other sessions differ."""
     url, wrong = postgresql.new_database(), list[str]()
@@ -192,11 +197,7 @@ def test_robots_that_write_and_read_at_once() -> None:
             wrong.append(repr(error))
             raise
 
-    robots = [threading.Thread(target=robot, args=(number,)) for number in range(6)]
-    for thread in robots:
-        thread.start()
-    for thread in robots:
-        thread.join()
+    at_once(robot, range(6))
     assert wrong == []
     with open_database(url) as database:
         assert len(database.sessions()) == 6 * 3 + 1
@@ -218,11 +219,7 @@ def test_first_two_with_different_settings_do_not_both_win() -> None:
         except DatabaseError as error:
             results.append(str(error))
 
-    threads = [threading.Thread(target=add, args=(entry,)) for entry in entries]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    at_once(add, entries)
     assert results.count("stored") == 1, results
     assert sum("cannot be compared" in str(result) for result in results) == 2, results
 

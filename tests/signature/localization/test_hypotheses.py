@@ -210,7 +210,7 @@ def seen_from(grid: OccupancyGrid, pose: SE2) -> OccupancyGrid:
     inside = ((at >= 0) & (at < grid.cells.shape)).all(axis=1)
     cells = empty.cells.copy()
     cells[rows[inside], columns[inside]] = grid.cells[at[inside, 0], at[inside, 1]]
-    return OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=origin_m)
+    return replace(empty, cells=cells)
 
 
 def stretch(index: int, grid: OccupancyGrid) -> PlaceMap:

@@ -23,10 +23,8 @@ from signature.config import Config
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch, check_pose
 from signature.paper import SignatureTable
-from tests.helpers.simulated_drives import building, drive, office, plan
+from tests.helpers.simulated_drives import BENT, OTHER, TWINS, building, drive, office, plan
 
-BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
-TWINS = plan(12, 6, [(6, 0, 6, 6), *BENT, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in BENT]])
 ROOM = [(0, 0, 6, 0), (0, 6, 6, 6), (0, 0, 0, 6), (6, 0, 6, 6), *BENT]
 EQUAL = plan(18, 9, [(x0 + x, y0 + 1, x1 + x, y1 + 1) for x in (1, 10) for x0, y0, x1, y1 in ROOM])
 """Two equal rooms that stand apart: (x, y) of the one is (x + 9, y) of the other."""
@@ -56,16 +54,10 @@ def test_a_right_pose_is_fine(off: SE2) -> None:
 
 @pytest.mark.parametrize(
     "off",
-    [
-        SE2(0.5, 0.0, 0.0),
-        SE2(0.0, -0.5, 0.0),
-        SE2(0.0, 0.0, math.radians(20.0)),
-        SE2(0.0, 0.0, math.pi),
-        SE2(6.0, -3.0, 0.0),
-    ],
+    [(0.5, 0.0, 0.0), (0.0, -0.5, 0.0), (0.0, 0.0, math.radians(20.0)), (0, 0, math.pi), (6.0, -3.0, 0)],
 )
-def test_a_wrong_pose_is_lost_and_the_right_one_is_told(off: SE2) -> None:
-    checked = check(OFFICE, in_office(), off)
+def test_a_wrong_pose_is_lost_and_the_right_one_is_told(off: tuple[float, float, float]) -> None:
+    checked = check(OFFICE, in_office(), SE2(*off))
     truth = in_office()[-1][2]
     assert checked.status == "lost" and checked.probability <= 0.1
     assert checked.better is not None and checked.better.T_map_base is not None
@@ -93,8 +85,7 @@ def test_where_the_map_knows_nothing_it_is_unsure() -> None:
 
 
 def test_in_another_building_it_is_lost_and_no_place_is_told() -> None:
-    other = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
-    checked = check(building({"other": other}), in_office(), SE2())
+    checked = check(building({"other": OTHER}), in_office(), SE2())
     assert checked.status == "lost" and checked.better is None and checked.probability <= 0.1
 
 
@@ -144,12 +135,8 @@ def test_a_real_log_in_the_nav2_map_of_the_floor() -> None:
     told = []
     for driven, truth in real_queries():
         scans = [(r, s) for r, s, _ in driven]
-        told.append(
-            [
-                check_pose(scans, index, truth @ off).status
-                for off in (SE2(), SE2(0.5, 0.0, 0.0), SE2(0.0, 0.0, math.radians(20.0)), SE2(9.0, 4.0, 2.0))
-            ]
-        )
+        offs = SE2(), SE2(0.5, 0.0, 0.0), SE2(0.0, 0.0, math.radians(20.0)), SE2(9.0, 4.0, 2.0)
+        told.append([check_pose(scans, index, truth @ off).status for off in offs])
     right, *wrong = zip(*told, strict=True)
     assert "lost" not in right and right.count("fine") >= 1
     assert all("fine" not in statuses for statuses in wrong)

@@ -21,7 +21,7 @@ from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR, Prior, slip_of
 from signature.localization.query import Query, QueryMap
-from tests.helpers.simulated_drives import building, drive, office, plan
+from tests.helpers.simulated_drives import TWINS, building, drive, office
 
 
 @functools.cache
@@ -76,9 +76,6 @@ def _blurred(planar_scan: PlanarScan) -> PlanarScan:
 # --- What is known of the pose beforehand excludes places, and nothing else ---
 
 
-BENT = [(0, 3, 3, 3), (4, 3, 6, 3), (2, 3, 2, 5)]
-TWINS = plan(12, 6, [(6, 0, 6, 6), *BENT, *[(x0 + 6, y0, x1 + 6, y1) for x0, y0, x1, y1 in BENT]])
-"""Two rooms side by side that are alike: (x, y) of the one is (x + 6, y) of the other."""
 IN_ROOM = [(1.0, 1.0), (5.0, 1.0), (5.0, 2.4)]
 AT_ONCE = Config(relocalize=RelocalizeConfig(step_m=100.0))
 """The database is asked once, at the end: what is tested here does not depend on the looks before."""
@@ -148,22 +145,6 @@ def test_a_pose_of_the_first_scan_is_carried_along_by_the_travel() -> None:
     assert ask(OFFICE.within(turned))[0].status == "not_found"
 
 
-def test_a_prior_from_before_registration_was_lost_is_not_used() -> None:
-    localizer = Localizer(OFFICE.within(Prior.around(17.0, 2.0, 1.0)))
-    timed = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=0)
-    localizers = [localizer, Localizer(OFFICE.within(timed))]
-    for k, (registered, planar_scan, _) in enumerate(driven(in_office=True)):
-        if k == 10:
-            registered = RegisteredScan(
-                scan=registered.scan, T_session_base=registered.T_session_base, health=Health.LOST
-            )
-        for each in localizers:
-            each.add(registered, planar_scan)
-    always, at_start = (each.answer() for each in localizers)
-    assert (always.status, always.prior) == ("not_found", "used")
-    assert (at_start.status, at_start.prior) == ("located", "lapsed")
-
-
 def estimates(index: MapIndex) -> tuple[list[tuple[int, str, float]], Answer]:
     """Stamp, status and confidence of each estimate in the left room, and the answer at the end."""
     localizer, found = Localizer(index), []
@@ -180,57 +161,65 @@ def alike_step_by_step() -> MapIndex:
     return building({"twins": TWINS}, Config(relocalize=RelocalizeConfig(accept=0.95)))
 
 
+@functools.cache
+def undecided() -> tuple[list[tuple[int, str, float]], Answer]:
+    """The estimates without a prior."""
+    return estimates(alike_step_by_step())
+
+
 def test_a_prior_acts_at_its_time_and_never_before() -> None:
     """The robot is 3 m from the region at first."""
-    free, undecided = estimates(alike_step_by_step())
+    free, without = undecided()
     registered, _, then = driven(in_office=False)[20]
     prior = replace(Prior.around(then.x, then.y, 1.0), stamp_ns=registered.scan.stamp_ns)
     found, answer = estimates(alike_step_by_step().within(prior))
-    assert undecided.status == "ambiguous" and answer.status == "located" and answer.prior == "used"
+    assert without.status == "ambiguous" and answer.status == "located" and answer.prior == "used"
     assert distance(answer.T_map_base, driven(in_office=False)[-1][2]) < 0.1
     before = [k for k, (stamp_ns, _, _) in enumerate(found) if stamp_ns < registered.scan.stamp_ns]
     assert len(before) >= 3 and found[: len(before)] == free[: len(before)]
     assert all(status == "located" for _, status, _ in found[len(before) :])
 
 
-def test_a_prior_of_a_time_after_the_last_scan_says_nothing_yet() -> None:
+@pytest.mark.parametrize(("later_ns", "told"), [(1, ("ambiguous", "ahead")), (None, ("located", "used"))])
+def test_a_prior_at_the_end_changes_no_estimate_before(later_ns: int | None, told: tuple[str, str]) -> None:
+    """One of a time after the last scan says nothing yet; one without a time is about the last scan."""
     registered, _, end = driven(in_office=False)[-1]
-    later = replace(Prior.around(end.x, end.y, 1.0), stamp_ns=registered.scan.stamp_ns + 1)
-    found, answer = estimates(alike_step_by_step().within(later))
-    assert found == estimates(alike_step_by_step())[0]
-    assert (answer.status, answer.prior) == ("ambiguous", "ahead")
+    stamp_ns = None if later_ns is None else registered.scan.stamp_ns + later_ns
+    prior = replace(Prior.around(end.x, end.y, 1.0), stamp_ns=stamp_ns)
+    found, answer = estimates(alike_step_by_step().within(prior))
+    assert found == undecided()[0]
+    assert (answer.status, answer.prior) == told
+    assert told[0] == "ambiguous" or distance(answer.T_map_base, end) < 0.1
 
 
-def test_a_prior_without_a_time_is_about_the_scan_at_which_the_answer_is_asked() -> None:
-    end = driven(in_office=False)[-1][2]
-    found, answer = estimates(alike_step_by_step().within(Prior.around(end.x, end.y, 1.0)))
-    assert found == estimates(alike_step_by_step())[0]
-    assert (answer.status, answer.prior) == ("located", "used")
-    assert distance(answer.T_map_base, end) < 0.1
-
-
-def test_registration_that_is_lost_before_the_time_of_a_prior_takes_nothing_from_it() -> None:
-    """But while it is lost, nothing connects the time with what comes after."""
+@pytest.mark.parametrize(
+    ("told_at", "lost", "again_at", "became"),
+    [
+        # Registration that is lost before the time of a prior takes nothing from it. But while it is lost,
+        # nothing connects the time with what comes after.
+        (17, range(8, 12), None, "used"),
+        (17, range(12, 19), None, "lapsed"),
+        (17, range(17, 18), None, "lapsed"),
+        (0, range(10, 11), None, "lapsed"),
+        (None, range(10, 11), None, "used"),  # without a time it is about now
+        # The same of a robot that is followed anew.
+        (5, (), 10, "lapsed"),
+        (20, (), 10, "used"),
+    ],
+)
+def test_a_prior_lapses_if_tracking_breaks_after_its_time(
+    told_at: int | None, lost: range, again_at: int | None, became: str
+) -> None:
+    """It says that the robot is where it is not."""
     scans = driven(in_office=True)
-    prior = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=scans[17][0].scan.stamp_ns)
-    for lost, became in ((range(8, 12), "used"), (range(12, 19), "lapsed"), (range(17, 18), "lapsed")):
-        localizer = Localizer(OFFICE.within(prior))
-        for k, (registered, planar_scan, _) in enumerate(scans):
-            health = Health.LOST if k in lost else Health.FINE
-            localizer.add(replace(registered, health=health), planar_scan)
-        assert localizer.answer().prior == became, lost
-
-
-def test_a_restart_takes_nothing_from_a_prior_of_a_later_time() -> None:
-    scans = driven(in_office=True)
-    for number, became in ((5, "lapsed"), (20, "used")):
-        prior = replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=scans[number][0].scan.stamp_ns)
-        localizer = Localizer(OFFICE.within(prior))
-        for k, (registered, planar_scan, _) in enumerate(scans):
-            if k == 10:
-                localizer.restart()
-            localizer.add(registered, planar_scan)
-        assert localizer.answer().prior == became
+    stamp_ns = None if told_at is None else scans[told_at][0].scan.stamp_ns
+    localizer = Localizer(OFFICE.within(replace(Prior.around(17.0, 2.0, 1.0), stamp_ns=stamp_ns)))
+    for k, (registered, planar_scan, _) in enumerate(scans):
+        if k == again_at:
+            localizer.restart()
+        localizer.add(replace(registered, health=Health.LOST if k in lost else Health.FINE), planar_scan)
+    answer = localizer.answer()
+    assert (answer.prior, answer.status) == (became, "not_found" if became == "used" else "located")
 
 
 def test_a_prior_that_contradicts_where_the_robot_was_located_is_not_taken_for_lapsed() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,46 +14,25 @@ import pytest
 from pc2grid.errors import DatabaseError
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, Precision, Trajectory
-from signature.config import Config
 from signature.database import Label, SubmapDatabase, maintenance, open_database
 from signature.database.protocol import BuildingFrame, Deformation
-from signature.localization.answer import answer_in_building, covariance_in_building
+from signature.localization.answer import Answer, answer_in_building, covariance_in_building
 from signature.localization.joining.building import building_map, join_sessions, map_of
 from signature.localization.localizer import locate_map
-from signature.sessions import add_sessions, provenance
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
-from tests.helpers.session_maps import session, way
-from tests.helpers.simulated_drives import building, office, office_part, plan
+from tests.helpers.session_maps import session, stored, way
+from tests.helpers.simulated_drives import OTHER, building, office, office_part
 
-OTHER = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
 NONE: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3
 
 
-def store(path: Path, maps: dict[str, OccupancyGrid], labels: dict[str, Label] | None = None) -> None:
-    config = Config()
-    sessions = [
-        (
-            session(name, grid, way()),
-            provenance(Path(f"{name}.mcap"), name, config, label=(labels or {}).get(name, Label())),
-        )
-        for name, grid in maps.items()
-    ]
-    add_sessions(path, sessions, config)
-
-
 MAPS = {"west": part(WEST), "elsewhere": OTHER, "east": in_frame(part(EAST), T_OFFICE_EAST)}
-
-
-@pytest.fixture(scope="module")
-def stored(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("joining") / "building.submaps"
-    store(path, MAPS)
-    return path
+SESSIONS = {name: session(name, grid, way()) for name, grid in MAPS.items()}
 
 
 @pytest.fixture
-def database(stored: Path) -> Iterator[SubmapDatabase]:
-    with open_database(stored) as opened:
+def database(tmp_path: Path) -> Iterator[SubmapDatabase]:
+    with open_database(stored(tmp_path / "building.submaps", *SESSIONS.values())) as opened:
         yield opened
 
 
@@ -75,6 +55,14 @@ def test_sessions_of_one_building_get_its_frame_and_others_none(database: Submap
     # As two maps are joined, see test_join.
     assert east.name == "west" and distance_m < 0.05 and turn_rad < 0.0072
     assert np.linalg.eigvalsh(np.array(east.covariance)).min() > 0.0
+    # All is in the map of the building, and what was not joined is alone.
+    whole, alone = map_of(database, "west", found.frames), map_of(database, "elsewhere", found.frames)
+    assert np.array_equal(alone.cells, MAPS["elsewhere"].cells)
+    # The whole office: 20 x 14 m, of which walls take some 18 m2.
+    office_m2 = sum(MAPS[name].free_m2 for name in ("west", "east")) - part((6.0, 0.0, 13.0, 14.0)).free_m2
+    assert whole.free_m2 == pytest.approx(office_m2, rel=0.03)
+    # A room of the east, where only that session was, and the corridor, in the frame of the west.
+    assert whole.is_free(19.0, 7.0) and whole.is_free(1.0, 7.0) and not whole.is_free(14.5, 10.0)
 
 
 def test_the_frame_of_a_building_is_that_of_the_named_session(database: SubmapDatabase) -> None:
@@ -106,11 +94,7 @@ def test_a_session_that_drifts_is_straightened_by_one_that_does_not(tmp_path: Pa
     exact = Precision(stamps_ns=tuple(range(0, len(along), 20)), sigma_m=(0.1,) * 5)
     bent = replace(session("bent", drawn_bent(office()), drive), precision=exact)
     maps = (session("plan", office(), way()), bent)
-    path = tmp_path / "x.submaps"
-    add_sessions(
-        path, [(one, provenance(Path(one.session), one.session, Config())) for one in maps], Config()
-    )
-    with open_database(path) as opened:
+    with open_database(stored(tmp_path / "x.submaps", *maps)) as opened:
         frames = join_sessions(opened).frames
         whole = map_of(opened, "plan", frames)
     rigid = frames["bent"].T_building_session
@@ -128,15 +112,14 @@ def test_a_session_that_drifts_is_straightened_by_one_that_does_not(tmp_path: Pa
 def test_floors_stay_apart(tmp_path: Path) -> None:
     """The ground floor, and the same plan on the first: nothing but labels tells them apart."""
     labels = {"west": Label(building="A", floor="0"), "east": Label(building="A", floor="1")}
-    store(tmp_path / "x.submaps", {name: MAPS[name] for name in labels}, labels)
-    with open_database(tmp_path / "x.submaps") as opened:
+    path = stored(tmp_path / "x.submaps", *(SESSIONS[name] for name in labels), **labels)
+    with open_database(path) as opened:
         found = join_sessions(opened)
     assert found.pairs == () and not found.frames
 
 
 def test_what_is_added_joins_and_the_others_stay(tmp_path: Path) -> None:
-    path = tmp_path / "x.submaps"
-    store(path, MAPS)
+    path = stored(tmp_path / "x.submaps", *SESSIONS.values())
     # The building's frame is some other one, whose session has been removed.
     T_building_west = SE2(100.0, -50.0, 2.0)
     west = BuildingFrame(name="gone", T_building_session=T_building_west, covariance=NONE)  # type: ignore[arg-type]
@@ -146,18 +129,6 @@ def test_what_is_added_joins_and_the_others_stay(tmp_path: Path) -> None:
     assert frames.keys() == {"west", "east"} and frames["west"] == west and frames["east"].name == "gone"
     distance_m, _ = apart(T_building_west @ T_OFFICE_EAST, frames["east"].T_building_session)
     assert distance_m < 0.05
-
-
-def test_the_map_of_a_building_holds_all_its_sessions(stored: Path) -> None:
-    with open_database(stored) as opened:
-        frames = join_sessions(opened).frames
-        whole, alone = map_of(opened, "west", frames), map_of(opened, "elsewhere", frames)
-        assert np.array_equal(alone.cells, opened.grid("elsewhere").cells)
-    # The whole office: 20 x 14 m, of which walls take some 18 m2.
-    office_m2 = sum(MAPS[name].free_m2 for name in ("west", "east")) - part((6.0, 0.0, 13.0, 14.0)).free_m2
-    assert whole.free_m2 == pytest.approx(office_m2, rel=0.03)
-    # A room of the east, where only that session was, and the corridor, in the frame of the west.
-    assert whole.is_free(19.0, 7.0) and whole.is_free(1.0, 7.0) and not whole.is_free(14.5, 10.0)
 
 
 # --- One map of several: what the newest session that is sure of a cell says ---
@@ -222,8 +193,14 @@ FRAME = BuildingFrame(
 )
 
 
+@functools.cache
+def located() -> Answer:
+    """A part of the office, found in it."""
+    return locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
+
+
 def test_an_answer_is_moved_with_all_its_poses() -> None:
-    answer = locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
+    answer = located()
     assert answer.status == "located" and answer.T_map_base is not None and answer.frame is None
     moved = answer_in_building(answer, {"monday": FRAME})
     # A quarter turn: (9, 7) becomes (-7, 9), and then the shift.
@@ -240,7 +217,7 @@ def test_an_answer_is_moved_with_all_its_poses() -> None:
 def test_an_answer_in_a_bent_map_moves_as_its_place_does() -> None:
     """East of x = 4 m the map lies 0.3 m too far north; in the west it is right."""
     bend = tuple((x, y, 0.0, -0.3 * (x > 4.0), 0.0) for x in (0.0, 8.0) for y in (2.0, 7.0, 12.0))
-    answer = locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
+    answer = located()
     straight, bent = (
         answer_in_building(answer, {"monday": replace(FRAME, bend=rows)}) for rows in ((), bend)
     )
@@ -253,7 +230,7 @@ def test_an_answer_in_a_bent_map_moves_as_its_place_does() -> None:
 
 
 def test_an_answer_in_a_session_that_was_not_joined_stays() -> None:
-    answer = locate_map(office_part((9.0, 7.0)), building({"monday": office()}))
+    answer = located()
     moved = answer_in_building(answer, {"tuesday": FRAME})
     assert moved.T_map_base == answer.T_map_base and moved.covariance == pytest.approx(answer.covariance)
     assert moved.to_json()["frame"] is moved.to_json()["hypotheses"][0]["frame"] is None
@@ -264,17 +241,10 @@ def test_the_covariance_holds_how_exactly_the_session_lies_in_its_building() -> 
     rng = np.random.default_rng(0)
     own, pose = np.diag([1e-2, 1e-4, 1e-4]), SE2(20.0, 5.0, 0.3)
     T = FRAME.T_building_session
-    draws = []
-    for off, frame_off in zip(
-        rng.multivariate_normal(np.zeros(3), own, 20_000),
-        rng.multivariate_normal(np.zeros(3), np.array(FRAME.covariance), 20_000),
-        strict=True,
-    ):
-        there = SE2(T.x + frame_off[0], T.y + frame_off[1], T.yaw + frame_off[2]) @ SE2(
-            pose.x + off[0], pose.y + off[1], pose.yaw + off[2]
-        )
-        draws.append((there.x, there.y, there.yaw))
-    expected = np.cov(np.array(draws).T)
+    frames = rng.multivariate_normal((T.x, T.y, T.yaw), FRAME.covariance, 20_000)
+    poses = rng.multivariate_normal((pose.x, pose.y, pose.yaw), own, 20_000)
+    there = [SE2(*frame) @ SE2(*at) for frame, at in zip(frames.tolist(), poses.tolist(), strict=True)]
+    expected = np.cov(np.array([(at.x, at.y, at.yaw) for at in there]).T)
     found = covariance_in_building(own, pose, FRAME)
     sigmas = np.sqrt(np.diag(expected))
     assert found / np.outer(sigmas, sigmas) == pytest.approx(expected / np.outer(sigmas, sigmas), abs=0.03)

@@ -15,7 +15,7 @@ from signature.localization.joining.building import RIGID, body_of, straighten
 from signature.localization.joining.join import JOIN, Join, Link, Proposal, join_maps, proposals
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, joinable, part
 from tests.helpers.rooms import RESOLUTION_M
-from tests.helpers.simulated_drives import office, plan, with_tables
+from tests.helpers.simulated_drives import OTHER, office, plan, with_tables
 
 west, east = joinable(part(WEST)), joinable(in_frame(part(EAST), T_OFFICE_EAST))
 
@@ -71,7 +71,6 @@ def test_pieces_propose_where_the_other_map_lies() -> None:
 
 
 MIRRORED = OccupancyGrid(cells=office().cells[:, ::-1].copy(), resolution_m=RESOLUTION_M, origin_m=(0.0, 0.0))
-OTHER = plan(16, 12, [(4, 0, 4, 7), (9, 5, 9, 12), (9, 5, 13, 5), (6, 9, 6, 12), (13, 2, 16, 2)])
 
 
 @pytest.mark.parametrize("other", [MIRRORED, OTHER], ids=["mirrored", "another plan"])

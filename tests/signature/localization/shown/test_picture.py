@@ -33,19 +33,17 @@ from signature.localization.shown.picture import (
     draw_session,
     drawn_as,
 )
-from signature.sessions import add_sessions, find, provenance
+from signature.sessions import find
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
 from tests.helpers.nav2_map import as_mapped, nav2_map
-from tests.helpers.session_maps import session, way
-from tests.helpers.simulated_drives import cut, office, plan
+from tests.helpers.session_maps import session, stored, way
+from tests.helpers.simulated_drives import changed_part, cut, office, plan
 
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> SubmapDatabase:
-    folder = tmp_path_factory.mktemp("picture")
-    origin = provenance(Path("office.mcap"), "a" * 64, Config())
-    add_sessions(folder / "office.submaps", [(session("office", office(), way()), origin)], Config())
-    return open_database(folder / "office.submaps")
+    path = tmp_path_factory.mktemp("picture") / "office.submaps"
+    return open_database(stored(path, session("office", office(), way())))
 
 
 def located(grid: OccupancyGrid, database: SubmapDatabase, folder: Path) -> Found:
@@ -53,12 +51,9 @@ def located(grid: OccupancyGrid, database: SubmapDatabase, folder: Path) -> Foun
     return find(folder / "query.yaml", database, Config())
 
 
-def changed_part() -> OccupancyGrid:
-    """A part of the office: without the wall from (7, 1) to (7, 3), with a box, and larger than the map."""
-    cells = cut(office(), 4.0, 0.0, 15.0, 12.0).cells.copy()
-    cells[18:62, 58:63] = 0
-    cells[140:148, 110:118] = 100
-    # Below y = 0 the map ends, and the query has seen another wall there.
+def larger_part() -> OccupancyGrid:
+    """The changed part; below y = 0 the map ends, and the query has seen another wall there."""
+    cells = changed_part().cells
     beyond = np.zeros((40, cells.shape[1]), np.int8)
     beyond[0:2] = 100
     return OccupancyGrid(cells=np.vstack((beyond, cells)), resolution_m=0.05, origin_m=(0.0, 0.0))
@@ -86,7 +81,7 @@ def labels_of(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 def test_walls_have_the_colour_of_what_the_map_says_about_them(
     database: SubmapDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    found = located(changed_part(), database, tmp_path)
+    found = located(larger_part(), database, tmp_path)
     assert found.status == "located"
     labels = labels_of(monkeypatch)
     draw_answer(tmp_path / "a.png", database, found, found.poses)
@@ -113,12 +108,10 @@ def test_the_picture_is_the_map_that_nav2_gets_and_tells_furniture_apart(
         assert set(drawn[cells == told]) == kinds
     assert set(drawn[grid.things]) == {FURNITURE}
 
-    origin = provenance(Path("office.mcap"), "a" * 64, Config())
     for name, there in (("bare", False), ("furnished", True)):
         made = session(name, grid if there else office(), way())
-        add_sessions(tmp_path / f"{name}.submaps", [(made, origin)], Config())
         labels = labels_of(monkeypatch)
-        with open_database(tmp_path / f"{name}.submaps") as opened:
+        with open_database(stored(tmp_path / f"{name}.submaps", made)) as opened:
             draw_session(tmp_path / f"{name}.png", opened, name)
         assert ("map's furniture: an obstacle, no wall" in labels) == there
         colour = "#" + bytes(PALETTE[FURNITURE].tolist()).hex()
@@ -189,7 +182,7 @@ def test_no_band_of_a_picture_is_empty(name: str, database: SubmapDatabase, tmp_
     if name == "session":
         draw_session(tmp_path / "a.png", database, "office")
     else:
-        found = located(changed_part(), database, tmp_path)
+        found = located(larger_part(), database, tmp_path)
         draw_answer(tmp_path / "a.png", database, found, found.poses)
     drawn = cv2.imread(str(tmp_path / "a.png")).min(axis=-1) < 250
     for axis in (0, 1):

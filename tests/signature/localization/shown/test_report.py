@@ -24,11 +24,11 @@ from signature.freespace import freespace_histogram, shortest_paths
 from signature.localization.answer import PoseInSpace
 from signature.localization.shown.page import Found, contents, write_report
 from signature.paper import Signature, distances
-from signature.sessions import add_sessions, find, provenance
+from signature.sessions import find
 from tests.helpers.browser import DESK, PHONE, Browser
 from tests.helpers.nav2_map import as_mapped
-from tests.helpers.session_maps import LOOPS, session, way
-from tests.helpers.simulated_drives import cut, office, plan
+from tests.helpers.session_maps import LOOPS, session, stored, way
+from tests.helpers.simulated_drives import changed_part, cut, office, plan
 
 NASTY = "</script><b>&"
 RADIUS_M = Config().partition.radius_m
@@ -39,14 +39,9 @@ ROUNDED_M = 0.006
 
 @pytest.fixture(scope="module")
 def database(tmp_path_factory: pytest.TempPathFactory) -> SubmapDatabase:
-    folder = tmp_path_factory.mktemp("report")
-    config = Config()
-    sessions = [
-        (session("office", office(), way(), LOOPS), provenance(Path("office.mcap"), "a" * 64, config)),
-        (session(NASTY, plan(8, 5, []), way(25)), provenance(Path("room.mcap"), "b" * 64, config)),
-    ]
-    add_sessions(folder / "two.submaps", sessions, config, keep=False)
-    return open_database(folder / "two.submaps")
+    path = tmp_path_factory.mktemp("report") / "two.submaps"
+    two = session("office", office(), way(), LOOPS), session(NASTY, plan(8, 5, []), way(25))
+    return open_database(stored(path, *two))
 
 
 @pytest.fixture(scope="module")
@@ -56,15 +51,30 @@ def found(database: SubmapDatabase, tmp_path_factory: pytest.TempPathFactory) ->
     return find(stem.with_suffix(".yaml"), database, Config())
 
 
+@pytest.fixture(scope="module")
+def page(database: SubmapDatabase, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of the database alone."""
+    path = tmp_path_factory.mktemp("page") / "page.html"
+    write_report(path, database)
+    return path
+
+
+@pytest.fixture(scope="module")
+def answered(database: SubmapDatabase, found: Found, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of the answer."""
+    path = tmp_path_factory.mktemp("answered") / "page.html"
+    write_report(path, database, found=found)
+    return path
+
+
 def embedded(page: str) -> dict:
     return json.loads(re.search(r"const D = (\{.*?\}), A = D\.answer", page, re.S)[1])
 
 
 def test_the_page_is_whole_and_fetches_nothing(
-    database: SubmapDatabase, found: Found, tmp_path: Path
+    database: SubmapDatabase, found: Found, answered: Path
 ) -> None:
-    write_report(tmp_path / "page.html", database, found=found)
-    page = (tmp_path / "page.html").read_text(encoding="utf-8")
+    page = answered.read_text(encoding="utf-8")
     outside = re.findall(r"(?:https?:)?//[a-z][^\s\"'`)]*", page.replace("http://www.w3.org/2000/svg", ""))
     assert [u for u in outside if u.startswith(("http", "//www"))] == []
     assert "default-src 'none'" in page
@@ -105,10 +115,7 @@ def test_furniture_is_in_the_picture_and_in_the_legend(tmp_path: Path, browser: 
     many = replace(few, cells=np.kron(few.cells, np.ones((8, 8), np.int8)), resolution_m=few.resolution_m / 8)
     for name, grid, there in (("bare", office(), False), ("few", few, True), ("many", many, True)):
         made = replace(session("s", office(), way()), grid=grid)
-        add_sessions(
-            tmp_path / f"{name}.submaps", [(made, provenance(Path("x.mcap"), "a" * 64, Config()))], Config()
-        )
-        with open_database(tmp_path / f"{name}.submaps") as opened:
+        with open_database(stored(tmp_path / f"{name}.submaps", made)) as opened:
             write_report(tmp_path / "page.html", opened)
             image = contents(opened)["sessions"][0]["image"]
         raw = np.frombuffer(base64.b64decode(image["png"].split(",")[1]), np.uint8)
@@ -129,36 +136,20 @@ def test_loops_join_the_places_that_they_are_between(database: SubmapDatabase) -
     assert second["loops"] == []
 
 
-def test_where_map_and_scans_disagree_is_marked_on_the_path(tmp_path: Path) -> None:
-    stamps = way().stamps_ns
-    stretch = Contradiction(
-        from_ns=int(stamps[5]), to_ns=int(stamps[9]), x_m=2.4, y_m=7.0, length_m=0.8, share=0.4
-    )
-    bent = replace(
+def test_where_scans_disagree_and_how_exactly_places_are_known_is_drawn_along_the_path(
+    tmp_path: Path,
+) -> None:
+    stamps = [int(stamp_ns) for stamp_ns in way().stamps_ns]
+    stretch = Contradiction(from_ns=stamps[5], to_ns=stamps[9], x_m=2.4, y_m=7.0, length_m=0.8, share=0.4)
+    made = replace(
         session("office", office(), way()),
         consistency=Consistency(hits_on_free=0.1, contradicted=0.3, bent=True, stretches=(stretch,)),
+        precision=Precision(stamps_ns=(stamps[0], stamps[4], stamps[9]), sigma_m=(0.01, 0.05, 0.75)),
     )
-    add_sessions(
-        tmp_path / "bent.submaps", [(bent, provenance(Path("office.mcap"), "a" * 64, Config()))], Config()
-    )
-    with open_database(tmp_path / "bent.submaps") as database:
+    with open_database(stored(tmp_path / "x.submaps", made)) as database:
         shown = contents(database)["sessions"][0]
-    assert (shown["agreement"], shown["bent"]) == (0.7, True)
+    assert (shown["agreement"], shown["bent"], shown["worst_m"]) == (0.7, True, 0.75)
     assert np.allclose(shown["contradicted"], [way().planar()[5:10, :2].ravel()], atol=ROUNDED_M)
-
-
-def test_how_exactly_places_are_known_is_drawn_along_the_path(tmp_path: Path) -> None:
-    stamps = way().stamps_ns
-    loose = replace(
-        session("office", office(), way()),
-        precision=Precision(stamps_ns=tuple(int(stamps[k]) for k in (0, 4, 9)), sigma_m=(0.01, 0.05, 0.75)),
-    )
-    add_sessions(
-        tmp_path / "loose.submaps", [(loose, provenance(Path("office.mcap"), "a" * 64, Config()))], Config()
-    )
-    with open_database(tmp_path / "loose.submaps") as database:
-        shown = contents(database)["sessions"][0]
-    assert shown["worst_m"] == 0.75
     ((sigma_m, *xy),) = shown["loose"]  # the first piece is known better than a path is wide
     assert sigma_m == 0.4
     assert np.allclose((xy[:2], xy[-2:]), way().planar()[[4, 9], :2], atol=ROUNDED_M)
@@ -169,15 +160,10 @@ def test_an_answer_comes_with_how_exactly_the_map_is_known_there(tmp_path: Path,
     assert pose is not None
     nearest = int(np.argmin(np.hypot(*(way().planar()[:, :2] - (pose.x, pose.y)).T)))
     known = Precision(stamps_ns=(int(stamps[0]), int(stamps[nearest]) + 1), sigma_m=(0.1, 0.75))
-    office_map = session("office", office(), way())
-    for name, precision in (("known", known), ("unknown", None)):
-        path = tmp_path / f"{name}.submaps"
-        origin = provenance(Path("office.mcap"), "a" * 64, Config())
-        add_sessions(path, [(replace(office_map, precision=precision), origin)], Config())
-    with open_database(tmp_path / "known.submaps") as database:
-        assert map_sigma_m(found, database) == pytest.approx(0.75, abs=1e-6)
-    with open_database(tmp_path / "unknown.submaps") as database:
-        assert map_sigma_m(found, database) is None
+    for precision, sigma_m in ((known, pytest.approx(0.75, abs=1e-6)), (None, None)):
+        made = replace(session("office", office(), way()), precision=precision)
+        with open_database(stored(tmp_path / f"{sigma_m}.submaps", made)) as database:
+            assert map_sigma_m(found, database) == sigma_m
 
 
 def test_the_answer_on_the_page_is_the_answer(database: SubmapDatabase, found: Found) -> None:
@@ -237,10 +223,7 @@ def test_what_a_changed_query_contradicts_is_where_it_was_changed(
     database: SubmapDatabase, tmp_path: Path
 ) -> None:
     """The query lost a wall that the map has, from (7, 1) to (7, 3), and has a box that the map has not."""
-    cells = cut(office(), 4.0, 0.0, 15.0, 12.0).cells.copy()
-    cells[18:62, 58:63] = 0
-    cells[140:148, 110:118] = 100
-    save_map(OccupancyGrid(cells=cells, resolution_m=0.05, origin_m=(0.0, 0.0)), tmp_path / "changed")
+    save_map(changed_part(), tmp_path / "changed")
     shown = contents(database, found=find(tmp_path / "changed.yaml", database, Config()))["answer"]
     best = shown["hypotheses"][0]
     missed_m = np.array(best["missed"]).reshape(-1, 2)
@@ -305,9 +288,7 @@ def test_a_page_about_an_answer_explains_the_maps_of_its_hypotheses(
 def test_a_map_of_nothing_still_has_a_page(tmp_path: Path) -> None:
     nothing = OccupancyGrid(cells=np.full((9, 9), -1, np.int8), resolution_m=0.05, origin_m=(0.0, 0.0))
     still = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
-    origin = provenance(Path("nothing.mcap"), "c" * 64, Config())
-    add_sessions(tmp_path / "x.submaps", [(session("x", nothing, still), origin)], Config(), keep=False)
-    with open_database(tmp_path / "x.submaps") as opened:
+    with open_database(stored(tmp_path / "x.submaps", session("x", nothing, still))) as opened:
         (only,) = contents(opened)["sessions"]
     assert only["submaps"] == [] and only["path"] == [] and only["graph"] == {"nodes": [], "edges": []}
 
@@ -364,25 +345,16 @@ def test_a_browser_has_nothing_to_complain_about(
     # Of the three loops that the first session came back by, off until they are wanted.
     for label in ("2 loops closed", "1 loop doubted"):
         assert re.search(rf'<label><input type="checkbox">(?:(?!<label>).)*?>{label}</span></label>', shown)
+    behind = browser.evaluate("getComputedStyle(document.body).backgroundColor")
+    assert behind == ("rgb(20, 23, 26)" if dark else "rgb(255, 255, 255)")
     assert browser.faults() == []
 
 
-def test_the_page_is_dark_where_the_reader_wants_it(
-    database: SubmapDatabase, tmp_path: Path, browser: Browser
-) -> None:
-    write_report(tmp_path / "page.html", database)
-    pages = []
-    for dark in (False, True):
-        looked_at(browser, tmp_path / "page.html", dark=dark)
-        pages.append(browser.evaluate("getComputedStyle(document.body).backgroundColor"))
-    assert pages == ["rgb(255, 255, 255)", "rgb(20, 23, 26)"]
-
-
-def test_every_label_is_explained_under_the_pointer_and_in_the_list(
-    database: SubmapDatabase, found: Found, tmp_path: Path, browser: Browser
-) -> None:
-    write_report(tmp_path / "page.html", database, found=found)
-    looked_at(browser, tmp_path / "page.html", act="$('next').click();")
+def test_every_label_is_explained_under_the_pointer_and_in_the_list(answered: Path, browser: Browser) -> None:
+    """No submap is shown until the reader chooses one."""
+    assert '<g id="mark"></g>' in looked_at(browser, answered)
+    shown = looked_at(browser, answered, act="$('next').click();")
+    assert '<g id="mark"><circle' in shown and ">Submap 0<" in shown
     titles = browser.evaluate("[...document.querySelectorAll('#legend label span')].map(e => e.title)")
     told = browser.evaluate("[...document.querySelectorAll('#words dd')].map(e => e.textContent)")
     assert len(titles) > 5 and all(titles) and set(titles) <= set(told)
@@ -408,48 +380,33 @@ def test_what_is_cut_small_or_faint_is_found(tmp_path: Path, browser: Browser) -
 
 
 def test_the_pose_in_space_is_shown_with_all_that_the_terminal_says(
-    database: SubmapDatabase, found: Found, tmp_path: Path, browser: Browser
+    database: SubmapDatabase, found: Found, answered: Path, tmp_path: Path, browser: Browser
 ) -> None:
     write_report(tmp_path / "page.html", database, found=in_space(found))
     looked_at(browser, tmp_path / "page.html")
     rows = browser.evaluate("[...$('six').rows].slice(1).map(r => [...r.cells].map(c => c.textContent))")
     assert [row[0] for row in rows] == ["x", "y", "z", "roll", "pitch", "yaw"]
     assert rows[2] == ["z", "0.030 m", "0.020 m"] and rows[3] == ["roll", "0.00°", "0.17°"]
-    write_report(tmp_path / "page.html", database, found=found)
-    looked_at(browser, tmp_path / "page.html")
+    looked_at(browser, answered)
     assert browser.evaluate("$('space').hidden")
 
 
-def test_the_place_under_the_pointer_is_named(
-    database: SubmapDatabase, tmp_path: Path, browser: Browser
-) -> None:
-    write_report(tmp_path / "page.html", database)
+def test_the_place_under_the_pointer_is_named(database: SubmapDatabase, page: Path, browser: Browser) -> None:
     place = contents(database)["sessions"][0]["submaps"][3]["xy"]
     act = (
         f"const there = new DOMPoint({place[0]}, -({place[1]})).matrixTransform($('map').getScreenCTM());"
         " $('map').dispatchEvent(new PointerEvent('pointermove',"
         " { clientX: there.x, clientY: there.y, pointerId: 1 }));"
     )
-    shown = looked_at(browser, tmp_path / "page.html", act=act)
+    shown = looked_at(browser, page, act=act)
     x, y = (float(v) for v in re.findall(r'id="pointed"[^>]*>x (-?[\d.]+) m, y (-?[\d.]+) m<', shown)[0])
     assert math.hypot(x - place[0], y - place[1]) < 0.05
-
-
-def test_an_answer_is_shown_without_a_submap_until_the_reader_chooses_one(
-    database: SubmapDatabase, found: Found, tmp_path: Path, browser: Browser
-) -> None:
-    write_report(tmp_path / "page.html", database, found=found)
-    assert '<g id="mark"></g>' in looked_at(browser, tmp_path / "page.html")
-    shown = looked_at(browser, tmp_path / "page.html", act="$('next').click();")
-    assert '<g id="mark"><circle' in shown and ">Submap 0<" in shown
 
 
 def test_each_warning_is_a_line_of_its_own(tmp_path: Path, browser: Browser) -> None:
     made = session("office", office(), way())
     warned = replace(made, report=replace(made.report, warnings=("first <warning>", "second")))
-    row = (warned, provenance(Path("office.mcap"), "a" * 64, Config()))
-    add_sessions(tmp_path / "warned.submaps", [row], Config(), keep=False)
-    with open_database(tmp_path / "warned.submaps") as database:
+    with open_database(stored(tmp_path / "warned.submaps", warned)) as database:
         write_report(tmp_path / "page.html", database)
     shown = looked_at(browser, tmp_path / "page.html")
     assert "<li>office: first &lt;warning&gt;</li><li>office: second</li>" in shown
@@ -476,9 +433,8 @@ def test_the_place_that_a_reader_chooses_is_the_one_weighed(
 
 
 def test_the_submap_that_a_reader_chooses_is_explained_with_its_loops(
-    database: SubmapDatabase, tmp_path: Path, browser: Browser
+    database: SubmapDatabase, page: Path, browser: Browser
 ) -> None:
-    write_report(tmp_path / "page.html", database)
     first = contents(database)["sessions"][0]
     places_m = np.array([submap["xy"] for submap in first["submaps"]])
     ends_m = np.array([loop[:4] for loop in first["loops"]]).reshape(-1, 2, 2)
@@ -486,7 +442,7 @@ def test_the_submap_that_a_reader_chooses_is_explained_with_its_loops(
     chosen = int(nearest[0, 0])
     own = int((nearest == chosen).any(axis=1).sum())
     act = f"pick(S.submaps.at({chosen} - 1)); $('next').click();"
-    shown = looked_at(browser, tmp_path / "page.html", act=act)
+    shown = looked_at(browser, page, act=act)
     submap = first["submaps"][chosen]
     assert f">Submap {submap['id']}<" in shown
     assert f"{own} loop{'s' if own > 1 else ''} from here" in shown and own < len(ends_m)
