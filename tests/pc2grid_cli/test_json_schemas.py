@@ -87,6 +87,7 @@ def test_documents_are_as_their_schema_says(
     done = CliRunner().invoke(app, [*command.split(), "--json"], catch_exceptions=False)
     assert done.exit_code == code, done.stderr
     jsonschema.validate(json.loads(done.stdout), closed(schema(name)))
+    assert all(Path(written).stat().st_size > 0 for written in re.findall(r"out\.\w+", command))
 
 
 @pytest.mark.parametrize("name", DOCUMENTS)

@@ -25,7 +25,6 @@ from pc2grid.errors import (
     Pc2GridError,
     TopicError,
 )
-from pc2grid.io.maps import save_map
 from pc2grid.model import MISSING_FILES, ReadReport
 from pc2grid_cli import console, output as data_loss, relocalize
 from pc2grid_cli.main import app
@@ -33,7 +32,6 @@ from signature.database.maintenance import store
 from tests.helpers.databases import make_entry
 from tests.helpers.recordings import STEP, T0, drive, ros, write_mcap
 from tests.helpers.shared_folders import shared_folder
-from tests.helpers.simulated_drives import office
 
 
 @shared_folder("office_folder")
@@ -216,64 +214,55 @@ def test_a_refusal_is_one_line_and_one_of_advice_and_leaves_nothing(
     assert files(desk) == before
 
 
-@pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    monkeypatch.chdir(tmp_path)
-    write_mcap(tmp_path / "a.mcap", drive())
-    store(tmp_path / "b.submaps", [make_entry("monday")], keep=False)
-    save_map(office(), tmp_path / "office")
-    return tmp_path
-
-
-def test_scans_out_of_order_get_a_hint(folder: Path) -> None:
+def test_scans_out_of_order_get_a_hint(tmp_path: Path) -> None:
     """Their headers count down, while the log is in order; more than wait to be sorted."""
     to = ros()
     scans = [
         to.laser("/scan", T0 - i * STEP, [1.0] * 10)._replace(log_time_ns=T0 + i * STEP) for i in range(400)
     ]
-    write_mcap(folder / "s.mcap", scans)
-    error = CliRunner().invoke(app, ["convert", "s.mcap", "-o", "x.submaps"]).exception
+    write_mcap(tmp_path / "s.mcap", scans)
+    error = CliRunner().invoke(app, f"convert {tmp_path}/s.mcap -o {tmp_path}/x.submaps".split()).exception
     assert isinstance(error, Pc2GridError) and "stamp goes back in time" in error.message
     assert error.hint is not None and "must increase" in error.hint and "--start" in error.hint
 
 
-def test_the_last_session_is_not_removed_unasked(folder: Path) -> None:
-    store(folder / "b.submaps", [make_entry("tuesday", 2)], keep=True)
-    remove = ["db", "remove", "b.submaps"]
-    before = (folder / "b.submaps").read_bytes()
+def test_the_last_session_is_not_removed_unasked(tmp_path: Path) -> None:
+    database = tmp_path / "b.submaps"
+    store(database, [make_entry("monday"), make_entry("tuesday", 2)], keep=False)
+
+    def refused(*names: str) -> DatabaseError:
+        before = database.read_bytes()
+        error = CliRunner().invoke(app, ["db", "remove", str(database), *names]).exception
+        assert isinstance(error, DatabaseError) and database.read_bytes() == before
+        return error
+
     for names in (["monday", "tuesday"], ["tuesday", "monday", "monday"]):
-        error = CliRunner().invoke(app, [*remove, *names]).exception
-        assert isinstance(error, DatabaseError) and "no session would be left" in error.message
+        error = refused(*names)
+        assert "no session would be left" in error.message
         assert error.hint is not None and "--force" in error.hint
-        assert (folder / "b.submaps").read_bytes() == before
-    assert CliRunner().invoke(app, [*remove, "monday"]).exit_code == 0
-    left = (folder / "b.submaps").read_bytes()
-    assert isinstance(CliRunner().invoke(app, [*remove, "tuesday"]).exception, DatabaseError)
-    assert isinstance(CliRunner().invoke(app, [*remove, "monday"]).exception, DatabaseError)  # is not there
-    assert (folder / "b.submaps").read_bytes() == left
-    done = CliRunner().invoke(app, [*remove, "tuesday", "--force"])
+    assert CliRunner().invoke(app, ["db", "remove", str(database), "monday"]).exit_code == 0
+    refused("tuesday")
+    refused("monday")  # is not there
+    done = CliRunner().invoke(app, ["db", "remove", str(database), "tuesday", "--force"])
     assert done.exit_code == 0 and "0 sessions left" in done.stdout
 
 
 def test_the_help_of_a_group_names_all_its_commands() -> None:
-    from typer.main import get_command
-
-    group = get_command(app).commands["compare"]  # type: ignore[attr-defined]
+    group: Any = get_command(app).commands["compare"]
     for name in group.commands:
         assert re.search(rf"\b{name}\b", group.help) or (name == "paper" and "the paper's" in group.help)
 
 
-def test_another_label_is_named(folder: Path) -> None:
-    convert = ["convert", "office.yaml", "-o", "labelled.submaps"]
+def test_another_label_is_named(office_folder: Path, tmp_path: Path) -> None:
+    convert = f"convert {office_folder}/office.yaml -o {tmp_path}/labelled.submaps".split()
     assert CliRunner().invoke(app, [*convert, "--building", "fr079", "--floor", "0"]).exit_code == 0
     error = CliRunner().invoke(app, convert).exception
     assert isinstance(error, OutputError)
     assert "exists already, 'office' made with building = 'fr079', not None" in error.message
 
 
-def test_text_is_calm_and_json_exact(folder: Path) -> None:
-    assert CliRunner().invoke(app, ["convert", "office.yaml", "-o", "c.submaps"]).exit_code == 0
-    locate = ["relocalize", "office.yaml", "-d", "c.submaps"]
+def test_text_is_calm_and_json_exact(office_folder: Path) -> None:
+    locate = f"relocalize {office_folder}/part.yaml -d {office_folder}/b.submaps".split()
     assert "confidence > 0.99" in CliRunner().invoke(app, locate).stdout
     document = json.loads(CliRunner().invoke(app, [*locate, "--json"]).stdout)
     assert 0.99 < document["confidence"] <= 1.0

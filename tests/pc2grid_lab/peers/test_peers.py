@@ -36,6 +36,8 @@ from pc2grid_lab.runner import once
 from pc2grid_lab.sensors import RegisteredSession
 from tests.helpers.simulated_drives import drive, office
 
+KINDS = {kind.name: kind for kind in PEERS}
+
 
 def judged(
     error_m: float | None,
@@ -135,9 +137,8 @@ def test_what_is_missing_is_named_with_its_command(tmp_path: Path, monkeypatch: 
 
 
 def test_a_program_that_ends_without_answers_is_an_error(tmp_path: Path) -> None:
-    (fpfh,) = (kind for kind in PEERS if kind.name == "fpfh-ransac")
     with pytest.raises(PeerFailed, match="fpfh-ransac: no answers"):
-        answers(fpfh, tmp_path / "no map", [tmp_path / "00"], tmp_path / "kept.json")
+        answers(KINDS["fpfh-ransac"], tmp_path / "no map", [tmp_path / "00"], tmp_path / "kept.json")
 
 
 def test_clouds_are_matched_in_a_process_of_its_own(tmp_path: Path) -> None:
@@ -153,11 +154,12 @@ def test_clouds_are_matched_in_a_process_of_its_own(tmp_path: Path) -> None:
     true = SE2(1.0, 2.0, 0.4)
     seen = room @ true.inverse().lift()[:3, :3].T + true.inverse().lift()[:3, 3]
     np.savez(tmp_path / "00.cloud.npz", points_m=seen.astype(np.float32))
-    (fpfh,) = (kind for kind in PEERS if kind.name == "fpfh-ransac")
-    (answer,) = answers(fpfh, tmp_path / "map", [tmp_path / "00"], tmp_path / "kept.json")
+    (answer,) = answers(KINDS["fpfh-ransac"], tmp_path / "map", [tmp_path / "00"], tmp_path / "kept.json")
     assert answer["pose"] == pytest.approx((1.0, 2.0, 0.4), abs=0.1)
     assert answer["cpu_s"] > 0.0 and answer["peak_mb"] > 50.0
-    assert answers(fpfh, tmp_path / "gone", [tmp_path / "00"], tmp_path / "kept.json") == [answer]
+    assert answers(KINDS["fpfh-ransac"], tmp_path / "gone", [tmp_path / "00"], tmp_path / "kept.json") == [
+        answer
+    ]
 
 
 def test_the_particle_filter_is_told_the_map_and_the_scans(
@@ -179,8 +181,7 @@ def test_the_particle_filter_is_told_the_map_and_the_scans(
     once(tmp_path / "00.pickle", lambda: driven)
     ranges_m = np.ones((len(driven), 5))
     np.savez(tmp_path / "00.ranges.npz", ranges_m=ranges_m, fov_rad=3.0, T_base_middle=np.eye(4))
-    (kind,) = (kind for kind in PEERS if kind.name == "particle-filter")
-    (answer,) = answers(kind, tmp_path / "map", [tmp_path / "00"], tmp_path / "kept.json")
+    (answer,) = answers(KINDS["particle-filter"], tmp_path / "map", [tmp_path / "00"], tmp_path / "kept.json")
     assert answer["pose"] == pytest.approx((1.0, 2.0, math.radians(30.0))) and answer["score"] == -0.25
     assert (tmp_path / "query.rawlog").read_text() == carmen_log(driven, ranges_m, 3.0, SE2())
     config = (tmp_path / "query.ini").read_text().splitlines()
