@@ -72,8 +72,10 @@ def answer_of(looks: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
 @pytest.fixture(scope="module")
 def expected(folder: Path) -> list[tuple[Any, ...]]:
     """The answer for the finished file."""
-    words = ["watch", str(folder / "tuesday.mcap"), "-d", str(folder / "plan.submaps"), "--json"]
-    said = CliRunner().invoke(app, words, catch_exceptions=False).stdout
+    words = ["watch", "tuesday.mcap", "-d", "plan.submaps", "--json"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        said = CliRunner().invoke(app, words, catch_exceptions=False).stdout
     return answer_of([json.loads(line) for line in said.splitlines()])
 
 
