@@ -32,12 +32,13 @@ from pc2grid.model import (
 from pc2grid.submaps.submaps import view_at
 from signature.boundary import boundary_bins
 from signature.config import Config
-from signature.database import Provenance, SubmapDatabase, open_database
+from signature.database import Label, Provenance, SubmapDatabase, open_database
 from signature.database.document import graph_to_arrays, row_crc, unpack
 from signature.database.protocol import Entry
 from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
 from signature.freespace import freespace_bins
 from signature.paper import Signature
+from signature.sessions import add_sessions, provenance
 from tests.helpers import postgresql
 
 
@@ -216,6 +217,22 @@ def digests_of(database: SubmapDatabase) -> dict[str, str]:
             digest.update(np.ascontiguousarray(getattr(table, field)[table.session_index == number]))
         digests[info.name] = digest.hexdigest()
     return digests
+
+
+def stored(path: Path, *made: SessionMap, **labels: Label) -> Path:
+    """The database of session maps, as if each was made of a recording of its name."""
+    config, none = Config(), Label()
+    origins = [
+        provenance(
+            Path(f"{one.session}.mcap"),
+            one.session.encode().hex(),
+            config,
+            label=labels.get(one.session, none),
+        )
+        for one in made
+    ]
+    add_sessions(path, list(zip(made, origins, strict=True)), config, keep=False)
+    return path
 
 
 # --- rows as SQL sees them, of either engine ----------------------------------------------------------

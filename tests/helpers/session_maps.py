@@ -1,15 +1,11 @@
 """Session maps with a trajectory and loops, without a recording."""
 
-from pathlib import Path
-
 import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.model import Health, Loop, OccupancyGrid, SessionMap, Trajectory
 from pc2grid.submaps.submaps import partition
 from signature.config import Config
-from signature.database import Label
-from signature.sessions import add_sessions, provenance
 
 
 def way(n: int = 40) -> Trajectory:
@@ -37,14 +33,3 @@ def session(
     return SessionMap(
         session=name, sensor="laser", grid=grid, submaps=submaps, trajectory=trajectory, loops=loops
     )
-
-
-def stored(path: Path, *made: SessionMap, **labels: Label) -> Path:
-    """The database of session maps, as if each was made of a recording of its name."""
-    config, none = Config(), Label()
-    origins = [
-        provenance(Path(f"{one.session}.mcap"), one.session.encode().hex(), config, label=labels.get(one.session, none))
-        for one in made
-    ]
-    add_sessions(path, list(zip(made, origins, strict=True)), config, keep=False)
-    return path

@@ -1,7 +1,5 @@
 """An office, made once for all tests of commands."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from typer.testing import CliRunner

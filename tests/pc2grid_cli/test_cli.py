@@ -1,7 +1,5 @@
 """The program as a user meets it: exit codes, one-line errors, nothing left behind, a quick --help."""
 
-from __future__ import annotations
-
 import os
 import statistics
 import subprocess

@@ -1,7 +1,5 @@
 """What a terminal sees, and what a pipe sees."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

@@ -1,7 +1,5 @@
 """`pc2grid export` in the formats of others, read back by the programs they are for or by their libraries."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
@@ -24,7 +22,8 @@ from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid_cli.main import app
 from signature.config import Config
 from tests.helpers.building_clouds import room_cloud
-from tests.helpers.session_maps import LOOPS, session, stored, way
+from tests.helpers.databases import stored
+from tests.helpers.session_maps import LOOPS, session, way
 from tests.helpers.simulated_drives import office
 
 

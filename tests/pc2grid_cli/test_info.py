@@ -1,7 +1,5 @@
 """`pc2grid info`: the document and the table."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

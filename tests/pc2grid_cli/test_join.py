@@ -1,7 +1,5 @@
 """`db join`, and what is in the frame of a building afterwards."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What --json prints is what its published schema says, and every command has an example."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """`relocalize --near`, `--near-pose`, `--check` and `--check-topic`, as a user types them."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

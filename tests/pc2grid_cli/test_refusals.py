@@ -1,7 +1,5 @@
 """What a user reads who typed what cannot be done: the error, and what to type next."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

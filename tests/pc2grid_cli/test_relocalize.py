@@ -1,7 +1,5 @@
 """relocalize as a user of nav2 and Foxglove calls it: what it writes for a recording and for a map."""
 
-from __future__ import annotations
-
 import json
 import math
 import threading

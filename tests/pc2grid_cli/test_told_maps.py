@@ -1,7 +1,5 @@
 """Maps and poses as the program tells them to others, read by the rules of nav2, AMCL, RViz and tf2."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

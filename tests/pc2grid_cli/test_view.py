@@ -1,7 +1,5 @@
 """`pc2grid view`: what the server gives, and to whom; an upload from its first byte to its answer."""
 
-from __future__ import annotations
-
 import contextlib
 import functools
 import http.client

@@ -1,7 +1,5 @@
 """`pc2grid watch`: the same robot by every way in gives the same answer."""
 
-from __future__ import annotations
-
 import json
 import math
 import signal

@@ -1,7 +1,5 @@
 """`pc2grid relocalize` of several recordings, and of windows along them."""
 
-from __future__ import annotations
-
 import csv
 import json
 import signal

@@ -1,7 +1,5 @@
 """The sensor matrix: its measures over given trials, and one small run."""
 
-from __future__ import annotations
-
 import json
 import math
 import pickle

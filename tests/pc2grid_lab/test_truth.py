@@ -1,7 +1,5 @@
 """What is right: answers that judge each other, clouds of one room, relations and trajectories."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

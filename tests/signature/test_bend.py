@@ -1,7 +1,5 @@
 """A rigid motion that varies over a map."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

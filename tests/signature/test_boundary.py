@@ -1,7 +1,5 @@
 """Boundary histogram (paper III-B)."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -1,7 +1,5 @@
 """Many recordings at once: what a cluster makes is what one process makes, and what is done stays done."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os

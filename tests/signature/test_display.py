@@ -1,7 +1,5 @@
 """Answers, signatures and databases in a notebook: one short line each, and a table."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """From file to file: what is refused before any work, and what a notebook gets back."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A submap is described with the libraries whose structures the paper names: graph and neighbour search."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from typing import Any

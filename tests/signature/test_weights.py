@@ -1,7 +1,5 @@
 """The weights of the bins, and how much a distance says."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The factor in space of `fit.posterior` on made queries whose model is known, and as its users run it."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, replace

@@ -1,7 +1,5 @@
 """`pc2grid_lab.fit.posterior` on made answers whose model is known, and as its users run it."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import asdict, replace
 from pathlib import Path

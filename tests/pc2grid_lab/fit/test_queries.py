@@ -1,7 +1,5 @@
 """Pairs of descriptions of one place, from which the weights of the signatures are learned."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`pc2grid compare paper`: cells, resuming, tables, JSON, pictures."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

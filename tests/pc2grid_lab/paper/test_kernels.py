@@ -1,7 +1,5 @@
 """The compiled step of SDF gives what a plain form in numpy gives, bit for bit."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

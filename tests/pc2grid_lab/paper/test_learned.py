@@ -1,7 +1,5 @@
 """The boundary at several radii, compared by a metric that was learned on other maps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The six rivals and the protocol they share."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`pc2grid compare scale`: recall against the number of places."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """pc2grid beside its peers: what they get, what their answers are worth, and one small run."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

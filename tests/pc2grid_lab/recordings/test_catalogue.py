@@ -1,7 +1,5 @@
 """The catalogue of real recordings names what there is."""
 
-from __future__ import annotations
-
 import os
 import re
 from itertools import combinations

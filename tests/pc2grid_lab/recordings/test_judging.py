@@ -1,7 +1,5 @@
 """Answers of several drives in one map judge each other; true poses are carried to the scans between."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import asdict, replace

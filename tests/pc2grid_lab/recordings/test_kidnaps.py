@@ -1,7 +1,5 @@
 """What is said of a robot that is carried away, from the looks of `watch`."""
 
-from __future__ import annotations
-
 from pc2grid_lab.recordings.judging import Look, followed_row
 from pc2grid_lab.recordings.table import FollowedRow
 

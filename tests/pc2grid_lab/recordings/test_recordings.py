@@ -1,7 +1,5 @@
 """`pc2grid compare recordings`: a small run over recordings that are good, broken and missing."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

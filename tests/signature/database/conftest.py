@@ -1,7 +1,5 @@
 """Databases of two sessions, made once for each engine."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The submap database: what goes in comes out, whole or not at all, on every engine; damage is found."""
 
-from __future__ import annotations
-
 import sqlite3
 from dataclasses import replace
 from pathlib import Path

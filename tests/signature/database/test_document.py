@@ -1,7 +1,5 @@
 """Arrays and documents as bytes: all comes back, and nothing is allocated for what is only claimed."""
 
-from __future__ import annotations
-
 import ast
 import hashlib
 import io

@@ -3,8 +3,6 @@
 `PC2GRID_FUZZ=N` makes the random tests long.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import errno
 import multiprocessing

@@ -1,7 +1,5 @@
 """In a large database, only the maps that look like what the query sees are read and searched."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Iterator, Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sessions renamed, removed and split off, on every engine; all or nothing."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -3,8 +3,6 @@
 What it shares with other engines is in test_database.py.
 """
 
-from __future__ import annotations
-
 import functools
 import multiprocessing
 import subprocess

@@ -1,7 +1,5 @@
 """Which wall points the coarse search takes, and how exactly a place is known."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """What the points of a map and a query change in an answer."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The decision: located, ambiguous or not found."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """A pose that the robot believes in: right, a little off, in another room, in a room that is alike."""
 
-from __future__ import annotations
-
 import functools
 import math
 import os

@@ -1,7 +1,5 @@
 """The masses of places, and what moves them: slips and the prior."""
 
-from __future__ import annotations
-
 import functools
 import math
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What a query keeps of what it has seen, and where it is described."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

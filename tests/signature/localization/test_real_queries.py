@@ -1,7 +1,5 @@
 """Real recordings that were once located in the wrong place."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from itertools import islice

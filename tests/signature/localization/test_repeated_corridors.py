@@ -1,7 +1,5 @@
 """Two equal corridors with equal rooms: nothing but the travel tells one from the other."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Places selected by the signatures of their viewpoints, at every size."""
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import get_args

@@ -1,7 +1,5 @@
 """The sessions of a database become buildings with one frame each."""
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Iterator
@@ -19,8 +17,9 @@ from signature.database.protocol import BuildingFrame, Deformation
 from signature.localization.answer import Answer, answer_in_building, covariance_in_building
 from signature.localization.joining.building import building_map, join_sessions, map_of
 from signature.localization.localizer import locate_map
+from tests.helpers.databases import stored
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
-from tests.helpers.session_maps import session, stored, way
+from tests.helpers.session_maps import session, way
 from tests.helpers.simulated_drives import OTHER, building, office, office_part
 
 NONE: tuple[tuple[float, ...], ...] = ((0.0,) * 3,) * 3

@@ -1,7 +1,5 @@
 """Two maps of one building are joined, and no others."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

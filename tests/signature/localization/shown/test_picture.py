@@ -1,7 +1,5 @@
 """What `--plot` draws: evidence in its colours, nothing in the legend that is not in the picture."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,9 +32,10 @@ from signature.localization.shown.picture import (
     drawn_as,
 )
 from signature.sessions import find
+from tests.helpers.databases import stored
 from tests.helpers.joined_maps import EAST, T_OFFICE_EAST, WEST, in_frame, part
 from tests.helpers.nav2_map import as_mapped, nav2_map
-from tests.helpers.session_maps import session, stored, way
+from tests.helpers.session_maps import session, way
 from tests.helpers.simulated_drives import changed_part, cut, office, plan
 
 

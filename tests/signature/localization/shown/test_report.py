@@ -1,7 +1,5 @@
 """The page contains everything, loads nothing, and agrees with the database and the answer."""
 
-from __future__ import annotations
-
 import base64
 import json
 import math
@@ -26,8 +24,9 @@ from signature.localization.shown.page import Found, contents, write_report
 from signature.paper import Signature, distances
 from signature.sessions import find
 from tests.helpers.browser import DESK, PHONE, Browser
+from tests.helpers.databases import stored
 from tests.helpers.nav2_map import as_mapped
-from tests.helpers.session_maps import LOOPS, session, stored, way
+from tests.helpers.session_maps import LOOPS, session, way
 from tests.helpers.simulated_drives import changed_part, cut, office, plan
 
 NASTY = "</script><b>&"
