@@ -131,9 +131,11 @@ class ColumnMap:
         to_base = pose.inverse()
         origin = to_base.apply(sensor_m[None, :2])[0]
         if not self._stamp:
-            nothing = np.empty((0, 2), np.float32)
             return PlanarScan.of_hits(
-                stamp_ns=stamp_ns, hits_m=nothing, origin_m=origin, free_m=np.zeros(BEARINGS, np.float32)
+                stamp_ns=stamp_ns,
+                hits_m=np.empty((0, 2), np.float32),
+                origin_m=origin,
+                free_m=np.zeros(BEARINGS, np.float32),
             )
         edge_m = self._config.resolution_m
         free_m, sums, low_m = view(

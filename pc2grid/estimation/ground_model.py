@@ -8,7 +8,7 @@ import numpy as np
 
 from pc2grid.clouds.ground import Ground, assumed_ground, find_ground
 from pc2grid.estimation.line_map import TRACKING_PARAMETERS, TrackingParameters
-from pc2grid.geometry import F32, F64, SE2
+from pc2grid.geometry import F32, F64, SE2, leveling
 from pc2grid.model import SENSOR_MODELS, Scan
 
 _UPRIGHT_HEIGHT_M, _UPRIGHT_TILT_RAD = 0.05, math.radians(0.5)
@@ -77,7 +77,7 @@ class GroundModel:
         """Return tilt and height (4, 4) of the base over the floor. The heading of the base stays."""
         if self.ground is None:
             return np.eye(4)
-        level = self.ground.leveling()
+        level = leveling(self.ground.normal)
         # Levelling is the smallest rotation, which may change the heading: turn it back.
         turn = SE2(0.0, 0.0, -SE2.from_matrix(level).yaw).lift()
         level[:3, :3] = turn[:3, :3] @ level[:3, :3]

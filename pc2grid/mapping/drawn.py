@@ -30,7 +30,18 @@ from pc2grid.clouds.cloud import VoxelCloud, random_subset
 from pc2grid.clouds.ground import CLOUD_PARAMETERS, Ground, find_ground
 from pc2grid.clouds.planar_scan import project_to_plane
 from pc2grid.errors import MapFileError
-from pc2grid.geometry import F32, F64, I64, SE2, U8, BoolGrid, frozen_arrays, invert_pose, transform_points
+from pc2grid.geometry import (
+    F32,
+    F64,
+    I64,
+    SE2,
+    U8,
+    BoolGrid,
+    frozen_arrays,
+    invert_pose,
+    leveling,
+    transform_points,
+)
 from pc2grid.io.building_file import (
     UPRIGHT,
     axis_of_file,
@@ -548,7 +559,7 @@ def level_cloud(
     middle = np.median(points, axis=0)
     points = points - middle
     ground = _refined(points, _lowest_floor(points, up), parameters)
-    T_level_cloud = ground.leveling()
+    T_level_cloud = leveling(ground.normal)
     T_level_cloud[:3, 3] = middle - T_level_cloud[:3, :3] @ middle
     T_level_cloud[2, 3] += ground.offset_m - middle[2]
     return T_level_cloud

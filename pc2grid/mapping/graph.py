@@ -361,7 +361,7 @@ def optimised_heights(
     steps_m[np.asarray(restarts, np.int64) - 1] = p.lost_m
     chain = np.arange(count - 1)
     # One row for each observation: the height of `second` less that of `first`, which is -1 for the floor.
-    first = np.concatenate((chain, [-1], np.full(len(seen), -1), [loop.first for loop in loops]))
+    first = np.array([*chain, -1, *np.full(len(seen), -1), *(loop.first for loop in loops)], np.int64)
     second = np.concatenate((chain + 1, [0], seen, [loop.second for loop in loops])).astype(np.int64)
     rise_m = np.concatenate(
         (np.diff(tracked_m), tracked_m[:1], above_floor_m[seen], [loop.rise_m for loop in loops])
@@ -369,7 +369,6 @@ def optimised_heights(
     sigma_m = np.concatenate(
         (steps_m, [p.known_m], np.full(len(seen), LEVEL.seen_m), [loop.sigma_m for loop in loops])
     )
-    first = first.astype(np.int64)
     may_be_wrong = np.arange(len(first)) >= count
     row = np.arange(len(first))
     inner = first >= 0

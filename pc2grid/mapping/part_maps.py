@@ -16,6 +16,8 @@ from pc2grid.geometry import F64, I64, SE2, wrap_angle
 from pc2grid.mapping.graph import (
     FLOOR_LEVELS,
     HeightStep,
+    between,
+    compose,
     floor_warning,
     floors_apart_m,
     optimised_heights,
@@ -82,14 +84,7 @@ def interpolate_corrections(tracked: F64, known: Sequence[int] | I64, corrected:
 
 def _moved(tracked: F64, index: NDArray[np.integer], corrected: F64, which: NDArray[np.integer]) -> F64:
     """Move every scan as if rigidly attached to the known scan number `which` (N,)."""
-    old, new = tracked[index[which]], corrected[which]
-    turn = new[:, 2] - old[:, 2]
-    c, s = np.cos(turn), np.sin(turn)
-    d = tracked[:, :2] - old[:, :2]
-    moved: F64 = np.column_stack(
-        (new[:, 0] + c * d[:, 0] - s * d[:, 1], new[:, 1] + s * d[:, 0] + c * d[:, 1], tracked[:, 2] + turn)
-    )
-    return moved
+    return compose(corrected[which], between(tracked[index[which]], tracked))
 
 
 # --- the map of each part -----------------------------------------------------------------------------
@@ -183,15 +178,11 @@ def _moved_in_plane(T_session_base: F64, tracked: F64, optimised: F64) -> F64:
 
     Tilt and height stay as they are.
     """
-    turn_rad = optimised[:, 2] - tracked[:, 2]
-    c, s = np.cos(turn_rad), np.sin(turn_rad)
-    rotation = np.zeros((len(turn_rad), 3, 3))
-    rotation[:, 0, 0], rotation[:, 0, 1], rotation[:, 1, 0], rotation[:, 1, 1] = c, -s, s, c
-    rotation[:, 2, 2] = 1.0
-    moved = T_session_base.copy()
-    moved[:, :3, :3] = rotation @ T_session_base[:, :3, :3]
-    moved[:, :2, 3] = optimised[:, :2]
-    return moved
+    changes = [
+        (SE2(*after) @ SE2(*before).inverse()).lift()
+        for after, before in zip(optimised, tracked, strict=True)
+    ]
+    return np.array(changes) @ T_session_base
 
 
 def _level(

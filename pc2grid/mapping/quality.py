@@ -20,7 +20,7 @@ S-transformation of Baarda, 1973, as free networks are adjusted in geodesy).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain, tee
 
@@ -101,9 +101,12 @@ def measure_consistency(
         _drawn(keyframe, SE2.from_matrix(trajectory.T_session_base[keyframe.index]), grid, clear, parameters)
         for keyframe in keyframes
     )
+    before, here, after = tee(drawn, 3)
+    next(after, None)
+    with_neighbours = zip(chain((None,), before), here, chain(after, (None,)), strict=False)
     counts = [
-        (scan.index, len(scan.hits_m), _confirmed(before, scan, after, parameters.same_m))
-        for before, scan, after in _with_neighbours(drawn)
+        (scan.index, len(scan.hits_m), _confirmed(earlier, scan, later, parameters.same_m))
+        for earlier, scan, later in with_neighbours
     ]
     if not counts:
         return Consistency()
@@ -155,8 +158,7 @@ def _clear_ground(grid: OccupancyGrid, wall_m: float) -> BoolGrid:
     offsets = np.arange(-reach, reach + 1)
     disc = (np.hypot(*np.meshgrid(offsets, offsets)) * grid.resolution_m <= wall_m + 1e-9).astype(np.uint8)
     near_wall = cv2.dilate(grid.occupied.astype(np.uint8), disc)
-    clear: BoolGrid = grid.free & (near_wall == 0)
-    return clear
+    return np.asarray(grid.free & (near_wall == 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,13 +189,6 @@ def _drawn(
     return _Drawn(keyframe.index, hits_m, grid.look_up(clear, hits_m, outside=False))
 
 
-def _with_neighbours(scans: Iterable[_Drawn]) -> Iterator[tuple[_Drawn | None, _Drawn, _Drawn | None]]:
-    """Yield each scan between the one before and the one after it; None at the two ends."""
-    before, here, after = tee(scans, 3)
-    next(after, None)
-    return zip(chain((None,), before), here, chain(after, (None,)), strict=False)
-
-
 def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m: float) -> int:
     """Count the hits on clear ground that a neighbouring scan confirms within `same_m`.
 
@@ -217,8 +212,7 @@ def _window_shares(poses: F64, hits: I64, contradicting: I64, parameters: Consis
     last = np.searchsorted(travel_m, travel_m + 0.5 * parameters.window_m, side="right")
     in_window = [np.concatenate(([0], np.cumsum(counts))) for counts in (hits, contradicting)]
     all_hits, all_contradicting = (total[last] - total[first] for total in in_window)
-    shares: F64 = all_contradicting / np.maximum(all_hits, parameters.fewest_hits)
-    return shares
+    return np.asarray(all_contradicting / np.maximum(all_hits, parameters.fewest_hits))
 
 
 def _contradictions(
