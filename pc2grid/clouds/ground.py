@@ -7,7 +7,8 @@ normals.
 
 A single view of a tilted camera may show a table only. `FloorBelow` therefore takes the lowest large level in
 the fused surfaces of several views and follows it. One recording is one floor, and a floor is level, so a
-floor that rises is drift of the pose.
+floor that rises is drift of the pose. `vertical_held` is the same for roll and pitch: level and upright
+surfaces of one view say how far its pose leans.
 
 Where no other origin is given, a number was chosen by hand.
 """
@@ -21,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.clouds.cloud import random_subset
-from pc2grid.geometry import F64, BoolGrid, leveling
+from pc2grid.geometry import F64, BoolGrid, skew
 from pc2grid.model import SENSOR_MODELS, Scan
 
 Plane = tuple[F64, float]
@@ -48,10 +49,6 @@ class Ground:
         normal = self.normal.astype(points_m.dtype)
         heights: NDArray[np.floating] = points_m @ normal + points_m.dtype.type(self.offset_m)
         return heights
-
-    def leveling(self) -> F64:
-        """Return T_level_base (4, 4): the smallest rotation that turns the normal upright."""
-        return leveling(self.normal)
 
     def toward(self, other: Ground, gain: float) -> Ground:
         """Return the mean of this ground and another one, weighted 1 - `gain` and `gain` (0..1)."""
@@ -392,8 +389,33 @@ def _normals(points_m: NDArray[np.floating], p: UprightParameters) -> F64:
     around -= around.mean(axis=1, keepdims=True)
     variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / p.neighbours)
     flat = (variances[:, 0] < p.flatness * variances[:, 1]) & (variances[:, 1] > p.breadth_m**2)
-    normals: F64 = axes[flat, :, 0]
-    return normals
+    return np.asarray(axes[flat, :, 0])
+
+
+def vertical_held(shapes: F64, up: F64) -> tuple[F64, F64]:
+    """Return the information (3, 3) of a view on turns of its base, and its pull (3,) on the turn that makes
+    floors level and walls upright.
+
+    shapes : (V, 9) of the surfaces of the view, and up : (3,) expected vertical, both in the axes of the
+    result. A surface that is neither nearly level nor nearly upright counts nothing.
+    """
+    held, axes = np.linalg.eigh(shapes[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3))
+    plane = held[:, 2] > LEVEL.flat
+    # Of an edge two directions are held, and none is its normal.
+    normals, flatness = axes[plane, :, 2], held[plane, 2] - held[plane, 1]
+    vertical, scatter = up, np.eye(3)
+    for _ in range(UPRIGHT.rounds):
+        along = (normals @ vertical) ** 2
+        level, upright = along > LEVEL.level**2, along < 1.0 - LEVEL.level**2
+        off = np.where(level, 1.0 - along, along) / UPRIGHT.scale**2
+        weight = flatness * (level | upright) / (1.0 + off) ** 2
+        scatter = (normals * np.where(level, -weight, weight)[:, None]).T @ normals
+        scatter += weight[level].sum() * np.eye(3)
+        axis = np.linalg.eigh(scatter)[1][:, 0]
+        vertical = axis * np.sign(axis @ up)
+    turn = skew(vertical[None])[0] / UPRIGHT.scale
+    information = turn @ scatter @ turn.T
+    return information, information @ np.cross(vertical, up)
 
 
 def floor_height(
@@ -426,8 +448,7 @@ def _lying_below(shapes: F64, sensor_m: F64, p: LevelParameters) -> BoolGrid:
     # Of a plane, each column of the information points along the normal.
     _, _, xz, _, yz, zz = shapes[:, 3:].T
     lying = (zz > p.flat) & (zz > p.level * np.sqrt(xz**2 + yz**2 + zz**2))
-    below: BoolGrid = near & lying & (shapes[:, 2] < sensor_m[2] - p.below_m)
-    return below
+    return np.asarray(near & lying & (shapes[:, 2] < sensor_m[2] - p.below_m))
 
 
 class FloorBelow:

@@ -22,7 +22,7 @@ from itertools import chain, islice
 import numpy as np
 
 from pc2grid.clouds.columns import ColumnMap
-from pc2grid.clouds.ground import LEVEL, FloorBelow, level_floor
+from pc2grid.clouds.ground import LEVEL, FloorBelow, level_floor, vertical_held
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
 from pc2grid.estimation.line_map import (
@@ -82,7 +82,8 @@ class SpatialMatcher:
         self._parameters, self._tracking = parameters, tracking
         self._map: SpaceMap | None = None
         self._last: F64 = np.eye(4)  # pose of the last scan that was not lost
-        self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0))  # the scan taken last
+        # Of the scan taken last.
+        self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0), np.empty((0, 9)))
 
     def restart(self) -> None:
         """Forget the map: the next scan begins a new one."""
@@ -105,7 +106,7 @@ class SpatialMatcher:
         """Implement `ScanMatcher.take`."""
         if self._map is None:
             self._map = SpaceMap(scan, points_m, self._registration, self._projection)
-        self._thinned = self._map.thin(scan, points_m)
+        self._thinned = self._map.thin(scan, points_m, self._last[:3, :3])
 
     def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
         """Match from the expected pose."""
@@ -126,7 +127,8 @@ class SpatialMatcher:
     def _matched(self, guess: F64, held: PoseWithCovariance) -> ScanMatch:
         """Match the scan taken last with the map from a guess (4, 4), with a belief as prior."""
         space = self._space
-        found = space.match(self._thinned, guess, held)
+        surfaces, points_m, weights = space.surfaces, self._thinned.points_m, self._thinned.weights
+        found = surfaces.match(points_m, weights, surfaces.near(points_m, weights, guess, held), held)
         of_known, of_all = space.agreement(self._thinned, found.pose)
         quality = of_all - self._parameters.residual_weight_per_m * found.residual_m
         return ScanMatch(
@@ -139,18 +141,30 @@ class SpatialMatcher:
         )
 
     def observable(self, fit: ScanMatch) -> ScanMatch:
-        """Implement `ScanMatcher.observable`."""
-        alone, information = fit.alone
+        """Implement `ScanMatcher.observable`.
+
+        Without odometry, the vertical that the scan shows by itself is added: the map leans as far as the
+        scans that made it. Not where the position is not fixed: a slide that turns the scan as well would
+        become known by the turn; nor by a camera, whose narrow view often leaves such a slide.
+        """
+        thinned, (alone, information) = self._thinned, fit.alone
         placement = SurfaceMatch(fit.pose, information, fit.overlap, 0.0, fit.measured)
-        held = self._space.observable(self._thinned, placement)
-        return replace(fit, alone=(alone, held.information), measured=held.measured)
+        held = self._space.surfaces.observable(thinned.points_m, thinned.weights, placement)
+        if not held.measured or not len(thinned.shapes):
+            return replace(fit, alone=(alone, held.information), measured=held.measured)
+        information, pull, turn = held.information.copy(), np.zeros(6), self._last[:3, :3]
+        of_turns, pull[3:] = vertical_held(thinned.shapes, turn @ alone[2, :3])
+        pull[3:] = turn.T @ pull[3:]
+        information[3:, 3:] += turn.T @ of_turns @ turn
+        step = np.asarray(np.linalg.solve(information + 1e-3 * np.eye(6), pull), np.float64)
+        alone = moved(alone[None], step[None])[0]
+        return replace(fit, alone=(alone, information), measured=held.measured)
 
     def follow(self, belief: PoseWithCovariance) -> None:
         """Return None: the surfaces of the last scans are in the map."""
 
     def fits_last(self, belief: PoseWithCovariance) -> bool:
         """Return False: the last scans are not matched alone."""
-        del belief
         return False
 
     def extend(self, pose: F64) -> None:
@@ -273,7 +287,7 @@ def first_pose(scan: Scan, points_m: F32) -> F64:
         up = scan.T_level_base[2, :3]
         if ground is None or ground.normal @ up < LEVEL.level:
             return leveling(up)
-    return np.eye(4) if ground is None else ground.leveling()
+    return np.eye(4) if ground is None else leveling(ground.normal)
 
 
 # --- the local map ------------------------------------------------------------------------------------
@@ -310,15 +324,18 @@ class ThinnedScan:
     """The downsampled points of a scan that are registered.
 
     points_m : (N, 3) about one for each half voxel, base frame. weights : (N,) 0..1, by their noise.
+    shapes : (V, 9) of the surfaces in all its points, turned as the last scan was; none with odometry, which
+    knows the vertical, and of a camera. Voxels bend the normals of surfaces that they cut at a slant, so
+    floors must be nearly level.
     """
 
     points_m: F64
     weights: F64
+    shapes: F64
 
     def placed(self, pose: F64) -> F64:
         """Return the points (N, 3) at a pose (4, 4)."""
-        moved: F64 = self.points_m @ pose[:3, :3].T + pose[:3, 3]
-        return moved
+        return np.asarray(self.points_m @ pose[:3, :3].T + pose[:3, 3])
 
 
 class SpaceMap:
@@ -342,31 +359,27 @@ class SpaceMap:
         noise_range_m = SENSOR_MODELS[scan.sensor].range_of_noise_m(parameters.noise_m)
         self._reach_m = min(projection.max_range_m, noise_range_m)
         ranges_m = np.linalg.norm(points_m - scan.T_base_sensor[:3, 3], axis=1)
-        self._surfaces = SurfaceMap.of_first_scan(ranges_m, 2.0 * projection.max_range_m, registration)
+        self.surfaces = SurfaceMap.of_first_scan(ranges_m, 2.0 * projection.max_range_m, registration)
         self._columns = ColumnMap(self._reach_m, scan.sensor, projection)
         self._added_at: F64 | None = None  # pose of the last scan that joined
         self._floor = FloorBelow()
         self._above_floor_m: float | None = None  # the base, by the last scan
 
     def __bool__(self) -> bool:
-        return self._added_at is not None and bool(self._surfaces)
+        return self._added_at is not None and bool(self.surfaces)
 
-    def thin(self, scan: Scan, points_m: F32) -> ThinnedScan:
-        """Downsample the points (N, 3) of a deskewed scan, base frame."""
-        thinned = self._surfaces.thinned(points_m[self._near(scan, points_m)])
+    def thin(self, scan: Scan, points_m: F32, turn: F64) -> ThinnedScan:
+        """Downsample the points (N, 3) of a deskewed scan, base frame. turn : (3, 3) of the last scan."""
+        near_m = points_m[self._near(scan, points_m)]
+        thinned = self.surfaces.thinned(near_m)
+        shown = near_m if scan.T_odom_base is None and not SENSOR_MODELS[scan.sensor].narrow else near_m[:0]
         away = thinned - scan.T_base_sensor[:3, 3]
         sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
-        return ThinnedScan(thinned, 1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2))
-
-    def match(self, thinned: ThinnedScan, guess: F64, prior: PoseWithCovariance) -> SurfaceMatch:
-        """Register a scan from a guess (4, 4), by KISS-ICP and then by surfaces, with a prior."""
-        near = self._surfaces.near(thinned.points_m, thinned.weights, guess, prior)
-        return self._surfaces.match(thinned.points_m, thinned.weights, near, prior)
-
-    def observable(self, thinned: ThinnedScan, placement: SurfaceMatch) -> SurfaceMatch:
-        """Return a match of a scan with the information that surfaces provide; see
-        `SurfaceMap.observable`."""
-        return self._surfaces.observable(thinned.points_m, thinned.weights, placement)
+        return ThinnedScan(
+            thinned,
+            1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2),
+            self.surfaces.alone(shown @ turn.T),
+        )
 
     def agreement(self, thinned: ThinnedScan, pose: F64) -> tuple[float, float]:
         """Return the agreement of a scan at a pose (4, 4) with surfaces and free space, see
@@ -403,13 +416,11 @@ class SpaceMap:
             if travel_m < p.step_m and turned_rad < p.step_rad:
                 return
         self._added_at = pose
-        self._surfaces.add(thinned.points_m, pose)
+        self.surfaces.add(thinned.points_m, pose)
         sensor_m, placed = (pose @ scan.T_base_sensor)[:3, 3], thinned.placed(pose)
         near_m = points_m[self._near(scan, points_m)].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
-        fine = self._surfaces.fine
-        seen_m = self._floor.follow(
-            travel_m, self._surfaces.alone(near_m), fine.shapes, fine.edge_m, sensor_m
-        )
+        fine = self.surfaces.fine
+        seen_m = self._floor.follow(travel_m, self.surfaces.alone(near_m), fine.shapes, fine.edge_m, sensor_m)
         if seen_m is not None:
             self._above_floor_m = float(pose[2, 3]) - seen_m
         rays_m = placed
@@ -444,5 +455,4 @@ class SpaceMap:
     def _near(self, scan: Scan, points_m: F32) -> BoolGrid:
         """Return a mask (N,) of the points that are near enough to be exact."""
         away = points_m - scan.T_base_sensor[:3, 3].astype(np.float32)
-        near: BoolGrid = np.einsum("ij,ij->i", away, away) < self._reach_m**2
-        return near
+        return np.asarray(np.einsum("ij,ij->i", away, away) < self._reach_m**2)

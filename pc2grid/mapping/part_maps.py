@@ -178,11 +178,8 @@ def _moved_in_plane(T_session_base: F64, tracked: F64, optimised: F64) -> F64:
 
     Tilt and height stay as they are.
     """
-    changes = [
-        (SE2(*after) @ SE2(*before).inverse()).lift()
-        for after, before in zip(optimised, tracked, strict=True)
-    ]
-    return np.array(changes) @ T_session_base
+    pairs = zip(optimised, tracked, strict=True)
+    return np.array([(SE2(*new) @ SE2(*old).inverse()).lift() for new, old in pairs]) @ T_session_base
 
 
 def _level(

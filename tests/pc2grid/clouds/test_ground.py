@@ -1,6 +1,7 @@
 """The ground plane: found below furniture and with a tilted sensor."""
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,10 +14,11 @@ from pc2grid.clouds.ground import (
     assumed_ground,
     find_ground,
     floor_height,
+    vertical_held,
     vertical_of,
 )
 from pc2grid.estimation.surface_map import SurfaceMap
-from pc2grid.geometry import F64, pose_from_rotation_vector, transform_points
+from pc2grid.geometry import F64, leveling, pose_from_rotation_vector, transform_points
 from pc2grid.settings import RegistrationConfig
 
 
@@ -48,7 +50,7 @@ def test_floor_found_under_a_table_and_a_tilted_sensor(tilt_deg: tuple[float, fl
     assert np.degrees(np.arccos(ground.normal @ T[:3, 2])) < 0.5
     assert ground.offset_m == pytest.approx(1.0, abs=0.01)
     assert ground.ceiling_m == pytest.approx(2.5, abs=0.06)
-    levelled = ground.leveling()[:3, :3] @ ground.normal
+    levelled = leveling(ground.normal)[:3, :3] @ ground.normal
     assert levelled == pytest.approx((0, 0, 1), abs=1e-9)
 
 
@@ -206,3 +208,36 @@ def test_a_camera_sees_the_pitch_by_a_single_wall_ahead() -> None:
     assert math.degrees(math.asin(vertical[0])) == pytest.approx(20.0, abs=0.5)
     beside = points[:, [1, 0, 2]] * (1.0, -1.0, 1.0)  # a wall along the way shows no pitch
     assert vertical_of(beside, UP, CAMERA_UPRIGHT) is None
+
+
+def of_walls(points: F64) -> F64:
+    return points[(points[:, 2] > -0.9) & (points[:, 2] < 1.4)]
+
+
+def of_floor(points: F64) -> F64:
+    return points[points[:, 2] < -0.9]
+
+
+@pytest.mark.parametrize("seen", [of_walls, of_floor])
+@pytest.mark.parametrize("tilt_deg", [-4.0, 0.0, 6.0])
+def test_floors_and_walls_of_one_view_hold_its_vertical(seen: Callable[[F64], F64], tilt_deg: float) -> None:
+    rng = np.random.default_rng(1)
+    points = seen(np.concatenate([room(rng, table=False) for _ in range(5)]))
+    tilted = transform_points(pose_from_rotation_vector((math.radians(tilt_deg), 0.0, 0.0)), points)
+    view = SurfaceMap(0.25, 20.0, RegistrationConfig()).alone(tilted)
+    information, pull = vertical_held(view, UP)
+    turn_deg = np.degrees(np.linalg.lstsq(information, pull, rcond=1e-6)[0])
+    assert turn_deg == pytest.approx((-tilt_deg, 0.0, 0.0), abs=0.8)
+    none, tiny, large = np.linalg.eigvalsh(information)
+    assert abs(none) < 1e-6 * large and tiny > math.radians(1.0) ** -2
+
+
+def test_of_a_single_wall_or_a_slanting_plane_no_vertical_follows() -> None:
+    y, z = np.meshgrid(np.linspace(-2, 2, 60), np.linspace(0, 2, 40))
+    wall = np.column_stack((np.full(y.size, 2.0), y.ravel(), z.ravel()))
+    wall += np.random.default_rng(1).normal(0, 0.003, wall.shape)
+    for turn_deg, held in ((0.0, 1), (40.0, 0)):
+        slanting = transform_points(pose_from_rotation_vector((0.0, math.radians(turn_deg), 0.0)), wall)
+        view = SurfaceMap(0.25, 20.0, RegistrationConfig()).alone(slanting)
+        information, _ = vertical_held(view, UP)
+        assert (np.linalg.eigvalsh(information) > math.radians(2.0) ** -2).sum() == held

@@ -12,7 +12,8 @@ import pytest
 from pc2grid import pipeline
 from pc2grid.clouds.ground import FloorBelow, level_floor
 from pc2grid.estimation.ground_model import is_rolling
-from pc2grid.estimation.spatial import SPATIAL_PARAMETERS, SpaceMap, begin, first_pose
+from pc2grid.estimation.scan_matching import ScanMatch
+from pc2grid.estimation.spatial import SPATIAL_PARAMETERS, SpaceMap, SpatialMatcher, begin, first_pose
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import F64, SE2, invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io.recording import open_log
@@ -307,6 +308,30 @@ def test_a_floor_in_view_is_more_exact_than_the_imu(recorded: list[tuple[Scan, F
         felt = dataclasses.replace(scan, T_odom_base=None, T_level_base=level(wrong @ true))
         found = first_pose(felt, felt.points_m)
         assert least_deg <= tilt_deg(found, true) < most_deg
+
+
+@pytest.mark.parametrize("with_odometry", [False, True])
+def test_what_a_scan_shows_of_the_vertical_holds_its_tilt(
+    recorded: list[tuple[Scan, F64]], with_odometry: bool
+) -> None:
+    """A match that leans by 3 degrees as the map does: floor and walls in view turn it back."""
+    scan, true = recorded[0]
+    scan = dataclasses.replace(scan, sensor="lidar", T_odom_base=scan.T_odom_base if with_odometry else None)
+    matcher = SpatialMatcher(RegistrationConfig(), ProjectionConfig())
+    leaning = pose_from_rotation_vector((math.radians(3.0), 0.0, 0.0)) @ matcher.start(scan, scan.points_m)
+    matcher.cut(scan, scan.points_m, leaning, lost=False)
+    matcher.take(scan, scan.points_m)
+    fit = ScanMatch(
+        pose=leaning,
+        alone=(leaning, 1e4 * np.eye(6)),
+        overlap=1.0,
+        measured=True,
+        evidence=0.0,
+        credible=True,
+    )
+    found, information = matcher.observable(fit).alone
+    assert (tilt_deg(found, true) < 1.0) is not with_odometry
+    assert (np.linalg.eigvalsh(information)[-1] > 1.5e4) is not with_odometry
 
 
 def level(T: F64) -> F64:
