@@ -162,7 +162,7 @@ def test_disturbed_recordings_are_compared_and_counted_once() -> None:
         pair_row("wrong", map="hall"),
     )
     text = markdown_page(table(*rows))
-    told = "0.020 to 0.050 m, 2.50 times; windows located rightly and wrongly in its maps: 1"
+    told = "0.020 to 0.050 m, 2.50 times; windows right in one of its maps and wrong in another: 1"
     assert [line for line in text.splitlines() if "times;" in line] == [f"- room, disturbed: {told}"]
     assert "| all queries | 1 | 4 | 4 | 2 of 4" in text
     worse = table(*rows[:-2], pair_row(*["refused"] * 9, map="room, disturbed 1 0..10 s", kind="disturbed"))

@@ -421,7 +421,7 @@ def _disturbed(table: Table) -> list[str]:
             verdicts.setdefault((map_, pair.query, query.window), set()).add(query.right)
     return [
         f"- {name}, disturbed: {min(found):.3f} to {max(found):.3f} m, {max(found) / min(found):.2f} times;"
-        f" windows located rightly and wrongly in its maps:"
+        f" windows right in one of its maps and wrong in another:"
         f" {sum(at[0] == name and right >= {True, False} for at, right in verdicts.items())}"
         for name, found in errors.items()
         if len(found) > 1
