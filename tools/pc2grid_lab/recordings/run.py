@@ -198,7 +198,7 @@ FOLLOWED: tuple[Followed, ...] = (
     *(Followed(before="fr079", map=name) for name in ("fr079 lidar", "fr079 depth", "fr079_floor.ply")),
     *(
         Followed(before=name, map=name, until_s=until_s)
-        for name, until_s in (("fr079", 600.0), ("intel", 900.0), ("csail", 250.0), ("aces", 700.0))
+        for name, until_s in (("fr079", 600.0), ("intel", 900.0), ("csail", 250.0))
     ),
 )
 """All rows, in the order of the page."""
