@@ -767,9 +767,8 @@ def test_robots_that_are_followed_are_those_of_the_page() -> None:
         r"(\d+) of (\d+) robots are located, (\S+) s and (\S+) m after they began, .*? " + wrong, alone
     )
     assert (
-        f"In {located} of {drives} drives a robot that did not know where it was is located, {s} s and {m} m "
-        f"after its start (median); of {told[0]} poses {told[1]} were wrong, and right ones were given up "
-        f"{'once' if told[2] == '1' else told[2] + ' times'}."
+        f"Along {drives} drives {located} robots without a first pose are located, after {s} s and {m} m "
+        f"(median); {told[1]} of {told[0]} poses were wrong."
     ) in FLAT
     ((kidnaps, noticed, s, m, shown, again, again_s, again_m, *told),) = re.findall(
         r"Of (\d+) kidnaps of a robot that knew where it was, (\d+) are noticed, (\S+) s and (\S+) m after "
@@ -778,9 +777,9 @@ def test_robots_that_are_followed_are_those_of_the_page() -> None:
         carried,
     )
     assert (
-        f"Of {kidnaps} such robots, {noticed} noticed it, {s} s and {m} m after they were put down (median). "
+        f"Of {kidnaps} robots carried away while they were off, {noticed} noticed it, after {s} s and {m} m. "
         f"At {shown} of the new places the map shows what the robot sees: {again} robots were located again, "
-        f"after {again_s} s and {again_m} m. Of {told[0]} poses {told[1]} were wrong."
+        f"after {again_s} s and {again_m} m; {told[1]} of {told[0]} poses were wrong."
     ) in FLAT
 
 

@@ -448,7 +448,7 @@ def mapped(rise: float) -> tuple[OccupancyGrid, F64, list[float | None]]:
         assert pose is not None
         if space is None:
             space = SpaceMap(scan, points, RegistrationConfig(), projection)
-        space.extend(scan, points, space.thin(scan, points), pose)
+        space.extend(scan, points, space.thin(scan, points, np.eye(3)), pose)
         planar_scan = space.cut(scan, pose)
         builder.add(planar_scan, SE2.from_matrix(pose))
         above_m.append(planar_scan.above_floor_m)
