@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import math
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,7 @@ from pc2grid.errors import ConfigError
 from pc2grid.geometry import wrap_angle
 from pc2grid.io.atomic import require_writable
 from pc2grid.io.trajectory import read_tum
-from pc2grid.model import OccupancyGrid
+from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.simulate import Building, SimulationConfig, load_building, simulate_session
 from pc2grid.simulate.config import LidarConfig
 from pc2grid_cli import console, options
@@ -55,17 +53,16 @@ def run(given: options.Demo, terminal: console.Console) -> int:
     visitor = SimulationConfig(
         length_m=QUERY_LENGTH_M, seed=12, start_m=QUERY_START_M, building_seed=BUILDING_SEED
     )
-    # The second drive is simulated beside all that needs no more than the first.
-    with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as beside:
-        visit = beside.submit(simulate_session, depth, sensor="depth", config=visitor, overwrite=force)
-        with terminal.progress("simulate lidar") as update:
-            simulate_session(lidar, sensor="lidar", config=mapper, progress=update, overwrite=force)
+    drives: tuple[tuple[SensorKind, Path, SimulationConfig], ...]
+    drives = (("lidar", lidar, mapper), ("depth", depth, visitor))
+    for sensor, path, drive in drives:
+        with terminal.progress(f"simulate {sensor}") as update:
+            simulate_session(path, sensor=sensor, config=drive, progress=update, overwrite=force)
 
-        terminal.note("2/4 convert the lidar's recording into a database")
-        config = Config()
-        session, origin = build_session(lidar, "lidar", config, observer=terminal)
-        add_sessions(database, [(session, origin)], config, keep=False)
-        visit.result()
+    terminal.note("2/4 convert the lidar's recording into a database")
+    config = Config()
+    session, origin = build_session(lidar, "lidar", config, observer=terminal)
+    add_sessions(database, [(session, origin)], config, keep=False)
 
     terminal.note("3/4 relocalize the depth camera's recording in it")
     truth_map, truth_query = read_tum(lidar.with_suffix(".tum")), read_tum(depth.with_suffix(".tum"))
