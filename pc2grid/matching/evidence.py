@@ -149,11 +149,6 @@ def masses(
     return np.asarray(odds / (math.exp(-highest) + odds.sum()))
 
 
-def log_likelihood(fit: Fit) -> float:
-    """Return f + g of a fit: below 0 the two sides contradict each other; 0 where they share nothing."""
-    return tempered(fit.known_agreement, fit.compared) + tempered(fit.backward, fit.looked_at)
-
-
 def tempered(agreement: float, points: float) -> float:
     """Return the log-likelihood of wall points that agree so well, tempered by their number."""
     return log_likelihood_ratio(agreement) * points / (points + EVIDENCE.few)

@@ -28,7 +28,7 @@ from pc2grid.errors import NoScans
 from pc2grid.geometry import SE2, wrap_angle
 from pc2grid.io.map_pose import MapPose
 from pc2grid.libraries import one_blas_thread
-from pc2grid.matching.evidence import log_likelihood
+from pc2grid.matching.evidence import evidence_of
 from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
@@ -155,7 +155,8 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     here = {number for number, *off in apart if _within_tolerance(*off)}
     mass_here = sum(answer.places[number].mass for number in here)
     # Where the map knows too little to contradict the pose, "at no place of this map" does not exclude it.
-    at_most = mass_here if log_likelihood(believed) < 0.0 else 1.0 - answer.mass + mass_here
+    (alone,) = evidence_of([believed])
+    at_most = mass_here if alone.log_likelihood < 0.0 else 1.0 - answer.mass + mass_here
     status = _status(mass_here, at_most, index.config.accept)
     _, off_m, off_rad = apart[0] if apart else (None, None, None)
     return PoseCheck(
