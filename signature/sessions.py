@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,7 +34,7 @@ from signature.config import Config
 from signature.database import Label, Provenance, SubmapDatabase, open_database
 from signature.database.maintenance import exists, store
 from signature.database.postgres import is_url
-from signature.localization.answer import Answer, QueryRecording, followed
+from signature.localization.answer import Answer, followed
 from signature.localization.localizer import Localizer, locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
@@ -200,12 +201,7 @@ def find(
     if is_drawn_map(path):
         drawn = load_drawn_map(path, config)
         answer = locate_map(drawn.grid, index or MapIndex.of(database, config, observer))
-        about = QueryRecording(
-            path_m=answer.path_m,
-            stamp_ns=answer.stamp_ns,
-            source=path.name,
-            warnings=tuple(drawn.warnings),
-        )
+        about = about_query(path, answer, ReadReport(warnings=drawn.warnings))
         return Found.of(answer, about=about, drawn=drawn.grid, **asked)
     with open_log(path, config.read, recover=recover) as log:
         known = prior(log, span)
@@ -222,8 +218,9 @@ def find(
             answer = localizer.answer()
         stamps_ns, poses, health = zip(*seen, strict=True)
         way = Trajectory(stamps_ns=np.array(stamps_ns), T_session_base=np.array(poses), health=health)
-        about = about_log(path, log, answer, span, health)
-        return Found.of(answer, about=about, poses=followed(way, answer), read=log.report(), **asked)
+        read, sensor = log.report(), log.choose().sensor
+        about = about_query(path, answer, read, span, health, sensor)
+        return Found.of(answer, about=about, poses=followed(way, answer), read=read, **asked)
 
 
 def tracked(
@@ -245,25 +242,30 @@ def query_config(database: SubmapDatabase, config: Config) -> Config:
     return database.config().model_copy(update=own)
 
 
-def about_log(
-    path: Path, query: Log, answer: Answer | PoseCheck, span: TimeSpan, health: Sequence[Health]
-) -> QueryRecording:
-    """Return the description of a recording, or of a part of it, in the JSON document of the answer.
+def about_query(
+    path: Path,
+    answer: Answer | PoseCheck,
+    read: ReadReport,
+    span: TimeSpan = TimeSpan(),
+    health: Sequence[Health] = (),
+    sensor: str = "map",
+) -> dict[str, Any]:
+    """Return the description of a recording, or of a part of it, or of a map, in the documents of answers.
 
-    health : of its scans.
+    read : what was read of it, and what was lost. span : the part that was read. health : of its scans.
+    sensor : lidar, laser, depth, or map.
     """
-    report = query.report()
-    return QueryRecording(
-        path_m=answer.path_m,
-        stamp_ns=answer.stamp_ns,
-        source=path.name,
-        start_s=span.start_s,
-        duration_s=span.duration_s,
-        scans=len(health),
-        sensor=query.choose().sensor,
-        lossy=report.lossy,
-        warnings=(*report.warnings, *lost_warnings(health)),
-    )
+    return {
+        "path_m": answer.path_m,
+        "stamp_ns": answer.stamp_ns,
+        "source": path.name,
+        "start_s": span.start_s,
+        "duration_s": span.duration_s,
+        "scans": len(health),
+        "sensor": sensor,
+        "lossy": read.lossy,
+        "warnings": [*read.warnings, *lost_warnings(health)],
+    }
 
 
 # --- from a recording or a map to a session -----------------------------------------------------------

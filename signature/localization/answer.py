@@ -21,7 +21,6 @@ from pydantic import Field
 
 from pc2grid.display import html_picture, html_table, map_png, plain, probability, short
 from pc2grid.geometry import F64, I64, SE2, frozen_arrays, wrap_angle
-from pc2grid.matching.evidence import Evidence
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
@@ -40,24 +39,8 @@ is not lost but doubtful until it is located elsewhere. recovered: located elsew
 lost."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class QueryRecording:
-    """The description of a query in documents.
-
-    path_m, stamp_ns : how far it travelled, and the stamp of its last scan. start_s, duration_s : the part of
-    the recording that was read; None: to its end. sensor : lidar, laser, depth, or map. lossy : data was lost
-    while reading.
-    """
-
-    path_m: float
-    stamp_ns: int
-    source: str
-    start_s: float = 0.0
-    duration_s: float | None = None
-    scans: int = 0
-    sensor: str = "map"
-    lossy: bool = False
-    warnings: tuple[str, ...] = ()
+_NO_MAP = OccupancyGrid(cells=np.empty((0, 0), np.int8), resolution_m=1.0, origin_m=(0.0, 0.0))
+"""Of an answer in a history, of which there may be thousands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -126,46 +109,19 @@ class Place:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Moment:
-    """The answer as it stood after `path_m` of travel.
-
-    pose : of the best hypothesis, if any, in the map of `session`.
-    """
-
-    stamp_ns: int
-    path_m: float
-    status: Status
-    session: str | None
-    pose: SE2 | None
-    confidence: float
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the moment as plain types."""
-        pose = dict.fromkeys(("x", "y", "yaw")) if self.pose is None else _planar(self.pose)
-        return {
-            "stamp_ns": self.stamp_ns,
-            "path_m": self.path_m,
-            "status": self.status,
-            "session": self.session,
-            **pose,
-            "confidence": self.confidence,
-        }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Answer:
     """Where the query was.
 
     status : located, ambiguous (several places fit) or not_found (none does).
     confidence : mass of the first place, see `signature.localization.posterior`.
-    places : all that fit, the likeliest first. evidence : what tells for the first place.
+    places : all that fit, the likeliest first. log_odds : of the first one over "nowhere", by the walls.
     off_map : further places, of which the map shows too little to tell; odometry has carried the robot there
     from places that it shows. The likeliest first; their masses are parts of the same probability.
-    history : how the answer came to be.
+    history : the answers so far, this one last: the best place of each (`moment`).
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with. views_m :
     where it was described by signatures, in that frame. map : of the session of the best hypothesis.
-    sessions, labels : all of the database, that `Fit.session_index` counts. submap_ids : of each of the
-    `hypotheses`, the place of the database that proposed it; -1: none.
+    sessions, labels : all of the database, that `Fit.session_index` counts. part : of the query, see
+    `signature.localization.query.QueryMap`.
     prior : what became of the prior, None if there was none. Not used: "lapsed", registration was lost after
     the time that it is about; "ahead", its time lies after the last scan. excluded : the best place that the
     prior excludes, if nothing that it allows is certain and this fits better.
@@ -191,18 +147,18 @@ class Answer:
     status: Status
     confidence: float
     places: tuple[Place, ...]
-    evidence: Evidence
+    log_odds: float = -math.inf
     stamp_ns: int
     path_m: float
     T_odom_base: SE2
     local_map: OccupancyGrid
     sessions: tuple[str, ...]
     labels: tuple[Label, ...]
-    submap_ids: tuple[int, ...] = ()
-    history: tuple[Moment, ...] = ()
+    part: int = 0
+    history: tuple[Answer, ...] = ()
     timing_ms: dict[str, float] = field(default_factory=dict)
     prior: Literal["used", "lapsed", "ahead"] | None = None
-    excluded: Moment | None = None
+    excluded: Answer | None = None
     in_space: PoseInSpace | None = None
     views_m: tuple[tuple[float, float], ...] = ()
     map: OccupancyGrid | None = None
@@ -258,12 +214,17 @@ class Answer:
     @property
     def hypotheses(self) -> tuple[Fit, ...]:
         """Return the fits of all places, the likeliest place first."""
-        return tuple(fit for _, fit in self.numbered)
+        return tuple(fit for place in self.places for fit in place.fits)
 
     @property
     def best(self) -> Fit | None:
         """Return the first fit of the likeliest place; None: nothing fits."""
         return self.places[0].fits[0] if self.places else None
+
+    @property
+    def pose(self) -> SE2 | None:
+        """Return the base at the query's last scan by the best fit, certain or not; None: nothing fits."""
+        return None if self.best is None else self.best.T_map_query @ self.T_odom_base
 
     @property
     def located(self) -> Fit | None:
@@ -283,7 +244,7 @@ class Answer:
     @property
     def T_map_base(self) -> SE2 | None:
         """Return the base at the query's last scan; None unless located."""
-        return self.T_map_odom and self.T_map_odom @ self.T_odom_base
+        return self.pose if self.located else None
 
     @property
     def T_map_odometry(self) -> SE2 | None:
@@ -303,16 +264,29 @@ class Answer:
         return None if self.located is None else self.located.covariance
 
     @property
-    def moment(self) -> Moment:
-        """Return the answer as it stands, for the history of those after it."""
-        best = self.best
-        return Moment(
-            stamp_ns=self.stamp_ns,
-            path_m=self.path_m,
-            status=self.status,
-            session=self.sessions[best.session_index] if best else None,
-            pose=best.T_map_query @ self.T_odom_base if best else None,
-            confidence=self.confidence,
+    def moment(self) -> Answer:
+        """Return the answer for the history of those after it: the best fit alone, without any map, and with
+        the base itself as the frame of the query."""
+        places = tuple(
+            replace(
+                place,
+                fits=tuple(
+                    replace(fit, T_map_query=fit.T_map_query @ self.T_odom_base) for fit in place.fits[:1]
+                ),
+            )
+            for place in self.places[:1]
+        )
+        return replace(
+            self,
+            places=places,
+            T_odom_base=SE2(),
+            local_map=_NO_MAP,
+            map=None,
+            views_m=(),
+            off_map=(),
+            in_space=None,
+            history=(),
+            excluded=None,
         )
 
     @property
@@ -384,19 +358,19 @@ class Answer:
                     "frame": self.frame_of(h),
                     "building": self.labels[h.session_index].building,
                     "floor": self.labels[h.session_index].floor,
-                    "submap_id": submap_id if submap_id >= 0 else None,
+                    "submap_id": h.submap_id if h.submap_id >= 0 else None,
                     "place": number,
                     **_planar(h.T_map_query @ self.T_odom_base),
                     "score": h.score,
                     "overlap": h.overlap,
                 }
-                for (number, h), submap_id in zip(self.numbered, self.submap_ids, strict=True)
+                for number, h in self.numbered
             ],
-            "history": [moment.to_json() for moment in self.history],
+            "history": [_moment_json(answer) for answer in self.history],
             "line": self.line,
             "off_map": self.off_map_pose,
             "prior": self.prior
-            and {"status": self.prior, "excluded": self.excluded and self.excluded.to_json()},
+            and {"status": self.prior, "excluded": self.excluded and _moment_json(self.excluded)},
             "in_space": self.in_space and self.in_space.to_json(),
             "query": {"path_m": self.path_m, "stamp_ns": self.stamp_ns},
             "database": {"sessions": list(self.sessions)},
@@ -418,6 +392,18 @@ def pose_text(pose: SE2) -> str:
 
 def _planar(pose: SE2) -> dict[str, float]:
     return {"x": pose.x, "y": pose.y, "yaw": pose.yaw}
+
+
+def _moment_json(answer: Answer) -> dict[str, Any]:
+    """Return an `Answer.moment` as plain types."""
+    return {
+        "stamp_ns": answer.stamp_ns,
+        "path_m": answer.path_m,
+        "status": answer.status,
+        "session": answer.best and answer.sessions[answer.best.session_index],
+        **(_planar(answer.pose) if answer.pose else dict.fromkeys(("x", "y", "yaw"))),
+        "confidence": answer.confidence,
+    }
 
 
 @dataclass(frozen=True, slots=True)
@@ -500,8 +486,8 @@ def answer_in_building(answer: AnswerT, frames: Mapping[str, BuildingFrame]) -> 
         answer,
         places=fits_changed(answer.places, placed),
         off_map=fits_changed(answer.off_map, placed),
-        history=tuple(_moment(moment, frames) for moment in answer.history),
-        excluded=answer.excluded and _moment(answer.excluded, frames),
+        history=tuple(answer_in_building(moment, frames) for moment in answer.history),
+        excluded=answer.excluded and answer_in_building(answer.excluded, frames),
         frames=tuple(frame.name or None for frame in frame_of),
     )
     if stated.located is None or answer.in_space is None:
@@ -526,11 +512,6 @@ def covariance_in_building(covariance: F64, T_session_base: SE2, frame: Building
     J = np.eye(3)
     J[:2, 2] = T.y - there.y, there.x - T.x
     return np.asarray(turn @ covariance @ turn.T + J @ np.array(frame.covariance) @ J.T)
-
-
-def _moment(moment: Moment, frames: Mapping[str, BuildingFrame]) -> Moment:
-    frame = frames.get(moment.session or "", _APART)
-    return replace(moment, pose=moment.pose and frame.placed(moment.pose))
 
 
 def _in_space(pose: PoseInSpace, frame: BuildingFrame) -> PoseInSpace:

@@ -36,87 +36,49 @@ and Fox, "Probabilistic Robotics", chapter 8.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.matching.score import Fit, score_fit
 from signature.localization.answer import Answer, Place, State
+from signature.localization.decision import PriorOf
 from signature.localization.hypotheses import agree, more_exact
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR, PRIOR
 from signature.localization.query import QueryMap
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Masses:
-    """The places that a robot may be at, with their masses, at one moment or carried on from it.
-
-    part : of the query, see `QueryMap.part`. places : with when a map showed each last.
-    """
-
-    part: int
-    path_m: float
-    T_odom_base: SE2
-    places: tuple[Place, ...] = ()
-
-    @staticmethod
-    def of(query: QueryMap, found: Answer) -> Masses:
-        """Return the masses that a query gives, first place first. A place of which the map shows too little
-        to align it stays where odometry has carried the robot."""
-        beside = list(found.off_map)
-        places: list[Place] = []
-        for place in found.places:
-            first = place.fits[0]
-            for k, away in enumerate(beside):
-                if first.overlap < POSTERIOR.shown and agree(query.T_odom_base, away.fits[0], first):
-                    places.append(replace(beside.pop(k), mass=away.mass + place.mass))
-                    break
-            else:
-                at, covariances = query.T_odom_base, tuple(fit.covariance for fit in place.fits)
-                places.append(replace(place, seen_m=query.path_m, T_odom_seen=at, seen=covariances))
-        return Masses(
-            part=query.part,
-            path_m=query.path_m,
-            T_odom_base=query.T_odom_base,
-            places=(*places, *beside),
-        )
-
-    def carried(self, now: QueryMap | Masses, odds: float = 1.0) -> Masses:
-        """Return the same places where odometry has carried the robot since: with their covariances there,
-        and their masses multiplied by `odds`."""
-        places = tuple(_carried(place, now, odds) for place in self.places)
-        return replace(self, path_m=now.path_m, T_odom_base=now.T_odom_base, places=places)
-
-    def mass(self, place: Iterable[Fit]) -> float:
-        """Return the mass of the places that put the robot where one of these hypotheses does."""
-        hypotheses = tuple(place)
-        return sum(
-            known.mass
-            for known in self.places
-            if any(agree(self.T_odom_base, fit, h) for fit in known.fits for h in hypotheses)
-        )
-
-    @property
-    def most(self) -> Masses:
-        """Return these masses with the likeliest place alone."""
-        return replace(self, places=(max(self.places, key=lambda place: place.mass),))
-
-    @property
-    def beside(self) -> bool:
-        """Whether the map shows too little of the first place."""
-        return self.places[0].seen_m < self.path_m
-
-    def prior(self, place: Sequence[Fit]) -> float:
-        """Return the prior of a place relative to that of "nowhere", as the masses are (`Belief.before`)."""
-        shown = place[0].overlap >= POSTERIOR.shown
-        found = (known for known in self.places if shown or more_exact(place[0], known.fits[0]))
-        return 1.0 + replace(self, places=tuple(found)).mass(place)
+def with_mass(answer: Answer) -> tuple[Place, ...]:
+    """Return the places that an answer gives mass to, first place first, with when a map showed each last. A
+    place of which the map shows too little to align it stays where odometry has carried the robot."""
+    beside = list(answer.off_map)
+    places: list[Place] = []
+    for place in answer.places:
+        first, at = place.fits[0], answer.T_odom_base
+        for k, away in enumerate(beside):
+            if first.overlap < POSTERIOR.shown and agree(at, away.fits[0], first):
+                places.append(replace(beside.pop(k), mass=away.mass + place.mass))
+                break
+        else:
+            covariances = tuple(fit.covariance for fit in place.fits)
+            places.append(replace(place, seen_m=answer.path_m, T_odom_seen=at, seen=covariances))
+    return (*places, *beside)
 
 
-def _carried(place: Place, now: QueryMap | Masses, odds: float) -> Place:
-    """Return the place with the covariances of the base now, by the odometry since the map showed it."""
+def mass_at(fits: Sequence[Fit], places: Iterable[Place], T_odom_base: SE2) -> float:
+    """Return the mass of those of the places that put the base where one of the fits does."""
+    return sum(
+        place.mass
+        for place in places
+        if any(agree(T_odom_base, known, fit) for known in place.fits for fit in fits)
+    )
+
+
+def _carried(place: Place, now: QueryMap | Answer, odds: float = 1.0) -> Place:
+    """Return the place with the covariances of the base now, by the odometry since the map showed it, and
+    with `odds` times its mass."""
     way_m = (now.path_m - place.seen_m) / PRIOR.sigmas
     drift = np.array([PRIOR.drift, PRIOR.drift, PRIOR.drift_rad_m]) * way_m
     fits = []
@@ -142,9 +104,10 @@ class Belief:
         accept : least mass to say where the robot is, and to say that it is not where it was.
         """
         self._accept = accept
-        self._searches: list[Masses] = []
-        self._place: Masses | None = None  # where it is held to be, located or off the map
-        self._found: tuple[Masses, float] | None = None  # the last search, if it located the robot; doubt
+        # Answers without maps, with all places that have mass (`with_mass`), or the likeliest alone.
+        self._searches: list[Answer] = []
+        self._place: Answer | None = None  # where it is held to be, located or off the map
+        self._found: tuple[Answer, float] | None = None  # the last search, if it located the robot; doubt
         self._was_located = False
 
     @property
@@ -152,29 +115,39 @@ class Belief:
         """Return whether the robot is taken to be somewhere, in the map or off it."""
         return self._place is not None
 
-    @property
-    def session_index(self) -> int | None:
-        """Return the number of the map in which the robot is taken to be."""
-        return self._place.places[0].fits[0].session_index if self._place else None
+    def in_its_map(self, answer: Answer) -> Answer:
+        """Return the answer in which, of each place, the fit in the map in which the robot is taken to be
+        comes first."""
+        number = self._place.places[0].fits[0].session_index if self._place else None
+        places = tuple(
+            replace(place, fits=tuple(sorted(place.fits, key=lambda fit: fit.session_index != number)))
+            for place in answer.places
+        )
+        return replace(answer, places=places)
 
-    def before(self, index: MapIndex, query: QueryMap) -> tuple[Masses, tuple[Place, ...]]:
-        """Return the masses before all scans of a query, carried on by odometry, and those of their places of
-        which the map shows too little. Masses are relative to that of "nowhere"."""
-        known = Masses(part=query.part, path_m=query.path_m, T_odom_base=query.T_odom_base)
-        beside, share = [], kept(query)
+    def before(self, index: MapIndex, query: QueryMap) -> tuple[PriorOf, tuple[Place, ...]]:
+        """Return the prior of each place by the masses before all scans of a query, carried on by odometry,
+        and those places of which the map shows too little. Masses are relative to that of "nowhere"."""
+        known, beside, share = [], [], kept(query)
         for past in self._before(query)[-1:]:
-            odds = share / (1.0 - share * sum(place.mass for place in past.places))
-            known = past.carried(query, odds)
-            for place in known.places:
-                h = place.fits[0]
-                walls = index.maps_for(query)[h.session_index].walls
-                fit = score_fit(walls, query.walls, h.T_map_query, h.covariance)
-                if place.mass >= 1.0 - POSTERIOR.certain and fit.overlap < POSTERIOR.shown:
-                    here = replace(fit, session_index=h.session_index, row=h.row)
-                    beside.append(replace(place, fits=(here,), seen=place.seen[:1]))
-        return known, tuple(beside)
+            odds = share / (1.0 - share * past.mass)
+            known = [_carried(place, query, odds) for place in past.places]
+        for place in known:
+            h = place.fits[0]
+            walls = index.maps_for(query)[h.session_index].walls
+            fit = score_fit(walls, query.walls, h.T_map_query, h.covariance)
+            if place.mass >= 1.0 - POSTERIOR.certain and fit.overlap < POSTERIOR.shown:
+                here = replace(fit, session_index=h.session_index, submap_id=h.submap_id)
+                beside.append(replace(place, fits=(here,), seen=place.seen[:1]))
 
-    def _before(self, query: QueryMap) -> list[Masses]:
+        def prior_of(fits: Sequence[Fit]) -> float:
+            shown = fits[0].overlap >= POSTERIOR.shown
+            found = (place for place in known if shown or more_exact(fits[0], place.fits[0]))
+            return 1.0 + mass_at(fits, found, query.T_odom_base)
+
+        return prior_of, tuple(beside)
+
+    def _before(self, query: QueryMap) -> list[Answer]:
         """Return the searches that lie before all scans of a query, and after a slip before it."""
         first_m = query.keyframes[0].path_m if query.keyframes else 0.0
         return [
@@ -186,7 +159,8 @@ class Belief:
     def follow(self, query: QueryMap, answer: Answer) -> State:
         """Return the state of a running robot after a search. Keep its masses; forget those that no later
         query continues."""
-        now = Masses.of(query, answer)
+        now = replace(answer.moment, places=with_mass(answer), T_odom_base=answer.T_odom_base)
+        likeliest = replace(now, places=tuple(sorted(now.places, key=lambda place: -place.mass)[:1]))
         forgotten = max(len(self._before(query)) - 1, 0)
         here = [known for known in self._searches if known.part == query.part]
         self._searches = [*here[forgotten:], now]
@@ -195,26 +169,26 @@ class Belief:
             doubt = 1.0 - answer.confidence
             if self._found is not None and _mass_there(now, self._found[0]) >= self._accept:
                 doubt *= self._found[1]
-            self._found = now.most, doubt
+            self._found = likeliest, doubt
             if on >= POSTERIOR.likely or doubt <= 1.0 - POSTERIOR.certain:
                 goes_on = on >= POSTERIOR.likely or not self._was_located
-                self._was_located, self._place = True, now.most
+                self._was_located, self._place = True, likeliest
                 return "located" if goes_on else "recovered"
         else:
             self._found = None
             if answer.beside_map is not None:
-                self._place = now.most
+                self._place = likeliest
                 return "off_map"
-        held = self._place
-        if held is not None and held.part == now.part and (on > 1.0 - self._accept or held.beside):
+        held, less_sure = self._place, on > 1.0 - self._accept
+        if held and held.part == now.part and (less_sure or held.places[0].seen_m < held.path_m):
             return "doubtful"
         self._place = None
         return "lost" if self._was_located else "searching"
 
 
-def _mass_there(now: Masses, before: Masses | None) -> float:
+def _mass_there(now: Answer, before: Answer | None) -> float:
     """Return the mass of the places where a robot may be now if odometry has carried it from one place
     before."""
     if before is None or before.part != now.part:
         return 0.0
-    return now.mass(before.carried(now).places[0].fits)
+    return mass_at(_carried(before.places[0], now).fits, now.places, now.T_odom_base)

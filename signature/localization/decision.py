@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
-from pc2grid.matching.evidence import LEFT, NO_EVIDENCE, evidence_of, masses
+from pc2grid.matching.evidence import LEFT, evidence_of, masses
 from pc2grid.matching.score import Fit
 from signature.localization.answer import Answer, Place, Status
 from signature.localization.hypotheses import agree, more_exact, same_pose
@@ -65,7 +65,7 @@ def judge(
         status="located" if sum(mass[:1]) >= index.config.accept else status,
         confidence=sum(mass[:1]),
         places=tuple(Place(fits=fits, mass=share) for (fits, *_), share in zip(known, mass, strict=True)),
-        evidence=known[0][2] if known else NO_EVIDENCE,
+        log_odds=known[0][2].log_odds() if known else -math.inf,
         stamp_ns=query.stamp_ns,
         path_m=query.path_m,
         T_odom_base=query.T_odom_base,
@@ -73,6 +73,7 @@ def judge(
         views_m=tuple(view.center_m for view in query.views),
         sessions=index.sessions,
         labels=index.labels,
+        part=query.part,
     )
 
 
@@ -88,7 +89,7 @@ def weighed(
     first, at = answer.places[0].fits if answer.places else (), answer.T_odom_base
     odds = 1.0
     if answer.confidence:
-        odds = prior_of(first) * math.exp(answer.evidence.log_odds()) / answer.places[0].mass
+        odds = prior_of(first) * math.exp(answer.log_odds) / answer.places[0].mass
     share = 1.0 / (odds * (1.0 + slipped * answer.confidence) + sum(away.mass for away in off_map))
     places = tuple(replace(place, mass=place.mass * odds * share) for place in answer.places)
     here = [

@@ -77,6 +77,7 @@ def align(
     maps : prepared map of each session, by session_index.
     """
     most = HYPOTHESES.refined * config.hypotheses
+    submap_ids = np.append(places.table.submap_id, -1)  # row -1: there is no place
     scores, enough = [0.0], 0.0  # the best so far, and what is worth refining
     for areas in batches:
         coarse: list[tuple[float, int, int, SE2]] = []
@@ -95,13 +96,13 @@ def align(
                 ),
             )
             _, rows = places.nearest(session, poses[:, :2])
-            for (x, y, yaw, score), row in zip(poses.tolist(), rows.tolist(), strict=True):
-                coarse.append((score, session, row, _about(query.center_m, SE2(x, y, yaw))))
+            for (x, y, yaw, score), number in zip(poses.tolist(), submap_ids[rows].tolist(), strict=True):
+                coarse.append((score, session, number, _about(query.center_m, SE2(x, y, yaw))))
             scores = sorted((*scores, *poses[:, 3].tolist()), reverse=True)[:most]
             enough = max(config.coarse_keep * scores[0], scores[-1])
         yield tuple(
-            fitted(query, session, row, maps[session], T_map_query)
-            for score, session, row, T_map_query in coarse
+            fitted(query, session, number, maps[session], T_map_query)
+            for score, session, number, T_map_query in coarse
             if score >= enough
         )
 
@@ -119,18 +120,18 @@ def best_around(query: QueryMap, h: Fit, target: SearchMap) -> Fit:
         parameters=SearchParameters(floor=0.0, most=1),
     )
     found = (
-        fitted(query, h.session_index, h.row, target, _about(center_m, SE2(x, y, yaw)))
+        fitted(query, h.session_index, h.submap_id, target, _about(center_m, SE2(x, y, yaw)))
         for x, y, yaw, _ in poses.tolist()
     )
     return max((h, *found), key=lambda one: one.score)
 
 
-def fitted(query: QueryMap, session_index: int, row: int, target: SearchMap, T_map_query: SE2) -> Fit:
+def fitted(query: QueryMap, session_index: int, submap_id: int, target: SearchMap, T_map_query: SE2) -> Fit:
     """Return the hypothesis that the query lies at a pose, which is refined first."""
     pose, covariance = _refined(query, target, T_map_query)
     covariance = covariance + np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
     fit = score_fit(target.walls, query.walls, pose, covariance)
-    return replace(fit, session_index=session_index, row=row)
+    return replace(fit, session_index=session_index, submap_id=submap_id)
 
 
 def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2, F64]:
@@ -155,15 +156,15 @@ def _refined(query: QueryMap, target: SearchMap, T_map_query: SE2) -> tuple[SE2,
 def distinct(query: QueryMap, hypotheses: Iterable[Fit]) -> tuple[Fit, ...]:
     """Return the hypotheses best first, without those that are one peak with a better one.
 
-    The best one takes over the `row` of the others if it has none.
+    The best one takes over the `submap_id` of the others if it has none.
     """
     kept: list[Fit] = []
     for candidate in sorted(hypotheses, key=lambda h: -h.score):
         better = next((i for i, other in enumerate(kept) if _one_peak(query, candidate, other)), None)
         if better is None:
             kept.append(candidate)
-        elif kept[better].row < 0:
-            kept[better] = replace(kept[better], row=candidate.row)
+        elif kept[better].submap_id < 0:
+            kept[better] = replace(kept[better], submap_id=candidate.submap_id)
     return tuple(kept)
 
 

@@ -30,8 +30,8 @@ from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
-from signature.localization.answer import Answer, Moment, State, fits_changed
-from signature.localization.belief import Belief, Masses
+from signature.localization.answer import Answer, State, fits_changed
+from signature.localization.belief import Belief, mass_at, with_mass
 from signature.localization.decision import PriorOf, decide, judge, weighed
 from signature.localization.hypotheses import HYPOTHESES, moved_to_origin
 from signature.localization.in_space import settle_in_space
@@ -40,7 +40,7 @@ from signature.localization.posterior import POSTERIOR, slip_of
 from signature.localization.query import Query, QueryMap, ViewSpacing, map_as_query
 
 _MOMENTS = 10_000
-"""The latest moments that `Answer.history` tells, some kilometres, so that memory is bounded; by hand."""
+"""The latest answers that `Answer.history` holds, some kilometres, so that memory is bounded; by hand."""
 _LOST_SCANS = 20
 """A robot of which so many scans in a row cannot be registered is looked for by the last one; by hand."""
 _STANDING_S = 2.0
@@ -74,7 +74,7 @@ class Localizer:
         """
         self.index = index
         self._belief = Belief(index.config.accept)
-        self._history: deque[Moment] = deque(maxlen=_MOMENTS)
+        self._history: deque[Answer] = deque(maxlen=_MOMENTS)
         prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
         self.query = Query(index.made_with, index.config, prior_ns=prior_ns, in_space=self.uses_points)
         # Of the last search: part of the query, metres driven in it, and hypotheses.
@@ -179,8 +179,8 @@ class Localizer:
         """
         seen, index, clock = query.map(), index or self.index, self._clock
         clock.lap("describe")
-        before, off_map = self._belief.before(index, seen)
-        prior_of = prior_of or before.prior
+        believed, off_map = self._belief.before(index, seen)
+        prior_of = prior_of or believed
         answer, found = decide(index, seen, (*self._known, *known), prior_of)
         clock.lap("search")
         answer = _with_prior(index, seen, answer, found)
@@ -191,11 +191,11 @@ class Localizer:
             slipped, scans = slip_of(seen, best, walls, index.config.step_m)
             if scans and query is self.query:
                 later = self.search(query.since(scans), index=index)
-                slipped *= _elsewhere(*later, best)
+                slipped *= _elsewhere(later[1], best)
         answer = weighed(answer, prior_of, off_map, slipped, index.config.accept)
         if later and slipped * answer.places[0].mass >= POSTERIOR.likely:
             return later
-        answer = _in_map(answer, self._belief.session_index)
+        answer = self._belief.in_its_map(answer)
         clock.lap("decide")
         if query.in_space is not None:
             answer = settle_in_space(answer, query.in_space, index.surface, index.config.accept)
@@ -229,21 +229,12 @@ def _with_prior(index: MapIndex, query: QueryMap, answer: Answer, found: tuple[F
     return replace(answer, prior="used", excluded=everywhere.moment if excluded else None)
 
 
-def _elsewhere(query: Query, alone: Answer, place: Fit) -> float:
+def _elsewhere(alone: Answer, place: Fit) -> float:
     """Return the mass of all that a query can be but one place, as a multiple of the mass of "nowhere"."""
     if not alone.places or not alone.places[0].mass:
         return 1.0
-    here = Masses.of(query.map(), alone).mass([place])
-    return 1.0 + math.exp(alone.evidence.log_odds()) / alone.places[0].mass * (alone.mass - here)
-
-
-def _in_map(answer: Answer, session_index: int | None) -> Answer:
-    """Return the answer in which, of each place, the hypothesis in the map of one session comes first."""
-    places = [
-        replace(place, fits=tuple(sorted(place.fits, key=lambda fit: fit.session_index != session_index)))
-        for place in answer.places
-    ]
-    return replace(answer, places=tuple(places))
+    here = mass_at([place], with_mass(alone), alone.T_odom_base)
+    return 1.0 + math.exp(alone.log_odds) / alone.places[0].mass * (alone.mass - here)
 
 
 @one_blas_thread
@@ -274,12 +265,11 @@ def locate_map(grid: OccupancyGrid, index: MapIndex) -> Answer:
     return _told(index, replace(answer, places=places, T_odom_base=SE2()), (), clock)
 
 
-def _told(index: MapIndex, answer: Answer, history: Iterable[Moment], clock: Clock) -> Answer:
+def _told(index: MapIndex, answer: Answer, history: Iterable[Answer], clock: Clock) -> Answer:
     """Return an answer, of which nothing is decided any more, with what shows it."""
-    ids, best = index.places.table.submap_id, answer.best
+    best = answer.best
     return replace(
         answer,
-        submap_ids=tuple(int(ids[h.row]) if h.row >= 0 else -1 for h in answer.hypotheses),
         map=None if best is None else index.grids[best.session_index],
         history=(*history, answer.moment),
         timing_ms=dict(clock.total_ms),

@@ -248,7 +248,9 @@ class MapIndex:
     def _fitted(self, query: QueryMap, known: Iterable[Fit]) -> list[Fit]:
         """Return the known hypotheses, refined."""
         maps = self.maps_for(query)
-        return [fitted(query, h.session_index, h.row, maps[h.session_index], h.T_map_query) for h in known]
+        return [
+            fitted(query, h.session_index, h.submap_id, maps[h.session_index], h.T_map_query) for h in known
+        ]
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
         """Return the maps as they are searched for a query: to one in a lower plane, their free space is

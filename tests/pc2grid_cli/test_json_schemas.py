@@ -36,7 +36,7 @@ from pc2grid_cli.main import app
 from pc2grid_cli.options import Export, Simulate
 from signature.config import Config
 from signature.database import Problem
-from signature.localization.answer import AmbiguousLine, Point, QueryRecording
+from signature.localization.answer import AmbiguousLine, Point
 from tests.helpers.json_schema import closed, keys
 from tests.helpers.shared_folders import shared_folder
 
@@ -99,7 +99,7 @@ def test_the_keys_of_a_document_stay(name: str) -> None:
     "kind",
     [
         SE2, Consistency, Contradiction, OdometryCheck, OdometryOutlier, ReadReport, UncertainSegment,
-        TopicInfo, ChosenTopics, Info, SimulatedSession, Problem, QueryRecording, AmbiguousLine, Point,
+        TopicInfo, ChosenTopics, Info, SimulatedSession, Problem, AmbiguousLine, Point,
     ],
 )  # fmt: skip
 def test_frozen_types_are_printed_as_the_schema_says(kind: Any) -> None:

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2
-from pc2grid.matching.evidence import NO_EVIDENCE
 from pc2grid.matching.score import Fit
 from pc2grid.model import OccupancyGrid
 from signature.database import Label, open_database
@@ -46,8 +45,6 @@ def answer(status: str, confidence: float) -> Answer:
         path_m=3.25,
         sessions=("monday", "tuesday <x>"),
         labels=(Label(), Label()),
-        submap_ids=() if status == "not_found" else (-1, -1),
-        evidence=NO_EVIDENCE,
         local_map=SEEN,
     )
 

@@ -26,7 +26,7 @@ from signature.localization.answer import pose_text
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, check_pose
 from signature.localization.posterior import Prior
-from signature.sessions import about_log, open_places, query_config, tracked
+from signature.sessions import about_query, open_places, query_config, tracked
 
 
 def validate(known: KnownPose, *, is_map: bool = False) -> None:
@@ -114,7 +114,7 @@ def check_log(
         with observer.step("check", span.length_ns(log.info.start_ns, log.info.end_ns) * 1e-9):
             index = MapIndex.of(database, config)
             checked = check_pose(counted(), index, T_map_base, stamp_ns=stamp_ns, session=given.session)
-        about = about_log(path, log, checked, span, health)
+        about = about_query(path, checked, log.report(), span, health, log.choose().sensor)
         return checked, {**judgement(checked, database.location), "query": about}
 
 

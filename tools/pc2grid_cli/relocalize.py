@@ -63,7 +63,7 @@ def run(given: options.Relocalize, terminal: console.Console) -> int:
         if is_check:
             checked, document = known_pose.check_log(given, opened, settings, terminal)
             console.print_result(plain(document) if given.json else known_pose.as_text(checked))
-            for warning in document["query"].warnings:
+            for warning in document["query"]["warnings"]:
                 console.warn(warning)
             return console.OK if checked.status == "fine" else console.UNSURE
         frames = opened.frames() if given.frame == "building" else {}
@@ -221,7 +221,7 @@ class Said:
             self.terminal.note(f"wrote {path}")
         _warn_of_missing_points(found, self.database)
         _warn_of_unjoined(found, self.database)
-        for warning in found.about.warnings:
+        for warning in found.about["warnings"]:
             console.warn(warning)
         _warn_of_prior(stated)
         return self._code([found])
@@ -249,11 +249,11 @@ class Said:
         if "trajectory" in outputs:
             write_places(outputs["trajectory"], [(answer.poses, answer) for answer in answers])
         if "plot" in outputs:
-            drawn = [(found, found.poses, found.about.source) for found in all_found]
+            drawn = [(found, found.poses, found.about["source"]) for found in all_found]
             draw_answers(outputs["plot"], self.database, drawn)
         for path in outputs.values():
             self.terminal.note(f"wrote {path}")
-        warnings = [f"{f.about.source}: {w}" for f in all_found for w in f.about.warnings]
+        warnings = [f"{f.about['source']}: {w}" for f in all_found for w in f.about["warnings"]]
         for warning in dict.fromkeys(warnings):
             console.warn(warning)
         return self._code(all_found, failed=len(all_found) < len(rows))
@@ -282,7 +282,7 @@ class Said:
 
     def _code(self, all_found: Sequence[Found], *, failed: bool = False) -> int:
         """Return the exit code. Data that was lost is warned of. failed : a query could not be read."""
-        reports = [(found.about.source, found.read) for found in all_found if found.read is not None]
+        reports = [(found.about["source"], found.read) for found in all_found if found.read is not None]
         for source, report in reports:
             if report.lossy:
                 console.warn(f"{source}: {output.sentence(report)}")
@@ -360,10 +360,10 @@ def _warn_of_prior(answer: Answer) -> None:
     if answer.prior == "ahead":
         console.warn("the time of --near-pose lies after the last scan, so that pose was not used")
     excluded = answer.excluded
-    if excluded is None or excluded.pose is None:
+    if excluded is None or excluded.best is None or excluded.pose is None:
         return
-    pose = excluded.pose
-    where = f"{one_line(excluded.session or '')}: x {pose.x:.2f} m, y {pose.y:.2f} m"
+    session, pose = excluded.sessions[excluded.best.session_index], excluded.pose
+    where = f"{one_line(session)}: x {pose.x:.2f} m, y {pose.y:.2f} m"
     how = "is certain" if excluded.status == "located" else "fits better"
     console.warn(
         f"a place that --near excludes {how}: {where}, confidence {probability(excluded.confidence)}"
@@ -373,7 +373,7 @@ def _warn_of_prior(answer: Answer) -> None:
 def _warn_of_missing_points(found: Found, database: SubmapDatabase) -> None:
     """Warn that points in space were not kept, where an answer is not certain."""
     in_space = {kind for kind, model in SENSOR_MODELS.items() if not model.planar}
-    if found.status == "located" or found.about.sensor not in in_space:
+    if found.status == "located" or found.about["sensor"] not in in_space:
         return
     infos = [info for info in database.sessions() if info.sensor in in_space]
     if infos and not any(info.points for info in infos):

@@ -325,16 +325,16 @@ class Progress:
 
     def tell(self, answer: Answer) -> None:
         """Publish an answer; if it is not located, with the best place all the same."""
-        moment = answer.history[-1]
         self.flush()
+        best, pose = answer.best, answer.pose
         self.events.publish(
             "moment",
             {
-                "path_m": moment.path_m,
-                "status": moment.status,
-                "session": moment.session,
-                "confidence": moment.confidence,
-                "pose": moment.pose and [moment.pose.x, moment.pose.y, moment.pose.yaw],
+                "path_m": answer.path_m,
+                "status": answer.status,
+                "session": best and answer.sessions[best.session_index],
+                "confidence": answer.confidence,
+                "pose": pose and [pose.x, pose.y, pose.yaw],
                 "base": _planar(answer.T_odom_base),
             },
         )

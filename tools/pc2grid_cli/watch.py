@@ -127,7 +127,7 @@ def _search(following: Following, robot: _Robot, prior: Prior | None) -> bool:
 
     def use(found: Answer, lock: threading.Lock) -> bool:
         nonlocal located
-        answer = answer_in_building(found, robot.frames)
+        answer = answer_in_building(replace(found, history=()), robot.frames)
         published = robot.tell(answer, lock)
         document = _document(answer, following.drive, robot, published)
         console.print_result(document if given.json else as_text(answer, published), indent=None)

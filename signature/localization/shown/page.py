@@ -31,7 +31,6 @@ import cv2
 import numpy as np
 
 from pc2grid._version import __version__
-from pc2grid.display import adapter
 from pc2grid.errors import OutputError
 from pc2grid.geometry import F32, F64, I64, SE2
 from pc2grid.io.atomic import replace_file, require_writable
@@ -43,7 +42,7 @@ from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_edges, boundary_p
 from signature.config import SignatureConfig
 from signature.database import SessionInfo, SubmapDatabase, open_database
 from signature.freespace import PATH_BINS, freespace_nodes, freespace_seen, visibility_graph
-from signature.localization.answer import Answer, QueryRecording
+from signature.localization.answer import Answer
 from signature.localization.shown.picture import (
     FURNITURE,
     PALETTE,
@@ -84,12 +83,13 @@ NO_POSES = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((
 class Found(Answer):
     """The answer of `pc2grid.relocalize`, with the query and the database it is about: it can be drawn.
 
-    about : the description of the query in the JSON document. database : where was looked. accept : the
-    confidence that `located` needed. poses : the query in its own frame, see `followed`; empty for a map.
-    drawn : the query if it is a map. read : what was read of a recording, and what was lost; None for a map.
+    about : the query as documents describe it, see `signature.sessions.about_query`. database : where was
+    looked. accept : the confidence that `located` needed. poses : the query in its own frame, see `followed`;
+    empty for a map. drawn : the query if it is a map. read : what was read of a recording, and what was lost;
+    None for a map.
     """
 
-    about: QueryRecording
+    about: dict[str, Any]
     database: str
     accept: float
     poses: Trajectory = NO_POSES
@@ -311,7 +311,7 @@ def _bands(poses: Trajectory, precision: Precision | None) -> list[list[float]]:
 
 
 def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dict[str, Any]:
-    document, query = answer.to_json(), adapter(QueryRecording).dump_python(answer.about, mode="json")
+    document = answer.to_json()
     pose = document["pose"]
     compared = agreements(answer, database)
     # The wall points are the same for all hypotheses; only what the map says about them differs.
@@ -324,7 +324,7 @@ def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dic
         "confidence": round(answer.confidence, 4),
         "accept": answer.accept,
         "space": document["in_space"],
-        "query": {**query, "is_map": answer.about.sensor == "map"},
+        "query": {**answer.about, "is_map": answer.about["sensor"] == "map"},
         "walls": _short(np.ravel(walls_m), 2),
         "hypotheses": [
             {

@@ -76,7 +76,7 @@ def test_what_odometry_says_counts_for_the_place_where_walls_say_it_more_exactly
     )
     away = Place(
         fits=(moved,),
-        mass=1e3 * math.exp(verdict.evidence.log_odds()),
+        mass=1e3 * math.exp(verdict.log_odds),
         seen_m=0.0,
         T_odom_seen=query.T_odom_base,
         seen=(moved.covariance,),

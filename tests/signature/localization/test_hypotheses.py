@@ -80,13 +80,13 @@ def test_a_shoulder_is_led_to_its_peak_and_is_no_place_of_its_own() -> None:
     target = SearchMap.of(office())
     peak = fitted(query, 0, -1, target, SE2())
     aside = SE2(0.6, -0.5, 0.06)
-    shoulder = replace(score_fit(target.walls, query.walls, aside, peak.covariance), row=3)
-    assert distinct(query, (shoulder, peak)) == (replace(peak, row=3),)
+    shoulder = replace(score_fit(target.walls, query.walls, aside, peak.covariance), submap_id=3)
+    assert distinct(query, (shoulder, peak)) == (replace(peak, submap_id=3),)
     led = best_around(query, shoulder, target)
     pose = led.T_map_query
     assert abs(pose.x) + abs(pose.y) < 0.05 and led.score > shoulder.score
     (one,) = distinct(query, (led, peak))
-    assert one.row == 3  # of the place that proposed it
+    assert one.submap_id == 3  # of the place that proposed it
     elsewhere = replace(led, session_index=1)
     farther = replace(shoulder, T_map_query=SE2(0.9, 0.0, 0.0))
     for other in (elsewhere, farther):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import SE2, invert_pose
-from pc2grid.matching.evidence import NO_EVIDENCE
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_space
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, PointMap
@@ -57,7 +56,6 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
         status="located" if alone else "ambiguous",
         confidence=mass,
         places=tuple(Place(fits=(fit,), mass=mass) for fit in fits),
-        evidence=NO_EVIDENCE,
         stamp_ns=0,
         path_m=0.0,
         T_odom_base=SE2(),

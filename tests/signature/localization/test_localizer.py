@@ -47,6 +47,10 @@ def test_a_drive_through_a_known_building_is_located(field_deg: float) -> None:
     travelled = [m.path_m for m in answer.history]
     assert travelled == sorted(travelled) and len(travelled) >= 8
     assert answer.history[-1].confidence >= answer.history[0].confidence
+    # There may be thousands, so none holds a map, or those before it.
+    assert not any(
+        m.local_map.cells.size or m.map or m.history or len(m.hypotheses) > 1 for m in answer.history
+    )
 
 
 def test_an_answer_is_one_search_and_asking_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -136,7 +136,7 @@ def test_without_a_hypothesis_there_is_only_the_map(
     database: SubmapDatabase, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = located(plan(8, 5, []), database, tmp_path)
-    none = replace(found, status="not_found", places=(), submap_ids=())
+    none = replace(found, status="not_found", places=())
     labels = labels_of(monkeypatch)
     draw_answer(tmp_path / "a.png", database, none, found.poses)
     assert labels == ["path of the map's robot"]
