@@ -220,6 +220,13 @@ def test_wrong_answers_are_counted_by_confidence_and_by_drive() -> None:
     assert "| 0.50 to 0.75 | 0 | 0 of 1 [0.00, 0.97] | 0 of 1 [0.00, 0.97] |" in section
 
 
+def test_what_the_search_found_is_told_among_the_overlooked() -> None:
+    first, later = (replace(query(k, "refused"), rank=k, fine=0.95) for k in (0, 1))
+    not_fine = replace(query(2, "refused"), rank=0, fine=0.6)
+    text = markdown_page(table(pair_row(queries=(first, later, not_fine, query(3, "right")))))
+    assert "Of 2 overlooked queries 1 have the right place first" in text
+
+
 @pytest.mark.parametrize(
     ("queries", "words"),
     [

@@ -106,6 +106,11 @@ class QueryRow:
         """Return whether it is covered, and the answer is not its place."""
         return self.covered is True and not (self.located and self.right)
 
+    @property
+    def overlooked(self) -> bool:
+        """Return whether it is missed though `--check` calls its true pose fine, see `FINE`."""
+        return self.missed and (self.fine or 0.0) >= FINE
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Counts:
@@ -136,7 +141,7 @@ class Counts:
             located=len(located),
             right=sum(q.right is True for q in located),
             covered_right=sum(q.right is True and q.covered is True for q in located),
-            overlooked=sum(q.missed and (q.fine or 0.0) >= FINE for q in queries),
+            overlooked=sum(q.overlooked for q in queries),
             wrong=sum(q.right is False for q in located),
             unjudged=sum(q.right is None for q in located),
             failed=sum(bool(q.problem) for q in queries),
@@ -316,11 +321,11 @@ def markdown_page(table: Table, changed: Sequence[RowChange] = ()) -> str:
             "",
             *_disturbed(table),
             "",
+            *_followed(table),
             "## Places",
             "",
             *_places(table),
             "",
-            *_followed(table),
             *_joined(table),
             "## By sensor",
             "",
@@ -594,8 +599,12 @@ def _by_building(table: Table) -> list[str]:
     judged = inside + outside
     buildings = sorted({row.building for row in judged})
     wrong = [building for building in buildings if _total(_of(building, judged)).wrong]
+    first = [query.rank == 0 for row in inside for query in row.queries if query.overlooked]
     return [
         *markdown(heads, cells),
+        "",
+        f"Of {len(first)} overlooked queries {sum(first)} have the right place first, below the confidence of an"
+        " answer: `--check` is surer, because it expects the robot there before it looks.",
         "",
         "Queries of one building are not independent. By buildings, which are, one at least wrong answer:"
         f" {share(len(wrong), len(buildings))}{' (' + ', '.join(wrong) + ')' if wrong else ''}.",
