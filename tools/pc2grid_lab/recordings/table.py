@@ -603,8 +603,8 @@ def _by_building(table: Table) -> list[str]:
     return [
         *markdown(heads, cells),
         "",
-        f"Of {len(first)} overlooked queries {sum(first)} have the right place first, below the confidence of an"
-        " answer: `--check` is surer, because it expects the robot there before it looks.",
+        f"Of {len(first)} overlooked queries {sum(first)} have the right place first, but not surely:"
+        " `--check` is surer, because it expects the robot there before it looks.",
         "",
         "Queries of one building are not independent. By buildings, which are, one at least wrong answer:"
         f" {share(len(wrong), len(buildings))}{' (' + ', '.join(wrong) + ')' if wrong else ''}.",
