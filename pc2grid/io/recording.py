@@ -6,10 +6,11 @@ from __future__ import annotations
 import functools
 import hashlib
 import re
-from collections.abc import Collection, Iterator
-from contextlib import AbstractContextManager
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,7 +21,7 @@ from pc2grid.io.containers import bags, cloud_folder
 from pc2grid.io.containers.bags import RosbagsFile
 from pc2grid.io.containers.mcap import MAGIC, McapSource
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.map_pose import MapPose, last_map_pose
+from pc2grid.io.map_pose import BelievedPose, MapPose, last_map_pose
 from pc2grid.io.plan import Plan, make_plan
 from pc2grid.io.source import (
     LFS_HINT,
@@ -35,7 +36,7 @@ from pc2grid.io.source import (
     is_lfs_pointer,
     is_submap_database,
 )
-from pc2grid.io.stream import LogPart, Stream
+from pc2grid.io.stream import LogPart, Stream, StreamParameters
 from pc2grid.model import ReadReport, Scan
 from pc2grid.settings import ReadConfig
 
@@ -64,20 +65,83 @@ def open_log(path: str | Path, config: ReadConfig | None = None, *, recover: boo
     return Log(source, config)
 
 
-class Log(AbstractContextManager["Log"]):
-    """An open recording. Use as a context manager."""
+SourceT = TypeVar("SourceT", bound="ScanSource")
 
-    def __init__(self, source: MessageSource, config: ReadConfig) -> None:
-        self._source = source
-        self._config = config
+
+class ScanSource(ABC):
+    """Scans of a recording (`Log`), or of a running robot (`LiveLog`). Use as a context manager.
+
+    name : for the user. tally : what was read so far. on_poll : called several times a second while scans of
+    a robot are awaited and with each scan; if it returns True, no more scans follow. lag_s : time from the
+    arrival of the last scan of a robot to the end of its use.
+    """
+
+    lag_s = 0.0
+
+    def __init__(
+        self, source: MessageSource, config: ReadConfig, parameters: StreamParameters | None = None
+    ) -> None:
+        self._source, self._config, self._stream_parameters = source, config, parameters
+        self._path = source.info.path
+        self.name, self.tally = str(self._path), source.tally
+        self.on_poll: Callable[[], bool] = lambda: False
         self._frames = FrameTree()
+        self._plan: Plan | None = None
         self._stream: Stream | None = None
+        self._believed: BelievedPose | None = None
+
+    def __enter__(self: SourceT) -> SourceT:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the source of the messages."""
+        self._source.close()
+
+    def report(self) -> ReadReport:
+        """Return the counts of what was read and of what was lost, so far."""
+        return self.tally.report(self._frames.warnings)
+
+    def choose(self) -> Choice:
+        """Choose the topics to read, and say why; of a robot, by its first seconds.
+
+        Raises TopicError, NoScans, UnsupportedSchema or FrameError.
+        """
+        return self._planned().choice
+
+    def _planned(self) -> Plan:
+        if self._plan is None:
+            read = self._source, self._config, self._frames
+            self._plan = guarded(self._path, lambda: make_plan(*read))
+        return self._plan
+
+    def _begin(self, plan: Plan, part: LogPart | None = None) -> Stream:
+        read = self._source, self._config, self._frames, plan, part, self._stream_parameters
+        self._stream = guarded(self._path, lambda: Stream(*read))
+        return self._stream
+
+    @abstractmethod
+    def parts(self) -> Iterator[Iterator[Scan]]:
+        """Yield one iterator of scans per uninterrupted segment."""
+
+    @abstractmethod
+    def listen_to_pose(self, topic: str) -> BelievedPose:
+        """Return the pose in the map by the robot's own localization, which `parts` keeps up to date.
+
+        topic : of a pose, an odometry or tf. Raises TopicError for one that a recording does not have.
+        """
+
+
+class Log(ScanSource):
+    """An open recording. Use as a context manager."""
 
     @functools.cached_property
     def info(self) -> LogInfo:
         """Return the facts that are known without decoding a message; its times are those of the scans."""
         try:
-            return guarded(self._source.info.path, lambda: _with_scan_times(self._source, self._config.topic))
+            return guarded(self._path, lambda: _with_scan_times(self._source, self._config.topic))
         except LogError:  # raised again where the scans are read
             return self._source.info
 
@@ -94,16 +158,9 @@ class Log(AbstractContextManager["Log"]):
         title = f"{self.info.path.name}: {self.info.format}, {self.info.duration_s:.1f} s"
         return html_table(title, rows, ("topic", "type", "messages"))
 
-    def __exit__(self, *error: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Close the files."""
-        self._source.close()
-
     def messages(self, topics: Collection[str]) -> Iterator[RawMessage]:
         """Yield all messages of some topics as they stand in the recording, by log time. Raises LogError."""
-        return guarded_stream(self._source.info.path, self._source.messages(topics))
+        return guarded_stream(self._path, self._source.messages(topics))
 
     def digest(self) -> str:
         """Return the SHA-256 (hex) of the file, or of all files of a folder one after another, in reading
@@ -114,22 +171,6 @@ class Log(AbstractContextManager["Log"]):
                 while block := file.read(1 << 20):
                     total.update(block)
         return total.hexdigest()
-
-    def report(self) -> ReadReport:
-        """Return the counts of what was read and of what was lost, so far."""
-        return self._source.tally.report(self._frames.warnings)
-
-    def choose(self) -> Choice:
-        """Choose the topics to read, and say why.
-
-        Raises TopicError, NoScans, UnsupportedSchema or FrameError.
-        """
-        return self._plan.choice
-
-    @functools.cached_property
-    def _plan(self) -> Plan:
-        read = self._source, self._config, self._frames
-        return guarded(self._source.info.path, lambda: make_plan(*read))
 
     def map_pose(self, topic: str, end_s: float | None = None) -> MapPose:
         """Return the last pose in a map that localization on the robot published.
@@ -155,15 +196,30 @@ class Log(AbstractContextManager["Log"]):
             raise ConfigError(f"start: expected seconds >= 0, found {start_s:g}")
         if duration_s is not None and not duration_s > 0:
             raise ConfigError(f"duration: expected seconds > 0, found {duration_s:g}")
-        path = self._source.info.path
-        read = self._source, self._config, self._frames, self._plan, self._part(start_s, duration_s)
-        self._stream = guarded(path, lambda: Stream(*read))
-        return guarded_stream(path, self._stream.run())
+        return guarded_stream(self._path, self._begin(self._planned(), self._part(start_s, duration_s)).run())
 
-    @property
-    def last_scan_ns(self) -> int:
-        """Return the log time of the last scan of `scans`; 0 before the first."""
-        return 0 if self._stream is None else self._stream.stamps.last_log_ns
+    def parts(self) -> Iterator[Iterator[Scan]]:
+        """Yield the scans of the whole recording."""
+        yield self.scans() if self._believed is None else self._with_pose(self._believed)
+
+    def listen_to_pose(self, topic: str) -> BelievedPose:
+        """See `ScanSource`."""
+        self._believed = BelievedPose(topic)
+        self._believed.find(self._source.info.topics, self.choose().base_frame)
+        return self._believed
+
+    def _with_pose(self, believed: BelievedPose) -> Iterator[Scan]:
+        """Yield the scans, each after the poses that were recorded before it."""
+        heard = self.messages(believed.topics)
+        message = next(heard, None)
+        for scan in self.scans():
+            assert self._stream is not None
+            while message is not None and message.log_time_ns <= self._stream.stamps.last_log_ns:
+                believed.take(message)
+                message = next(heard, None)
+            yield scan
+        if believed.problem is not None:
+            self.tally.tell(str(believed.problem))
 
     def _part(self, start_s: float, duration_s: float | None) -> LogPart:
         if not start_s and duration_s is None:

@@ -139,7 +139,8 @@ class Tally:
 
     points_dropped : without a finite position. skipped : scans left out, by reason. bytes_lost : of the
     files, skipped for damage. topics_lost : True if these bytes may have held otherwise unknown topics.
-    warnings : sentences for the user.
+    warnings : sentences for the user at the end. arrived, dropped, reconnected : of a robot: messages; scans
+    that waited too long because the computer is too slow; lost connections that were made again.
     """
 
     scans_read: int = 0
@@ -148,6 +149,22 @@ class Tally:
     topics_lost: bool = False
     skipped: dict[str, int] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+    arrived: int = 0
+    dropped: int = 0
+    reconnected: int = 0
+    _told: set[str] = field(default_factory=set)
+    _news: list[str] = field(default_factory=list)
+
+    def tell(self, sentence: str, *, again: bool = False) -> None:
+        """Add a sentence for the user now, at most once. again : even if it was told before."""
+        if again or sentence not in self._told:
+            self._told.add(sentence)
+            self._news.append(sentence)
+
+    def take_news(self) -> list[str]:
+        """Return the sentences for the user since the last call."""
+        taken, self._news = self._news, []
+        return taken
 
     def warn(self, sentence: str) -> None:
         """Add a sentence for the user, unless it is there already."""

@@ -96,7 +96,7 @@ class Stream:
         self._decoder_of(self._lead)
         for sensor in further:
             self._add((sensor.topic, sensor.frame), silent=sensor.silent)
-        self.poses = _Poses(plan, frames, source.tally)
+        self.poses = Poses(plan, frames, source.tally)
         self.stamps = _Stamps(source.tally)
         self._waiting: list[_Waiting] = []
         self._last_read_ns: int | None = None  # stamp of the last scan with odometry
@@ -126,17 +126,13 @@ class Stream:
         """Return the topics whose messages are used."""
         return frozenset(topic.topic for topic in self._handlers)
 
-    @property
-    def _topic(self) -> TopicInfo:
-        return self._lead[0]
-
     def run(self) -> Iterator[Scan]:
         """Yield the scans of the source. Raises as `Log.scans` says."""
         for message in self._source.messages(self.topics, *self._part.with_margin()):
             yield from self.take(message)
         yield from self.release_all()
         p = self._parameters
-        self._part.finish(self._topic.topic, p.max_bad_share, self._decoders[self._lead].empty)
+        self._part.finish(self._lead[0].topic, p.max_bad_share, self._decoders[self._lead].empty)
         if self._last_read_ns is None and self._plan.choice.odometry_topic is not None:
             self._source.tally.warn(
                 f"no scan has odometry: that from {self._plan.choice.odometry_topic} is of other times"
@@ -175,7 +171,7 @@ class Stream:
     # --- decoding messages ----------------------------------------------------------------------------
 
     def _take_scan(self, topic: TopicInfo, data: Any, log_time_ns: int) -> None:
-        leads = topic == self._topic
+        leads = topic == self._lead[0]
         if leads and not self._part.holds(log_time_ns):
             return
         try:
@@ -232,7 +228,7 @@ class Stream:
         """Add a sensor whose scans are put together with those of the first."""
         topic, frame = sensor
         self._further.pop((topic, None), None)
-        of_topic = [s.topic for s in self._plan.sensors].count(topic) > 1 or topic == self._topic
+        of_topic = [s.topic for s in self._plan.sensors].count(topic) > 1 or topic == self._lead[0]
         name = topic.topic + (f" in frame {frame}" if of_topic else "")
         self._further[sensor] = FurtherScans(name, self._decoder_of(sensor), silent=silent)
         return self._further[sensor]
@@ -286,7 +282,7 @@ class Stream:
             scan = self._scan(waiting.stamp_ns, waiting.scan.message, waiting.decoder)
         except UnsupportedSchema as error:
             if not self._part.good:
-                raise UnsupportedSchema(f"{self._topic.topic}: {error.message}", hint=error.hint) from error
+                raise UnsupportedSchema(f"{self._lead[0].topic}: {error.message}", hint=error.hint) from error
             self._skip(error)
             return
         except (PointCloudError, LimitExceeded) as error:
@@ -359,7 +355,7 @@ class Stream:
 
     def _skip(self, error: Pc2GridError) -> None:
         self._source.tally.skip(error.message)
-        self._part.skipped(error, self._topic.topic, self._parameters.patience)
+        self._part.skipped(error, self._lead[0].topic, self._parameters.patience)
 
 
 _Of = tuple[TopicInfo, str | None]
@@ -481,7 +477,7 @@ class _Stamps:
             self._tally.warn("the log has gaps of more than 5 s between scans")
 
 
-class _Poses:
+class Poses:
     """The poses of the sensors on the robot, and of the robot in the odometry frame, by time.
 
     frame : the parent frame of the odometry, such as `odom`; None as long as it is not known.

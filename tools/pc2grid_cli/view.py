@@ -154,16 +154,8 @@ class Locator:
             open_live(source, config.read) as live,
             Follower(localizer, beside=True, step_m=config.relocalize.step_m) as follower,
         ):
-
-            def poll() -> bool:
-                for sentence in live.news.take():
-                    console.warn(sentence)
-                for answer in follower.take():
-                    progress.tell(answer)
-                return False
-
             self.events.publish("begin", {"source": source})
-            feed(live, follower, config, poll, see=progress.add)
+            feed(live, follower, config, lambda answer, lock: progress.tell(answer), see=progress.add)
             progress.flush()
         self.events.publish("end", {"source": source, "error": "the source has ended", "hint": None})
 

@@ -11,9 +11,8 @@ import contextlib
 import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar, cast
 
 import numpy as np
@@ -22,20 +21,16 @@ from pc2grid import libraries
 from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, TrackingLost, one_line
 from pc2grid.geometry import SE2
-from pc2grid.io.live.live_log import FeedCounts, LiveLog, News, is_robot, open_live
+from pc2grid.io.live.live_log import LiveLog, is_robot, open_live
 from pc2grid.io.live.nav2 import Nav2Publisher, Outlet
-from pc2grid.io.map_pose import BelievedPose, MapPose
-from pc2grid.io.recording import Log, open_log
-from pc2grid.io.source import Choice, RawMessage
-from pc2grid.model import ReadReport, RegisteredScan, Scan
+from pc2grid.io.recording import ScanSource, open_log
+from pc2grid.model import RegisteredScan
 from pc2grid.observer import Observer
 from pc2grid.pipeline import follow
-from pc2grid.settings import ReadConfig
 from pc2grid_cli import console, known_pose, options
 from pc2grid_cli.documents import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
-from signature.database.protocol import BuildingFrame, SessionInfo
 from signature.localization.answer import Answer, answer_in_building, pose_text
 from signature.localization.joining.building import map_of
 from signature.localization.localizer import Follower, Localizer, ResetPolicy
@@ -61,17 +56,17 @@ def run(given: options.Watch, terminal: console.Console) -> int | None:
         if not is_robot(given.source):
             raise ConfigError(f"--publish: {given.source} takes no messages", hint="ws://ROBOT:8765 does")
     end_s = math.inf if given.timeout is None else time.monotonic() + given.timeout
+    as_robot = given.real_time or is_robot(given.source)
     with (
         known_pose.searched(given) as (opened, _),
-        followed(given.source, settings.read, real_time=given.real_time) as drive,
+        (open_live if as_robot else open_log)(given.source, settings.read) as drive,
     ):
         following = Following(given, drive, opened, query_config(opened, settings), end_s, terminal)
         if check_topic is not None:
             good = _check(following, check_topic)
         else:
-            with _robot_of(following) as robot:
-                # The region is that of the first scan.
-                good = _search(following, robot, prior and replace(prior, stamp_ns=0))
+            # The region is that of the first scan.
+            good = _search(following, prior and replace(prior, stamp_ns=0))
         _summarize(drive, terminal)
     return None if good else console.UNSURE
 
@@ -96,34 +91,19 @@ class Following:
         return MapIndex.of(self.database, self.config, self.terminal)
 
     def run(self, searcher: Any, use: Callable[[ResultT, threading.Lock], bool]) -> None:
-        """Search after each metre.
-
-        searcher : what `Follower` takes. use : what to do with each result, and with the lock that is held
-        to read the database; true if that was enough.
-        """
-        drive, over, step_m = self.drive, False, self.config.relocalize.step_m
-        with Follower(searcher, beside=drive.realtime, step_m=step_m) as follower:
-
-            def poll() -> bool:
-                nonlocal over
-                _print_news(drive)
-                for result in follower.take():
-                    over = over or use(result, follower.lock)
-                over = over or time.monotonic() > self.end_s
-                return over
-
-            drive.on_poll = poll  # a robot may be silent from the beginning
-            choice = drive.choose()
-            self.terminal.note(f"{drive.name}: {choice.topic} ({choice.sensor}): {choice.reason}", level=1)
-            feed(drive, follower, self.config, poll, observer=self.terminal)
+        """Search after each metre. searcher : what `Follower` takes. use : see `feed`."""
+        beside, step_m = isinstance(self.drive, LiveLog), self.config.relocalize.step_m
+        with Follower(searcher, beside=beside, step_m=step_m) as follower:
+            feed(self.drive, follower, self.config, use, end_s=self.end_s, observer=self.terminal)
 
 
-def _search(following: Following, robot: _Robot, prior: Prior | None) -> bool:
+def _search(following: Following, prior: Prior | None) -> bool:
     """Follow the robot. Return whether it is located at last.
 
     prior : where the robot is at the beginning, as far as it is known.
     """
     given, index, located = following.given, following.index, False
+    robot = _Robot(following)
 
     def use(found: Answer, lock: threading.Lock) -> bool:
         nonlocal located
@@ -134,14 +114,15 @@ def _search(following: Following, robot: _Robot, prior: Prior | None) -> bool:
         located = answer.status == "located"
         return answer.is_told and given.first
 
-    following.run(Localizer(index if prior is None else index.within(prior)), use)
+    with robot.publisher or contextlib.nullcontext():
+        following.run(Localizer(index if prior is None else index.within(prior)), use)
     return located
 
 
 def _check(following: Following, topic: str) -> bool:
     """Follow the robot, and judge the pose that it believes in. Return whether the last one was fine."""
     given, drive, fine = following.given, following.drive, False
-    drive.listen_to_pose(topic)
+    believed = drive.listen_to_pose(topic)
 
     def use(checked: PoseCheck, lock: threading.Lock) -> bool:
         nonlocal fine
@@ -155,35 +136,41 @@ def _check(following: Following, topic: str) -> bool:
         console.print_result(said, indent=None)
         return False
 
-    following.run(PoseWatch(following.index, lambda: drive.believed, given.session), use)
-    if drive.believed is None:
+    following.run(PoseWatch(following.index, lambda: believed.newest, given.session), use)
+    if believed.newest is None:
         console.warn(f"{topic}: no pose of the robot in a map; nothing was checked")
     return fine
 
 
-@dataclass(kw_only=True)
 class _Robot:
     """The robot that is told where it is.
 
     sessions : of the database, by name. frames : of the buildings that answers are in, by session.
-    publisher : None if it is not told anything. map_session : the session whose map was published.
+    publisher : None if it is not told anything.
     """
 
-    following: Following
-    sessions: Mapping[str, SessionInfo]
-    frames: Mapping[str, BuildingFrame]
     publisher: Nav2Publisher | None = None
-    resets: ResetPolicy = field(default_factory=ResetPolicy)
-    map_session: str | None = None
+
+    def __init__(self, following: Following) -> None:
+        """Announce what is published. Raises LiveError if the robot takes no messages."""
+        given, drive, database = following.given, following.drive, following.database
+        self._given, self._drive, self.database = given, drive, database
+        self.sessions = {info.name: info for info in database.sessions()}
+        self.frames = database.frames() if given.frame == "building" else {}
+        self._resets, self._map_session = ResetPolicy(), ""
+        topics = [f"/{given.publish}"] * (given.publish != "none") + ["/map"] * given.publish_map
+        if topics and isinstance(drive, LiveLog):
+            self.publisher = Nav2Publisher(cast(Outlet, drive.feed), given.map_frame)
+            self.publisher.announce(*topics)
 
     def tell(self, answer: Answer, lock: threading.Lock) -> list[str]:
         """Publish what follows from an answer. Return the topics. lock : is held to read the database."""
-        publisher, live, session = self.publisher, self.following.drive, answer.session
+        publisher, live, session = self.publisher, self._drive, answer.session
         if publisher is None or not isinstance(live, LiveLog):
             return []
         if answer.state == "lost":
             publisher.stop_tf()
-        may_reset = self.resets.allows(answer.state)
+        may_reset = self._resets.allows(answer.state)
         if session is None or not answer.is_told:
             return []
         return [
@@ -194,18 +181,18 @@ class _Robot:
     def _tell_map(
         self, publisher: Nav2Publisher, answer: Answer, session: str, lock: threading.Lock
     ) -> list[str]:
-        if not self.following.given.publish_map or session == self.map_session:
+        if not self._given.publish_map or session == self._map_session:
             return []
-        self.map_session = session
+        self._map_session = session
         with lock:
-            grid = map_of(self.following.database, session, self.frames)
+            grid = map_of(self.database, session, self.frames)
         publisher.map(answer.stamp_ns, grid)
         return ["/map"]
 
     def _tell_pose(
         self, publisher: Nav2Publisher, live: LiveLog, answer: Answer, may_reset: bool
     ) -> list[str]:
-        publish = self.following.given.publish
+        publish = self._given.publish
         if publish == "initialpose" and may_reset:
             assert answer.covariance is not None
             stamp_ns, T_map_base = _now(answer, live)
@@ -213,7 +200,7 @@ class _Robot:
             return ["/initialpose"]
         if publish != "tf":
             return []
-        T_map_odom, odom_frame = answer.T_map_odometry, live.odometry_frame
+        T_map_odom, odom_frame = answer.T_map_odometry, live.poses.frame
         if T_map_odom is None or odom_frame is None:
             console.warn("--publish tf: the robot has no odometry; nothing is published")
             return []
@@ -221,26 +208,9 @@ class _Robot:
         return ["/tf"]
 
 
-@contextlib.contextmanager
-def _robot_of(following: Following) -> Iterator[_Robot]:
-    """Yield the robot, ready to be told where it is. Raises LiveError if it takes no messages."""
-    given, drive = following.given, following.drive
-    robot = _Robot(
-        following=following,
-        sessions={info.name: info for info in following.database.sessions()},
-        frames=following.database.frames() if given.frame == "building" else {},
-    )
-    topics = [f"/{given.publish}"] * (given.publish != "none") + ["/map"] * given.publish_map
-    with contextlib.ExitStack() as stack:
-        if topics and isinstance(drive, LiveLog):
-            robot.publisher = stack.enter_context(Nav2Publisher(cast(Outlet, drive.feed), given.map_frame))
-            robot.publisher.announce(*topics)
-        yield robot
-
-
 def _now(answer: Answer, live: LiveLog) -> tuple[int, SE2]:
     """Return the stamp of the newest odometry, and the pose of the base there: the answer is older."""
-    T_map_odom, newest = answer.T_map_odometry, live.newest_odometry()
+    T_map_odom, newest = answer.T_map_odometry, live.poses.newest_odometry()
     if T_map_odom is None or newest is None:
         assert answer.T_map_base is not None
         return answer.stamp_ns, answer.T_map_base
@@ -248,22 +218,16 @@ def _now(answer: Answer, live: LiveLog) -> tuple[int, SE2]:
     return stamp_ns, T_map_odom @ SE2.from_matrix(T_odom_base)
 
 
-def _print_news(drive: ScanSource) -> None:
-    for sentence in drive.news.take():
-        console.warn(sentence)
-
-
 def _summarize(drive: ScanSource, terminal: console.Console) -> None:
     """Print what was left out, at the end."""
-    _print_news(drive)
-    report, counts = drive.report(), drive.counts
-    for warning in report.warnings:
+    report, dropped = drive.report(), drive.tally.dropped
+    for warning in (*drive.tally.take_news(), *report.warnings):
         console.warn(warning)
     skipped = sum(report.scans_skipped.values())
-    if counts.dropped or skipped:
+    if dropped or skipped:
         reasons = ", ".join(f"{count} {reason}" for reason, count in report.scans_skipped.items())
         terminal.note(
-            f"{report.scans_read} scans used, {counts.dropped} dropped to keep up, {skipped} unusable"
+            f"{report.scans_read} scans used, {dropped} dropped to keep up, {skipped} unusable"
             + (f" ({reasons})" if reasons else "")
         )
 
@@ -296,7 +260,7 @@ def _document(answer: Answer, drive: ScanSource, robot: _Robot, published: list[
     watched = None
     if session is not None:
         watched = {
-            "database": robot.following.database.location,
+            "database": robot.database.location,
             "session": session,
             "building": answer.label.building,
             "floor": answer.label.floor,
@@ -320,86 +284,36 @@ def _document(answer: Answer, drive: ScanSource, robot: _Robot, published: list[
     return plain(document)
 
 
-@contextlib.contextmanager
-def followed(source: str, config: ReadConfig, *, real_time: bool = False) -> Iterator[ScanSource]:
-    """Open a robot by its address, or a recording by its path.
-
-    real_time : a recording is replayed at its own pace. Raises what `open_live` and `open_log` do.
-    """
-    if real_time or is_robot(source):
-        with open_live(source, config) as live:
-            yield live
-    else:
-        with open_log(Path(source), config) as log:
-            yield WholeRecording(log)
-
-
-class WholeRecording:
-    """A finished recording, read as by all other commands: each scan once, as fast as it can be used."""
-
-    realtime = False
-    lag_s = 0.0
-
-    def __init__(self, log: Log) -> None:
-        self.on_poll: Callable[[], bool] = lambda: False
-        self.name = str(log.info.path)
-        self.counts, self.news = FeedCounts(), News()
-        self._log = log
-        self._pose: BelievedPose | None = None
-        self._messages: Iterator[RawMessage] = iter(())
-        self._next: RawMessage | None = None
-
-    def choose(self) -> Choice:
-        """See LiveLog."""
-        return self._log.choose()
-
-    def parts(self) -> Iterator[Iterator[Scan]]:
-        """See LiveLog."""
-        yield self._log.scans()
-        if self._pose is not None and self._pose.problem is not None:
-            self.news.tell(str(self._pose.problem))
-
-    def report(self) -> ReadReport:
-        """See LiveLog."""
-        return self._log.report()
-
-    def listen_to_pose(self, topic: str) -> None:
-        """See LiveLog."""
-        self._pose = BelievedPose(topic)
-        self._pose.find(self._log.info.topics, self.choose().base_frame)
-        self._messages = self._log.messages(self._pose.topics)
-        self._next = next(self._messages, None)
-
-    @property
-    def believed(self) -> MapPose | None:
-        """Return the newest pose that was recorded before the last scan."""
-        if self._pose is None:
-            return None
-        while self._next is not None and self._next.log_time_ns <= self._log.last_scan_ns:
-            self._pose.take(self._next)
-            self._next = next(self._messages, None)
-        return self._pose.newest
-
-
-ScanSource = LiveLog | WholeRecording
-"""Scans, part after part, and what is known of how they come."""
-
-
 def feed(
     drive: ScanSource,
-    follower: Follower[Any],
+    follower: Follower[ResultT],
     config: Config,
-    poll: Callable[[], bool],
+    use: Callable[[ResultT, threading.Lock], bool | None],
     *,
+    end_s: float = math.inf,
     see: Callable[[RegisteredScan | None], None] = lambda registered: None,
     observer: Observer = Observer(),
 ) -> None:
-    """Feed a follower with all scans of a robot or a recording.
+    """Feed a follower with all scans of a robot or a recording, and print its news.
 
-    poll : called after each scan, and while none comes; true if that was enough.
-    see : called with each registered scan; None: what follows does not go on from what was before.
+    use : called with each result of the follower, and with the lock that is held to read the database; true
+    if that was enough. end_s : of `time.monotonic`. see : called with each registered scan; None: what
+    follows does not go on from what was before.
     """
-    drive.on_poll = poll
+    over = False
+
+    def poll() -> bool:
+        nonlocal over
+        for sentence in drive.tally.take_news():
+            console.warn(sentence)
+        for result in follower.take():
+            over = over or bool(use(result, follower.lock))
+        over = over or time.monotonic() > end_s
+        return over
+
+    drive.on_poll = poll  # a robot may be silent from the beginning
+    choice = drive.choose()
+    observer.on_note(f"{drive.name}: {choice.topic} ({choice.sensor}): {choice.reason}")
     for scans in drive.parts():
         try:
             for registered, planar_scan in follow(scans, config, observer):
@@ -420,9 +334,9 @@ def feed(
 def live(drive: ScanSource, elapsed_s: float) -> Document:
     """Return how it is followed so far. elapsed_s : time that the search took."""
     return {
-        "scans": drive.report().scans_read,
-        "dropped": drive.counts.dropped,
-        "reconnected": drive.counts.reconnected,
+        "scans": drive.tally.scans_read,
+        "dropped": drive.tally.dropped,
+        "reconnected": drive.tally.reconnected,
         "lag_s": drive.lag_s,
         "elapsed_s": elapsed_s,
     }

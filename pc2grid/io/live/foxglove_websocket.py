@@ -21,7 +21,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from pc2grid.errors import LiveError
-from pc2grid.io.live.live_log import INBOX, Feed, InboxParameters
+from pc2grid.io.live.live_log import LIVE, Feed, LiveParameters
 from pc2grid.io.messages.ros import short_name
 from pc2grid.io.source import RawMessage, TopicInfo
 from pc2grid.settings import ReadConfig
@@ -189,16 +189,16 @@ class FoxgloveWebsocket(Feed):
         self,
         url: str,
         config: ReadConfig,
-        parameters: ConnectionParameters = CONNECTION,
-        inbox: InboxParameters = INBOX,
+        connection: ConnectionParameters = CONNECTION,
+        parameters: LiveParameters = LIVE,
     ) -> None:
         """Connect. Raises LiveError if the first connection fails."""
-        super().__init__(url, config, inbox)
-        self._introduced_s = parameters.open_s
+        super().__init__(url, config, parameters)
+        self._introduced_s = connection.open_s
         self._advertised: dict[str, _Advertised] = {}
         self._may_publish = False
         self._introduced = threading.Event()
-        self._link = _Link(url, parameters, self._take, self._connection_changed)
+        self._link = _Link(url, connection, self._take, self._connection_changed)
         self._link.start()
 
     def close(self) -> None:
@@ -265,7 +265,7 @@ class FoxgloveWebsocket(Feed):
         # RecursionError: lists in lists without end. OverflowError: infinity as a number of a channel.
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError) as error:
             reason = f"{type(error).__name__}: {str(error)[:100]}"
-            self.news.tell(f"{self.name}: a message that is not understood ({reason})")
+            self.tally.tell(f"{self.name}: a message that is not understood ({reason})")
 
     def _take_document(self, document: dict[str, Any]) -> None:
         match document["op"]:
@@ -279,7 +279,7 @@ class FoxgloveWebsocket(Feed):
                 self._may_publish = "clientPublish" in document.get("capabilities", [])
                 self._introduced.set()
             case "status" if document.get("level", 0) >= 1:
-                self.news.tell(f"{self.name} says: {str(document.get('message', ''))[:500]}")
+                self.tally.tell(f"{self.name} says: {str(document.get('message', ''))[:500]}")
 
     def _take_channel(self, channel: dict[str, Any]) -> None:
         number, found = int(channel["id"]), _topic_of(channel)
@@ -287,7 +287,7 @@ class FoxgloveWebsocket(Feed):
             twin = next((t for k, t in self._offered.items() if t.topic == found.topic and k != number), None)
             if twin is not None:
                 types = f", as {twin.type} and {found.type}" if twin.type != found.type else ""
-                self.news.tell(f"{found.topic}: published twice{types}; the first is used")
+                self.tally.tell(f"{found.topic}: published twice{types}; the first is used")
             if twin is None or twin.type != found.type:
                 self._offer(number, found)
 

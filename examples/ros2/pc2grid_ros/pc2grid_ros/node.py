@@ -148,7 +148,7 @@ class Pc2gridNode(LifecycleNode):
         self._resets = ResetPolicy()
         topic = self._set("topic") or None
         self._feed = RclpyFeed(self, topic)
-        self._live = self._robot.enter_context(LiveLog(self._feed, ReadConfig(topic=topic)))
+        self._live = self._robot.enter_context(LiveLog(self._feed))
         self._nav2 = self._robot.enter_context(Nav2Publisher(self._feed, self._set("map_frame")))
         self._nav2.announce(*TOLD[self._set("publish")], *(["/map"] if self._set("publish_map") else []))
         self._stop.clear()
@@ -193,7 +193,7 @@ class Pc2gridNode(LifecycleNode):
                 self.get_logger().error(self._problem)
 
     def _poll(self, follower: Follower[Answer]) -> bool:
-        for sentence in self._feed.news.take():
+        for sentence in self._feed.tally.take_news():
             self.get_logger().warning(sentence)
         for answer in follower.take():
             self._tell(answer, follower.lock)
@@ -215,11 +215,11 @@ class Pc2gridNode(LifecycleNode):
             self._map_of = answer.session
             with lock:
                 self._nav2.map(stamp_ns, map_of(self._database, answer.session, self._frames))
-        T_map_odom, odom_frame = answer.T_map_odometry, self._live.odometry_frame
+        T_map_odom, odom_frame = answer.T_map_odometry, self._live.poses.frame
         if self._set("publish") == "tf" and T_map_odom is not None and odom_frame is not None:
             self._nav2.start_tf(odom_frame, T_map_odom, self._live.now_ns)
         if self._set("publish") == "initialpose" and may_reset:
-            newest = self._live.newest_odometry()
+            newest = self._live.poses.newest_odometry()
             if newest is not None and T_map_odom is not None:  # the answer is some tenths of a second old
                 stamp_ns, pose = newest[0], T_map_odom @ pc2grid.SE2.from_matrix(newest[1])
             self._nav2.initialpose(stamp_ns, pose, answer.covariance)
@@ -238,7 +238,7 @@ class Pc2gridNode(LifecycleNode):
                 "confidence": f"{answer.confidence:.2f}",
                 "travel_m": f"{answer.path_m:.1f}",
                 "search_s": f"{answer.elapsed_s:.2f}",
-                "scans_dropped": str(self._live.counts.dropped),
+                "scans_dropped": str(self._live.tally.dropped),
             }
             status.values = [KeyValue(key=key, value=value) for key, value in facts.items()]
         told = DiagnosticArray(status=[status])

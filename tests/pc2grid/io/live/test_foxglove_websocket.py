@@ -18,7 +18,7 @@ import pytest
 from pc2grid.errors import LiveError, NoScans, Pc2GridError
 from pc2grid.geometry import SE2
 from pc2grid.io.live.foxglove_websocket import ConnectionParameters, FoxgloveWebsocket
-from pc2grid.io.live.live_log import InboxParameters, LiveLog, LiveParameters
+from pc2grid.io.live.live_log import LiveLog, LiveParameters
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.recording import open_log
 from pc2grid.model import OccupancyGrid, Scan
@@ -27,7 +27,7 @@ from tests.helpers.memory import bounded_memory
 from tests.helpers.recordings import STEP, T0, laser_drive, ros, write_mcap
 from tests.helpers.robot import LONG_S, SUBPROTOCOLS, Channel, Frame, Proxy, Recorded, Robot
 
-PATIENT = InboxParameters(most_lag_s=1e6)
+PATIENT = LiveParameters(most_lag_s=1e6)
 QUICK = ConnectionParameters(first_s=0.3, least_pause_s=0.001, most_pause_s=0.01)
 
 
@@ -47,8 +47,8 @@ def expected(recording: Path) -> list[Scan]:
         return list(log.scans())
 
 
-def connect(peer: Robot | Proxy, inbox: InboxParameters = PATIENT) -> LiveLog:
-    return LiveLog(FoxgloveWebsocket(peer.url, ReadConfig(), QUICK, inbox), ReadConfig())
+def connect(peer: Robot | Proxy, parameters: LiveParameters = PATIENT) -> LiveLog:
+    return LiveLog(FoxgloveWebsocket(peer.url, ReadConfig(), QUICK, parameters))
 
 
 def until(done: Callable[[], bool]) -> Callable[[], bool]:
@@ -85,7 +85,7 @@ def test_the_same_bytes_give_the_same_scans(recorded: Recorded, expected: list[S
         robot.play()
         # The last scan waits for odometry after it, which does not come.
         assert_equal(found_by(live, len(expected) - 1), expected[:-1])
-        assert live.feed.counts.dropped == 0
+        assert live.tally.dropped == 0
 
 
 def test_a_bridge_of_before_version_3_2(recorded: Recorded, expected: list[Scan]) -> None:
@@ -123,14 +123,14 @@ def test_a_robot_that_restarts_is_followed_again(recorded: Recorded, expected: l
             publisher.initialpose(8, SE2(1.0, 2.0, 0.5), np.eye(3))
         first.wait(lambda: len(first.told()) == 2)
         first.play(recorded.messages[:half])
-        wait(lambda: live.feed.counts.arrived == half)
+        wait(lambda: live.tally.arrived == half)
     with live, Robot(recorded, port=first.port) as second:
         numbers = [{channel.id() for channel in robot.channels.values()} for robot in (first, second)]
         assert numbers[0].isdisjoint(numbers[1])
         second.wait_for_client()
         second.play(recorded.messages[half:])
         assert_equal(found_by(live, len(expected) - 1), expected[:-1])
-        assert live.feed.counts.reconnected == 1
+        assert live.tally.reconnected == 1
     second.wait(lambda: not second.clients)
     assert [topic for topic, _ in second.told()] == ["/map"]
 
@@ -147,9 +147,9 @@ def test_a_hundred_lost_connections_are_made_again(tmp_path: Path) -> None:
         def send(block: list[tuple[Channel, int, bytes]], cuts: int) -> None:
             """Half of the messages arrive; the others are sent while nobody is connected."""
             robot.wait(lambda: min(map(robot.subscriptions.count, ("/scan", "/odom"))) > cuts)
-            arrived = live.feed.counts.arrived
+            arrived = live.tally.arrived
             robot.play(block[:4])
-            wait(lambda: live.feed.counts.arrived >= arrived + 4)
+            wait(lambda: live.tally.arrived >= arrived + 4)
             proxy.cut()
             robot.play(block[4:])
 
@@ -161,8 +161,8 @@ def test_a_hundred_lost_connections_are_made_again(tmp_path: Path) -> None:
         driven.start()
         live.on_poll = until(lambda: not driven.is_alive())
         found = [scan for _ in range(200) if not live.ended for scan in live.scans()]
-        assert live.feed.counts.reconnected >= 100
-        assert "the connection is lost" in " ".join(live.feed.news.take())
+        assert live.tally.reconnected >= 100
+        assert "the connection is lost" in " ".join(live.tally.take_news())
     by_stamp = {scan.stamp_ns: scan for scan in expected}
     assert len(found) > 20
     stamps = [scan.stamp_ns for scan in found]
@@ -193,26 +193,26 @@ def test_a_network_that_falls_behind_loses_messages_but_not_the_connection(recor
     assert arrived.items() <= sent.items()
     times_ns = [time_ns for _, time_ns in arrived]
     assert times_ns == sorted(times_ns)
-    assert feed.counts.reconnected == 0
+    assert feed.tally.reconnected == 0
 
 
 def test_a_computer_that_falls_behind_drops_scans_but_no_odometry(
     recorded: Recorded, expected: list[Scan]
 ) -> None:
     half = len(recorded.messages) // 2
-    with Robot(recorded) as robot, connect(robot, InboxParameters(most_lag_s=0.0, catch_up_s=0.0)) as live:
+    with Robot(recorded) as robot, connect(robot, LiveParameters(most_lag_s=0.0, catch_up_s=0.0)) as live:
         robot.wait_for_client()
         robot.play(recorded.messages[:half])
         scans = live.scans()
         found = [next(scans)]  # and now it is busy with it
         robot.play(recorded.messages[half:])
-        wait(lambda: live.feed.counts.arrived == len(recorded.messages))
-        live.on_poll = until(lambda: live.newest_odometry()[0] == recorded.messages[-1][1])
+        wait(lambda: live.tally.arrived == len(recorded.messages))
+        live.on_poll = until(lambda: live.poses.newest_odometry()[0] == recorded.messages[-1][1])
         found.extend(scans)
     by_stamp = {scan.stamp_ns: scan for scan in expected}
     assert_equal(found, [by_stamp[scan.stamp_ns] for scan in found])
     assert found[-1].stamp_ns == expected[-1].stamp_ns  # the newest is not dropped
-    assert live.feed.counts.dropped == len(expected) - len(found) > half // 3  # a third of them are scans
+    assert live.tally.dropped == len(expected) - len(found) > half // 3  # a third of them are scans
 
 
 def test_what_is_published_is_what_an_independent_decoder_reads(recorded: Recorded) -> None:
@@ -254,12 +254,12 @@ def test_a_robot_that_takes_no_messages_is_named(recorded: Recorded) -> None:
 def test_a_topic_that_never_speaks_is_named(recorded: Recorded) -> None:
     quick = LiveParameters(silent_s=0.2, poll_s=0.05)
     with Robot(recorded) as robot:
-        feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK)
-        with LiveLog(feed, ReadConfig(), quick) as live:
+        feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK, quick)
+        with LiveLog(feed) as live:
             robot.wait_for_client()
             robot.play(m for m in recorded.messages if m[0].topic != "/scan")
             news: list[str] = []
-            live.on_poll = until(lambda: bool(news.extend(feed.news.take()) or news))
+            live.on_poll = until(lambda: bool(news.extend(feed.tally.take_news()) or news))
             with pytest.raises(NoScans, match="/scan: no message yet"):
                 live.choose()
         assert news[0].startswith("/scan: no message yet")
@@ -279,7 +279,7 @@ def test_a_topic_that_is_published_twice_is_named(recorded: Recorded, expected: 
         robot.wait_for_client()
         robot.play()
         assert_equal(found_by(live, 20), expected[:20])
-        assert any("/scan: published twice" in sentence for sentence in live.feed.news.take())
+        assert any("/scan: published twice" in sentence for sentence in live.tally.take_news())
 
 
 def test_nobody_there_is_said_at_once() -> None:
@@ -371,13 +371,13 @@ def test_a_websocket_that_sends_garbage(
     recorded = Recorded.read(recording)
     with bounded_memory(MOST_BYTES), Robot(recorded) as robot, Proxy(robot, Garbage(robot, "/scan")) as proxy:
         feed = FoxgloveWebsocket(proxy.url, ReadConfig(), QUICK, PATIENT)
-        with LiveLog(feed, ReadConfig()) as live, robot.playing():
+        with LiveLog(feed) as live, robot.playing():
             live.on_poll = lambda: len(found) >= len(scans) or time.monotonic() > end_s
             while not live.ended:
                 found.extend(live.scans())
-            said = feed.news.take()
+            said = feed.tally.take_news()
             report = live.report()
-        assert feed.counts.reconnected == 0 and feed.counts.dropped == 0
+        assert feed.tally.reconnected == 0 and feed.tally.dropped == 0
     assert [scan.stamp_ns for scan in found] == [scan.stamp_ns for scan in scans]
     for a, b in zip(found, scans, strict=True):
         np.testing.assert_array_equal(a.points_m, b.points_m)
@@ -405,7 +405,7 @@ def test_bad_scans_alone_end_with_an_error_of_ours(tmp_path: Path, kind: str) ->
     recorded = Recorded.read(write_mcap(tmp_path / "bad.mcap", messages))
     with bounded_memory(MOST_BYTES), Robot(recorded) as robot:
         feed = FoxgloveWebsocket(robot.url, ReadConfig(), QUICK, PATIENT)
-        with LiveLog(feed, ReadConfig()) as live, robot.playing():
+        with LiveLog(feed) as live, robot.playing():
             live.on_poll = lambda: time.monotonic() > end_s
             with pytest.raises(Pc2GridError):
                 found.extend(live.scans())

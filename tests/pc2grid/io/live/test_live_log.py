@@ -8,34 +8,27 @@ from collections.abc import Collection, Sequence
 import pytest
 
 from pc2grid.errors import NoScans
-from pc2grid.io.live.live_log import Arrived, FeedCounts, Inbox, InboxParameters, LiveLog, News
-from pc2grid.io.source import RawMessage, TopicInfo
+from pc2grid.io.live.live_log import Arrived, Feed, Inbox, LiveLog, LiveParameters
+from pc2grid.io.source import RawMessage, Tally, TopicInfo
 from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import T0, Message, laser_drive, ros
 
 
-class Given:
+class Given(Feed):
     """A feed of messages that are all there; by its clock scans arrive as they were sent."""
 
-    name = "given"
-    connected = True
-
     def __init__(self, messages: Sequence[Message]) -> None:
-        self.counts, self.news = FeedCounts(), News()
+        super().__init__("given", ReadConfig())
         self.now_s = 0.0
         self.wanted: frozenset[str] | None = None
-        self._topics: dict[str, TopicInfo] = {}
         self._waiting: deque[RawMessage] = deque()
         for topic, kind, time_ns, data in messages:
-            known = self._topics.setdefault(topic, TopicInfo(topic=topic, type=kind, encoding="cdr"))
-            self._waiting.append(RawMessage(known, time_ns, data))
+            self._offer(topic, TopicInfo(topic=topic, type=kind, encoding="cdr"))
+            self._waiting.append(RawMessage(self._topics[topic, kind], time_ns, data))
 
     @property
     def ended(self) -> bool:
         return not self._waiting
-
-    def topics(self) -> tuple[TopicInfo, ...]:
-        return tuple(self._topics.values())
 
     def want(self, topics: Collection[str]) -> None:
         self.wanted = frozenset(topics)
@@ -49,13 +42,10 @@ class Given:
             self.now_s = max(self.now_s, (message.log_time_ns - T0) * 1e-9)
         return Arrived(message, self.now_s)
 
-    def close(self) -> None:
-        pass
-
 
 def live_log(messages: Sequence[Message]) -> tuple[LiveLog, Given]:
     feed = Given(messages)
-    return LiveLog(feed, ReadConfig(), clock=lambda: feed.now_s), feed
+    return LiveLog(feed, clock=lambda: feed.now_s), feed
 
 
 def parts_of(live: LiveLog) -> list[list[int]]:
@@ -76,7 +66,7 @@ def test_odometry_that_comes_after_its_scan_is_waited_for() -> None:
         assert scan.T_odom_base is not None
         number = round((scan.stamp_ns - messages[0].log_time_ns) / 1e8)
         assert scan.T_odom_base[0, 3] == pytest.approx(0.05 * number)
-        newest = live.newest_odometry()
+        newest = live.poses.newest_odometry()
         assert newest is not None
         late += newest[0] < scan.stamp_ns
     assert late == 0
@@ -105,7 +95,7 @@ def test_a_clock_that_is_set_begins_a_new_part(jump_s: int) -> None:
     assert len(first) >= 119
     assert len(second) >= 110  # a few tell that it was not one wrong stamp
     assert second[-1] == later[-2].log_time_ns - 50_000_000 + offset_ns or second == sorted(second)
-    assert any("clock of the scans was set" in sentence for sentence in feed.news.take())
+    assert any("clock of the scans was set" in sentence for sentence in feed.tally.take_news())
 
 
 def test_a_gap_without_odometry_begins_a_new_part() -> None:
@@ -114,7 +104,7 @@ def test_a_gap_without_odometry_begins_a_new_part() -> None:
     live, feed = live_log(gap)
     first, second = parts_of(live)
     assert (len(first), len(second)) == (49, 11)
-    assert any("no scan for 4.1 s" in sentence for sentence in feed.news.take())
+    assert any("no scan for 4.1 s" in sentence for sentence in feed.tally.take_news())
 
 
 def test_a_gap_with_odometry_is_bridged() -> None:
@@ -190,26 +180,26 @@ def waiting(inbox: Inbox, clock: Clock, seconds: range) -> dict[str, list[int]]:
 def test_scans_are_dropped_and_transforms_are_kept(
     limits: dict[str, float], prepared: bool, scans: list[int]
 ) -> None:
-    counts, clock = FeedCounts(), Clock()
-    inbox = Inbox(counts, InboxParameters(**limits), clock=clock)  # type: ignore[arg-type]
+    tally, clock = Tally(), Clock()
+    inbox = Inbox(tally, LiveParameters(**limits), clock=clock)  # type: ignore[arg-type]
     if prepared:
         inbox.prepared()
     found = waiting(inbox, clock, range(10))
     assert found["/scan"] == scans
     assert found["/tf"] == [*range(10)] or "most_bytes" in limits
-    assert counts.arrived == 20 and counts.dropped == 20 - len(found["/scan"]) - len(found["/tf"])
+    assert tally.arrived == 20 and tally.dropped == 20 - len(found["/scan"]) - len(found["/tf"])
     if limits.get("catch_up_s") == 20.0:
         assert waiting(inbox, clock, range(10, 20))["/scan"] == [17, 18, 19]
 
 
 def test_the_number_of_messages_is_bounded() -> None:
     clock = Clock()
-    inbox = Inbox(FeedCounts(), InboxParameters(most_messages=6), clock=clock)
+    inbox = Inbox(Tally(), LiveParameters(most_messages=6), clock=clock)
     assert sum(map(len, waiting(inbox, clock, range(10)).values())) == 6
 
 
 def test_get_waits_for_another_thread() -> None:
-    inbox = Inbox(FeedCounts())
+    inbox = Inbox(Tally())
     thread = threading.Timer(0.05, lambda: inbox.put(RawMessage(SCAN, 1, b"")))
     thread.start()
     arrived = inbox.get(20.0)
@@ -221,7 +211,7 @@ def test_get_waits_for_another_thread() -> None:
 
 @pytest.mark.parametrize("most", [1, 4])
 def test_a_dropped_scan_gives_its_bytes_back(most: int) -> None:
-    inbox = Inbox(FeedCounts(), InboxParameters(most_bytes=10 * most))
+    inbox = Inbox(Tally(), LiveParameters(most_bytes=10 * most))
     for k in range(50):
         inbox.put(RawMessage(SCAN, k, b"x" * 10))
     assert waiting(inbox, Clock(), range(0))["/scan"] == [*range(50 - most, 50)]
