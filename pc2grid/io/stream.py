@@ -98,7 +98,7 @@ class Stream:
             self._add((sensor.topic, sensor.frame), silent=sensor.silent)
         self.poses = Poses(plan, frames, source.tally)
         self.stamps = _Stamps(source.tally)
-        self._waiting: list[_Waiting] = []
+        self._waiting: list[Received] = []
         self._last_read_ns: int | None = None  # stamp of the last scan with odometry
         # From a stamp to the last point: until it is known, a lidar may turn until the next stamp.
         self._sweep_ns = 0 if SENSOR_MODELS[plan.choice.sensor].image else plan.period_ns
@@ -107,19 +107,16 @@ class Stream:
     def _make_handlers(self) -> dict[TopicInfo, Callable[[Any, int], None]]:
         """Return by topic the function that takes its messages."""
         plan, poses = self._plan, self.poses
-        on: dict[TopicInfo, Callable[[Any, int], None]] = {}
-        on.update((topic, functools.partial(self._take_scan, topic)) for topic in self._decode)
         decoded: list[tuple[TopicInfo | None, Callable[[Any, int], None]]] = [
             (plan.odometry, poses.take_odometry),
             (plan.imu, poses.take_imu),
-            *(
-                (sensor.camera, functools.partial(self._take_camera, sensor.camera))
-                for sensor in plan.sensors
-            ),
+            *((s.camera, functools.partial(self._take_camera, s.camera)) for s in plan.sensors),
             *((topic, poses.take_tf) for topic in plan.moving_tf),
         ]
-        on.update((topic, _decoding(topic, take)) for topic, take in decoded if topic is not None)
-        return on
+        return {
+            **{topic: functools.partial(self._take_scan, topic) for topic in self._decode},
+            **{topic: _decoding(topic, take) for topic, take in decoded if topic is not None},
+        }
 
     @property
     def topics(self) -> frozenset[str]:
@@ -132,7 +129,7 @@ class Stream:
             yield from self.take(message)
         yield from self.release_all()
         p = self._parameters
-        self._part.finish(self._lead[0].topic, p.max_bad_share, self._decoders[self._lead].empty)
+        self._part.finish(self._lead[0].topic, p.max_bad_share, self._decoder_of(self._lead).empty)
         if self._last_read_ns is None and self._plan.choice.odometry_topic is not None:
             self._source.tally.warn(
                 f"no scan has odometry: that from {self._plan.choice.odometry_topic} is of other times"
@@ -151,12 +148,12 @@ class Stream:
         while self._waiting:
             yield from self._release()
 
-    def _is_due(self, first: _Waiting, now_ns: int) -> bool:
+    def _is_due(self, first: Received, now_ns: int) -> bool:
         p, waiting = self._parameters, self._waiting
         return (
-            now_ns - first.scan.log_time_ns > p.wait_ns
+            now_ns - first.log_time_ns > p.wait_ns
             or len(waiting) > p.max_waiting
-            or sum(entry.scan.size_bytes for entry in waiting) > p.max_waiting_bytes
+            or sum(entry.size_bytes for entry in waiting) > p.max_waiting_bytes
             or (p.eager and self._all_is_there(first.stamp_ns))
         )
 
@@ -182,11 +179,12 @@ class Stream:
             if self._lead == (topic, None):
                 self._lead = sensor
             leads = sensor == self._lead
-            scan = Received(self._stamp_of(message, log_time_ns), log_time_ns, len(data), message)
+            stamp_ns = self._stamp_of(message, log_time_ns)
+            scan = Received(stamp_ns, 0, log_time_ns, len(data), message, sensor)
             if leads:
                 self._queue(scan)
             else:
-                self._take_further(sensor, scan)
+                self._take_further(scan)
         except Pc2GridError as error:
             if leads:
                 self._part.count += 1
@@ -198,11 +196,11 @@ class Stream:
         """Add a scan of the first sensor to those that wait."""
         self._alone_ns = None
         self._part.count += 1
-        waiting = _Waiting(scan.stamp_ns, self._part.count, scan, self._decoder_of(self._lead))
-        heapq.heappush(self._waiting, waiting)
+        heapq.heappush(self._waiting, scan._replace(number=self._part.count))
 
-    def _take_further(self, sensor: _Of, scan: Received) -> None:
+    def _take_further(self, scan: Received) -> None:
         """Keep a scan for the first sensor's; if that has none for long, this sensor takes its place."""
+        sensor = scan.sensor
         if sensor not in self._further:
             if len(self._further) >= FIRST_SCANS:
                 raise PointCloudError(f"scans in more than {FIRST_SCANS + 1} frames")
@@ -276,10 +274,9 @@ class Stream:
     def _release(self) -> Iterator[Scan]:
         """Yield the waiting scan with the earliest stamp, unless it is skipped."""
         waiting = heapq.heappop(self._waiting)
-        log_time_ns = waiting.scan.log_time_ns
         try:
-            self.stamps.check(waiting.stamp_ns, log_time_ns, self._waiting)
-            scan = self._scan(waiting.stamp_ns, waiting.scan.message, waiting.decoder)
+            self.stamps.check(waiting.stamp_ns, waiting.log_time_ns, self._waiting)
+            scan = self._scan(waiting)
         except UnsupportedSchema as error:
             if not self._part.good:
                 raise UnsupportedSchema(f"{self._lead[0].topic}: {error.message}", hint=error.hint) from error
@@ -288,7 +285,7 @@ class Stream:
         except (PointCloudError, LimitExceeded) as error:
             self._skip(error)
             return
-        self.stamps.used(waiting.stamp_ns, log_time_ns)
+        self.stamps.used(waiting.stamp_ns, waiting.log_time_ns)
         if scan.T_odom_base is not None:
             self._last_read_ns = waiting.stamp_ns
         self._part.good += 1
@@ -299,10 +296,12 @@ class Stream:
             self._source.tally.warn(note)
         yield scan
 
-    def _scan(self, stamp_ns: int, message: ScanMessage, decoder: ScanDecoder) -> Scan:
+    def _scan(self, waiting: Received) -> Scan:
         """Return the scan with all that belongs to it. Raises as `ScanDecoder.scan` does, and FrameError."""
+        stamp_ns, message = waiting.stamp_ns, waiting.message
         T_base_points = self.poses.sensor(message.header.frame, stamp_ns)
-        scan = decoder.scan(message, stamp_ns, T_base_points, self.poses.odometry(stamp_ns))
+        decoder, T_odom_base = self._decoder_of(waiting.sensor), self.poses.odometry(stamp_ns)
+        scan = decoder.scan(message, stamp_ns, T_base_points, T_odom_base)
         if self._plan.mounted is not None:
             scan = self._measured(scan, self._plan.mounted)
         # Infinite before the first reading.
@@ -360,18 +359,6 @@ class Stream:
 
 _Of = tuple[TopicInfo, str | None]
 """Topic and frame of the scans of one sensor; None: a frame that is not known yet."""
-
-
-class _Waiting(NamedTuple):
-    """A scan that waits; scans with equal stamps are sorted by their number in the log.
-
-    scan : its message takes at most four times its recorded size, if it is a text of numbers.
-    """
-
-    stamp_ns: int
-    number: int
-    scan: Received
-    decoder: ScanDecoder
 
 
 def _decoding(topic: TopicInfo, take: Callable[[Any, int], None]) -> Callable[[Any, int], None]:
@@ -454,7 +441,7 @@ class _Stamps:
         self.last_ns, self.last_log_ns = stamp_ns, log_time_ns
         self.out_of_time = 0
 
-    def check(self, stamp_ns: int, log_time_ns: int, waiting: Sequence[_Waiting]) -> None:
+    def check(self, stamp_ns: int, log_time_ns: int, waiting: Sequence[Received]) -> None:
         """Compare a stamp with the one before. Raises PointCloudError for a scan to be skipped."""
         if self.last_ns is None:
             return
@@ -607,12 +594,18 @@ _KEPT = 50
 
 
 class Received(NamedTuple):
-    """A scan as it was received. size_bytes : of the message as it was recorded."""
+    """A scan as it was received; those that wait are sorted by stamp, equal ones by their number in the log.
+
+    size_bytes : of the message as it was recorded; it takes at most four times that, if it is a text of
+    numbers.
+    """
 
     stamp_ns: int
+    number: int
     log_time_ns: int
     size_bytes: int
     message: ScanMessage
+    sensor: _Of
 
 
 class FurtherScans:

@@ -207,10 +207,14 @@ class FoxgloveWebsocket(Feed):
         self._link.close()
 
     def _connection_changed(self, connected: bool) -> None:
+        self.connected = connected
         if not connected:
             self._withdraw()
-        self._set_connected(connected)
-        if connected and self._advertised:
+            if not self._over:
+                self.tally.tell(f"{self.name}: the connection is lost; trying again", again=True)
+            return
+        self.tally.reconnected += 1
+        if self._advertised:
             self._advertise(self._advertised)
             for advertised in self._advertised.values():
                 if advertised.last:

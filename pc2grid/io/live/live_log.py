@@ -299,14 +299,6 @@ class Feed:
     def _unsubscribe(self, old: Mapping[Hashable, Any]) -> None:
         """Cancel subscriptions."""
 
-    def _set_connected(self, connected: bool) -> None:
-        """Set the state of the connection, and tell the user when it is lost."""
-        if self.connected and not connected and not self._over:
-            self.tally.tell(f"{self.name}: the connection is lost; trying again", again=True)
-        elif connected and not self.connected:
-            self.tally.reconnected += 1
-        self.connected = connected
-
 
 # --- scans of a feed ----------------------------------------------------------------------------------
 
