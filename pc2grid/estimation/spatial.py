@@ -35,7 +35,7 @@ from pc2grid.estimation.line_map import (
 )
 from pc2grid.estimation.scan_matching import Measurement, ScanMatch
 from pc2grid.estimation.smoother import KERNEL, SPATIAL, PoseWithCovariance
-from pc2grid.estimation.surface_map import SURFACES, SurfaceMap, SurfaceMatch
+from pc2grid.estimation.surface_map import LEAST_INFORMATION, SURFACES, SurfaceMap, SurfaceMatch
 from pc2grid.geometry import F32, F64, SE2, BoolGrid, invert_pose, leveling, motion_size
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
@@ -143,21 +143,20 @@ class SpatialMatcher:
     def observable(self, fit: ScanMatch) -> ScanMatch:
         """Implement `ScanMatcher.observable`.
 
-        Without odometry, the vertical that the scan shows by itself is added: the map leans as far as the
-        scans that made it. Not where the position is not fixed: a slide that turns the scan as well would
-        become known by the turn; nor by a camera, whose narrow view often leaves such a slide.
+        Without odometry, the vertical that the scan shows by itself is added, also where the map holds
+        nothing: the map leans as far as the scans that made it. A slide is then known only as far as it would
+        tilt the scan. Not of a camera, whose narrow view shows too little for that.
         """
         thinned, (alone, information) = self._thinned, fit.alone
         placement = SurfaceMatch(fit.pose, information, fit.overlap, 0.0, fit.measured)
         held = self._space.surfaces.observable(thinned.points_m, thinned.weights, placement)
-        if not held.measured or not len(thinned.shapes):
-            return replace(fit, alone=(alone, held.information), measured=held.measured)
         information, pull, turn = held.information.copy(), np.zeros(6), self._last[:3, :3]
-        of_turns, pull[3:] = vertical_held(thinned.shapes, turn @ alone[2, :3])
-        pull[3:] = turn.T @ pull[3:]
-        information[3:, 3:] += turn.T @ of_turns @ turn
-        step = np.asarray(np.linalg.solve(information + 1e-3 * np.eye(6), pull), np.float64)
-        alone = moved(alone[None], step[None])[0]
+        if len(thinned.shapes):
+            of_turns, pull[3:] = vertical_held(thinned.shapes, turn @ alone[2, :3])
+            pull[3:] = turn.T @ pull[3:]
+            information[3:, 3:] += turn.T @ of_turns @ turn
+            step = np.asarray(np.linalg.solve(information + LEAST_INFORMATION, pull), np.float64)
+            alone = moved(alone[None], step[None])[0]
         return replace(fit, alone=(alone, information), measured=held.measured)
 
     def follow(self, belief: PoseWithCovariance) -> None:
@@ -193,7 +192,7 @@ def _alone(found: SurfaceMatch, held: PoseWithCovariance) -> Measurement:
     removed.
     """
     away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], found.pose[None]))
-    information = found.information + 1e-3 * np.eye(6)
+    information = found.information + LEAST_INFORMATION
     change = np.linalg.solve(information, J.T @ held.information @ away)
     return moved(found.pose[None], change[None])[0], information
 

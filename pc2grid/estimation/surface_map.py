@@ -81,6 +81,9 @@ class SurfaceParameters:
 
 
 SURFACES = SurfaceParameters()
+LEAST_INFORMATION = 1e-3 * np.eye(6)
+"""(6, 6) added so that a direction that nothing holds can be solved for: of a standard deviation of 30 m and
+30 rad, farther than any match is moved. One point has 1e5 times as much."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -332,7 +335,7 @@ def _step(pose: F64, information: F64, gradient: F64, prior: PoseWithCovariance)
     """Return the Gauss-Newton step (6,) from a pose (4, 4), given measurements there and a prior."""
     away, _, J = (of_prior[0] for of_prior in steps(prior.pose[None], pose[None]))
     step: F64 = -np.linalg.solve(
-        information + J.T @ prior.information @ J + 1e-3 * np.eye(6),
+        information + J.T @ prior.information @ J + LEAST_INFORMATION,
         gradient + J.T @ prior.information @ away,
     )
     return step

@@ -14,6 +14,7 @@ from pc2grid.clouds.ground import FloorBelow, level_floor
 from pc2grid.estimation.ground_model import is_rolling
 from pc2grid.estimation.scan_matching import ScanMatch
 from pc2grid.estimation.spatial import SPATIAL_PARAMETERS, SpaceMap, SpatialMatcher, begin, first_pose
+from pc2grid.estimation.surface_map import LEAST_INFORMATION
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import F64, SE2, invert_pose, motion_size, pose_from_rotation_vector
 from pc2grid.io.recording import open_log
@@ -311,10 +312,12 @@ def test_a_floor_in_view_is_more_exact_than_the_imu(recorded: list[tuple[Scan, F
 
 
 @pytest.mark.parametrize("with_odometry", [False, True])
+@pytest.mark.parametrize("measured", [False, True])
 def test_what_a_scan_shows_of_the_vertical_holds_its_tilt(
-    recorded: list[tuple[Scan, F64]], with_odometry: bool
+    recorded: list[tuple[Scan, F64]], with_odometry: bool, measured: bool
 ) -> None:
-    """A match that leans by 3 degrees as the map does: floor and walls in view turn it back."""
+    """A match that leans by 3 degrees as the map does: floor and walls in view turn it back, whether the map
+    holds its position or not."""
     scan, true = recorded[0]
     scan = dataclasses.replace(scan, sensor="lidar", T_odom_base=scan.T_odom_base if with_odometry else None)
     matcher = SpatialMatcher(RegistrationConfig(), ProjectionConfig())
@@ -325,13 +328,33 @@ def test_what_a_scan_shows_of_the_vertical_holds_its_tilt(
         pose=leaning,
         alone=(leaning, 1e4 * np.eye(6)),
         overlap=1.0,
-        measured=True,
+        measured=measured,
         evidence=0.0,
         credible=True,
     )
     found, information = matcher.observable(fit).alone
     assert (tilt_deg(found, true) < 1.0) is not with_odometry
     assert (np.linalg.eigvalsh(information)[-1] > 1.5e4) is not with_odometry
+
+
+@pytest.mark.parametrize(("turn_rad_per_m", "least_m", "most_m"), [(0.0, 10.0, 100.0), (0.02, 0.1, 1.0)])
+def test_a_slide_is_known_only_as_far_as_it_would_tilt_the_scan(
+    recorded: list[tuple[Scan, F64]], turn_rad_per_m: float, least_m: float, most_m: float
+) -> None:
+    """The map holds all but a slide along x, which may pitch the scan by a degree a metre."""
+    scan, _ = recorded[0]
+    scan = dataclasses.replace(scan, sensor="lidar", T_odom_base=None)
+    matcher = SpatialMatcher(RegistrationConfig(), ProjectionConfig())
+    pose = matcher.start(scan, scan.points_m)
+    matcher.cut(scan, scan.points_m, pose, lost=False)
+    matcher.take(scan, scan.points_m)
+    slide = np.array([1.0, 0.0, 0.0, 0.0, turn_rad_per_m, 0.0])
+    held = 1e4 * (np.eye(6) - np.outer(slide, slide) / (slide @ slide))
+    fit = ScanMatch(pose=pose, alone=(pose, held), overlap=1.0, measured=False, evidence=0.0, credible=True)
+    covariance = np.linalg.inv(matcher.observable(fit).alone[1] + LEAST_INFORMATION)
+    along_m, pitch_rad = np.sqrt(covariance[0, 0]), np.sqrt(covariance[4, 4])
+    assert least_m < along_m < most_m
+    assert pitch_rad < math.radians(1.0)
 
 
 def level(T: F64) -> F64:
