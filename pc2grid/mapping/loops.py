@@ -12,16 +12,16 @@ package above this one implements, compares the map of the last few local maps (
 earlier places, without using their poses.
 
 A recognition alone may be wrong with high confidence: buildings repeat themselves, and some look alike when
-they are turned by 180 degrees. Two facts that the recognizer does not use distinguish such a place from the
-right one. The drift of tracking is bounded. And the recognitions at two places must be consistent with the
-travel between them (pairwise consistency, Mangelson et al., "Pairwise consistent measurement set maximization
-for robust multi-robot map merging", 2018). A recognition that is not accepted remains a candidate
-(`LoopCandidates`), because later ones may support it.
+they are turned by 180 degrees. What the recognizer does not know is that the drift of tracking is bounded. So
+its evidence is that of an answer, and the tracked pose the prior: one equation tells how likely each place is
+(`pc2grid.matching.evidence.masses`), and its loops count as much. Loops that contradict each other and the
+travel between them are told by the pose graph.
 """
 
 from __future__ import annotations
 
 import math
+import sys
 from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -29,16 +29,16 @@ from itertools import compress
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pc2grid.estimation.line_map import evenly
 from pc2grid.geometry import F64, I64, SE2, frozen_arrays
-from pc2grid.mapping.graph import Edge, Solution, WallDirection, between, compose, optimise, wall_direction
+from pc2grid.mapping.graph import Edge, Solution, WallDirection, optimise, wall_direction
 from pc2grid.mapping.keyframes import TURN_M_PER_RAD, Keyframe, Keyframes, grid_of
 from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps, pose_at
 from pc2grid.mapping.part_maps import OptimisedKeyframes, interpolate_corrections
 from pc2grid.mapping.parts import connected
 from pc2grid.mapping.quality import position_sigmas
+from pc2grid.matching.evidence import LEFT, Evidence, masses
 from pc2grid.model import Loop, OccupancyGrid
 from pc2grid.settings import ProjectionConfig
 
@@ -136,52 +136,6 @@ errors of tracking by a camera in simulated csail (`docs/method.md`); checked on
 """
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CandidateParameters:
-    """Parameters of `LoopCandidates`. Chosen on aces and csail, unless noted.
-
-    Standard deviation of the drift of tracking over a travel, large enough for a slip of the wheels
-    (`docs/method.md`):
-
-    drift_m, drift_per_m : of position, constant and per metre of travel.
-    drift_rad, drift_rad_per_m : of yaw.
-
-    The drift over the short travel between two recognitions that support each other:
-
-    short_m, short_per_m, short_rad : as above; per metre of travel the yaw drifts by `drift_rad_per_m`.
-    consistent : largest Mahalanobis distance at which two of them agree; 3 degrees of freedom, 1 %.
-
-    Acceptance:
-
-    alone : largest Mahalanobis distance from the tracked pose at which a recognition without support is
-        accepted.
-    supported : the same with one other recognition that agrees.
-    possible : the same with two; beyond it a recognition is never accepted. 3 degrees of freedom, 0.3 %.
-    known_way_m : a recognition over a shorter way adds nothing: tracking is more exact. The travel of one and
-    a half place maps.
-    margin : log-odds by which a contradicting recognition of the same place map must be less likely.
-    pending : candidates that are kept at most, the latest.
-    """
-
-    drift_m: float = 0.3
-    drift_per_m: float = 0.025
-    drift_rad: float = math.radians(1.5)
-    drift_rad_per_m: float = math.radians(0.1)
-    short_m: float = 0.15
-    short_per_m: float = 0.015
-    short_rad: float = math.radians(1.0)
-    consistent: float = 3.37
-    alone: float = 1.0
-    supported: float = 2.5
-    possible: float = 3.8
-    known_way_m: float = 1.5 * LOOPS.maps_per_place * LOOPS.travel_m
-    margin: float = 3.0
-    pending: int = 100
-
-
-CANDIDATES = CandidateParameters()
-
-
 class LoopCloser:
     """Closes loops while a session is recorded.
 
@@ -198,16 +152,12 @@ class LoopCloser:
         projection: ProjectionConfig = ProjectionConfig(),
         parameters: LoopParameters = LOOPS,
         local_map_parameters: LocalMapParameters = LOCAL_MAPS,
-        candidate_parameters: CandidateParameters = CANDIDATES,
     ) -> None:
         self._parameters = parameters
         self._keyframes = keyframes
         self._local_maps = LocalMaps(keyframes, local_map_parameters)
         self._graph = SessionGraph(parameters)
-        candidates = LoopCandidates(candidate_parameters)
-        self._place_maps = PlaceMaps(
-            self._local_maps, candidates, parameters.maps_per_place, recognizer, projection
-        )
+        self._place_maps = PlaceMaps(self._local_maps, parameters.maps_per_place, recognizer, projection)
         self._travel_m = 0.0  # in the local map that is not complete yet
         self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
         self._drift_m = 0.0  # travel since the pose was last certain
@@ -226,8 +176,7 @@ class LoopCloser:
         if not len(self._keyframes):
             return OptimisedKeyframes.empty()
         self._complete_local_map()
-        if self._place_maps.finish():
-            self._close_candidates()
+        self._close_recognized(self._place_maps.finish())
         return self._optimised_keyframes()
 
     # --- during the session -------------------------------------------------------------------------------
@@ -244,8 +193,7 @@ class LoopCloser:
         # Overlaps with the local maps just before show nothing but that tracking is smooth.
         recent = newest - 2 * self._parameters.maps_per_place
         known = any(edge.first < recent for edge in overlaps)
-        if self._place_maps.extend(restart=restart, known=known):
-            self._close_candidates()
+        self._close_recognized(self._place_maps.extend(restart=restart, known=known))
 
     def _place(self, newest: int, restart: bool) -> None:
         """Add the newest local map to the pose graph, by tracking."""
@@ -284,34 +232,57 @@ class LoopCloser:
         for older in spread_over_visits(distance_m, near_m, self._parameters.compared):
             yield from self._compare(older, newest, self._graph.relative(older, newest), window)
 
-    def _compare(self, older: int, newer: int, guess: SE2, window: tuple[float, float]) -> list[Edge]:
+    def _compare(
+        self, older: int, newer: int, guess: SE2, window: tuple[float, float], mass: float = 1.0
+    ) -> list[Edge]:
         """Match two local maps near a guess; returns an edge, or none if they do not match.
 
-        window : half widths of the search around the guess, metres and radians.
+        window : half widths of the search around the guess, metres and radians. mass : of the guess.
         """
         overlap = self._local_maps[older].overlap(self._local_maps[newer], guess, *window)
         if overlap is None:
             return []
-        information = self._parameters.information_share * overlap.information
-        return [Edge(older, newer, overlap.pose, information, loop=True, counts=overlap.counts)]
+        information = mass * self._parameters.information_share * overlap.information
+        return [Edge(older, newer, overlap.pose, information, loop=True, counts=mass * overlap.counts)]
 
     # --- place recognition --------------------------------------------------------------------------------
 
-    def _close_candidates(self) -> None:
-        """Close the loops among the recognised places.
-
-        Those that drift allows and that agree with each other are confirmed by matching their local maps.
-        """
+    def _close_recognized(self, found: Sequence[Recognition]) -> None:
+        """Close the loops to the places that the newest place map may show; each counts as it is likely."""
         p = self._parameters
         loops: list[Edge] = []
-        for found in self._place_maps.accepted(self._graph.nodes, np.array(self._travelled_m)):
-            for older, newer, guess in self._place_maps.guesses(found)[: p.compared_pairs]:
-                loops += self._compare(older, newer, guess, (p.recognized_m, p.certain_rad))
+        for place, mass in zip(found, masses([f.evidence for f in found], self._prior(found)), strict=True):
+            # Places a short way apart show nothing but that tracking is smooth.
+            if mass < LEFT or self._way_m(place) < 2 * p.maps_per_place * p.travel_m:
+                continue
+            for older, newer, guess in self._place_maps.guesses(place)[: p.compared_pairs]:
+                loops += self._compare(older, newer, guess, (p.recognized_m, p.certain_rad), float(mass))
         self._close(loops)
         if loops:
             # The newest place map is where it belongs now: loops that the search near the tracked pose missed
             # are near.
             self._close([edge for number in self._place_maps.latest() for edge in self._overlaps(number)])
+
+    def _prior(self, found: Sequence[Recognition]) -> list[float]:
+        """Return how likely tracking has drifted to each place; 1 where it is tracked.
+
+        The drift since the older place is a Gaussian. Its standard deviations are the window in which loops
+        are searched after so much travel: in killian, aces, csail, intel and the workshop tracking alone is
+        off by up to 1.7 % of the travel, 10.4 m and 10 degrees.
+        """
+        prior = []
+        for place in found:
+            older, newer = self._place_maps.middle(place.older), self._place_maps.middle(place.newer)
+            window_m, window_rad = self._parameters.window(self._way_m(place))
+            drift = place.T_older_newer.inverse() @ self._graph.relative(older, newer)
+            off = math.hypot(drift.x / window_m, drift.y / window_m, drift.yaw / window_rad)
+            prior.append(max(math.exp(-0.5 * off**2), sys.float_info.min))
+        return prior
+
+    def _way_m(self, place: Recognition) -> float:
+        """Return the travel between the two place maps; a lost part counts as `lost_m`."""
+        older, newer = self._place_maps.middle(place.older), self._place_maps.middle(place.newer)
+        return self._travelled_m[newer] - self._travelled_m[older]
 
     # --- at the end of the session ------------------------------------------------------------------------
 
@@ -508,7 +479,7 @@ class Recognition:
     older, newer : their indices.
     T_older_newer : the frame of the newer place map in that of the older one. Exact to some decimetres; loop
         closure refines it on the local maps.
-    log_odds : that both show the same place, by their appearance.
+    evidence : that both show the same place, by their appearance.
 
     At most one recognition of a newer place map is right, or those at one place that several older ones show.
     """
@@ -516,7 +487,7 @@ class Recognition:
     older: int
     newer: int
     T_older_newer: SE2
-    log_odds: float
+    evidence: Evidence
 
 
 class PlaceRecognizer(Protocol):
@@ -530,7 +501,7 @@ class PlaceRecognizer(Protocol):
         with, grids to verify with.
 
         It must not return `older >= newest.index`. All places similar to the newest may be returned, right or
-        wrong: loop closure accepts those that agree with the drift of tracking and with each other.
+        wrong: loop closure weighs them by the drift of tracking.
         """
         ...
 
@@ -538,26 +509,25 @@ class PlaceRecognizer(Protocol):
 class PlaceMaps:
     """The place maps of a session that were given to its recognizer.
 
-    candidates : get its recognitions. maps : consecutive local maps in a place map.
+    maps : consecutive local maps in a place map.
     recognizer : None: there are no place maps. projection : how their grids are drawn.
     """
 
     def __init__(
         self,
         local_maps: LocalMaps,
-        candidates: LoopCandidates,
         maps: int,
         recognizer: PlaceRecognizer | None,
         projection: ProjectionConfig,
     ) -> None:
-        self._local_maps, self._candidates, self._maps = local_maps, candidates, maps
+        self._local_maps, self._maps = local_maps, maps
         self._recognizer, self._projection = recognizer, projection
         self._asked: list[range] = []  # the local maps of each
         self._known_places: list[bool] = []  # whether each local map overlaps one of an earlier visit
         self._begin = 0  # first local map of the place that is not complete yet
 
-    def extend(self, *, restart: bool, known: bool) -> bool:
-        """Add the newest local map. Return True if a place map was completed and passed to the recognizer.
+    def extend(self, *, restart: bool, known: bool) -> Sequence[Recognition]:
+        """Add the newest local map. Return what is recognised in the place map that it completes.
 
         restart : tracking was lost before it. known : it overlaps a local map of an earlier visit.
 
@@ -569,27 +539,23 @@ class PlaceMaps:
         self._known_places.append(known)
         place = range(self._begin, len(self._known_places))
         if len(place) < self._maps:
-            return False
+            return ()
         self._begin = place.stop
         return self._ask(place)
 
-    def finish(self) -> bool:
+    def finish(self) -> Sequence[Recognition]:
         """Make a place map of the last local maps, which may overlap the one before; returns as `extend`
         does."""
         stop = len(self._known_places)
-        return self._begin < stop and self._ask(range(max(stop - self._maps, 0), stop))
+        return self._ask(range(max(stop - self._maps, 0), stop)) if self._begin < stop else ()
 
     def latest(self) -> range:
         """Return the local maps of the last place map that was passed on."""
         return self._asked[-1]
 
-    def accepted(self, nodes: F64, travel_m: F64) -> list[Recognition]:
-        """Return the recognitions that are loops, by drift and by each other; each is returned once.
-
-        nodes : (N, 3) optimised poses of the local maps. travel_m : (N,) metres of travel at each.
-        """
-        middles = [_middle(place) for place in self._asked]
-        return self._candidates.take(nodes[middles], travel_m[middles])
+    def middle(self, index: int) -> int:
+        """Return the local map in whose frame a place map is drawn."""
+        return _middle(self._asked[index])
 
     def guesses(self, found: Recognition) -> list[tuple[int, int, SE2]]:
         """Return the pairs of local maps of two place maps, the nearest first.
@@ -612,13 +578,12 @@ class PlaceMaps:
         poses = self._local_maps.poses((anchors[number] for number in place), anchors[_middle(place)])
         return list(zip(place, poses, strict=True))
 
-    def _ask(self, place: range) -> bool:
+    def _ask(self, place: range) -> Sequence[Recognition]:
         """Pass a place map to the recognizer, unless all of its local maps are known."""
         if self._recognizer is None or all(self._known_places[k] for k in place):
-            return False
+            return ()
         self._asked.append(place)
-        self._candidates.add(self._recognizer.recognize(self._draw(len(self._asked) - 1, place)))
-        return True
+        return self._recognizer.recognize(self._draw(len(self._asked) - 1, place))
 
     def _draw(self, index: int, numbers: range) -> PlaceMap:
         """Draw the place map of consecutive local maps, in the frame of the anchor of the middle one."""
@@ -637,73 +602,3 @@ class PlaceMaps:
 def _middle(numbers: range) -> int:
     """Return the local map in whose frame a place map is drawn."""
     return numbers[len(numbers) // 2]
-
-
-class LoopCandidates:
-    """Recognised places that are not accepted as loops yet."""
-
-    def __init__(self, parameters: CandidateParameters = CANDIDATES) -> None:
-        self._parameters = parameters
-        self._pending: list[Recognition] = []
-
-    def add(self, candidates: Sequence[Recognition]) -> None:
-        """Add the recognitions of the newest place map."""
-        self._pending = [*self._pending, *candidates][-self._parameters.pending :]
-
-    def take(self, nodes: F64, travel_m: F64) -> list[Recognition]:
-        """Return the candidates that are loops by drift and by each other; remove them and the impossible
-        ones.
-
-        nodes : (N, 3) optimised poses of the place maps. travel_m : (N,) metres of travel at each.
-        """
-        pending, p = self._pending, self._parameters
-        if not pending:
-            return []
-        older, newer = np.array([(c.older, c.newer) for c in pending]).T
-        measured = np.array([(c.T_older_newer.x, c.T_older_newer.y, c.T_older_newer.yaw) for c in pending])
-
-        way_m = travel_m[newer] - travel_m[older]
-        error = between(measured, between(nodes[older], nodes[newer]))
-        off = _mahalanobis(error, p.drift_m + p.drift_per_m * way_m, p.drift_rad + p.drift_rad_per_m * way_m)
-        in_reach, known = off <= p.possible, way_m <= p.known_way_m
-
-        agrees = self._agreement(older, newer, measured, nodes, travel_m)
-        same = newer[:, None] == newer
-        support = np.array([len(set(newer[row])) for row in agrees & ~same & in_reach])
-        likely = np.array([c.log_odds for c in pending]) - 0.5 * off**2
-
-        reach = np.choose(np.minimum(support, 2), (p.alone, p.supported, p.possible))
-        fits = (off <= reach) & ~known
-        # Rival k of candidate i contradicts it; one of the two must be clearly better.
-        weaker = support < support[:, None]
-        less_likely = (support == support[:, None]) & (likely <= likely[:, None] - p.margin)
-        beaten = weaker | less_likely | ~(same & ~agrees & in_reach)
-        chosen = fits & beaten.all(axis=1)
-        self._pending = list(compress(pending, in_reach & ~known & ~chosen))
-        return list(compress(pending, chosen))
-
-    def _agreement(
-        self, older: I64, newer: I64, measured: F64, nodes: F64, travel_m: F64
-    ) -> NDArray[np.bool_]:
-        """Return a mask (C, C) of the pairs of candidates that are consistent with the travel between them.
-
-        older, newer : (C,) place maps. measured : (C, 3) x, y, yaw of the newer in the older.
-        """
-        p = self._parameters
-        travelled_m = np.abs(travel_m[newer][:, None] - travel_m[newer])
-        travelled_m += np.abs(travel_m[older][:, None] - travel_m[older])
-        first, second = (k.ravel() for k in np.indices(travelled_m.shape))
-        there = compose(measured[first], between(nodes[newer[first]], nodes[newer[second]]))
-        again = compose(between(nodes[older[first]], nodes[older[second]]), measured[second])
-        apart = _mahalanobis(
-            between(there, again),
-            p.short_m + p.short_per_m * travelled_m.ravel(),
-            p.short_rad + p.drift_rad_per_m * travelled_m.ravel(),
-        )
-        return (apart <= p.consistent).reshape(travelled_m.shape)
-
-
-def _mahalanobis(error: F64, sigma_m: F64, sigma_rad: F64) -> F64:
-    """Return the length (N,) of errors (N, 3) of x, y, yaw in standard deviations."""
-    yaw = (error[:, 2] + np.pi) % (2.0 * np.pi) - np.pi
-    return np.asarray(np.sqrt((error[:, 0] ** 2 + error[:, 1] ** 2) / sigma_m**2 + yaw**2 / sigma_rad**2))

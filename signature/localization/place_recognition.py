@@ -10,7 +10,6 @@ them.
 
 from __future__ import annotations
 
-import math
 import pickle
 import zlib
 from collections.abc import Sequence
@@ -20,7 +19,7 @@ from functools import lru_cache
 import numpy as np
 
 from pc2grid.mapping.loops import PlaceMap, Recognition
-from pc2grid.matching.evidence import LEFT, evidence_of
+from pc2grid.matching.evidence import LEFT, evidence_of, masses
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
@@ -45,8 +44,6 @@ class RecognitionParameters:
 
 
 RECOGNITION = RecognitionParameters()
-_LEAST_LOG_ODDS = math.log(LEFT / (1.0 - LEFT))
-"""What is less likely than what a search leaves out is not reported."""
 
 
 class SessionRecognizer:
@@ -72,7 +69,7 @@ class SessionRecognizer:
         self._places: Places | None = None
 
     def recognize(self, newest: PlaceMap) -> Sequence[Recognition]:
-        """Return the earlier stretches that look like the newest one, each place with its own odds."""
+        """Return the earlier stretches that look like the newest one, each place with its own evidence."""
         query = query_of(newest.grid, newest.poses[:, :2], self._made_with, self._config)
         found = [] if self._places is None else self._look_up(query, self._places)
         self._remember(newest.grid, query)
@@ -82,16 +79,15 @@ class SessionRecognizer:
         rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
         maps = LazySequence(self._map, len(self._stored), most=0)
         found = distinct(query, next(align(query, [places.areas(rows)], places, maps, self._config)))
-        odds = [evidence.log_odds() for evidence in evidence_of(found, query.likeness)]
         return [
             Recognition(
                 older=h.session_index,
                 newer=len(self._stored),
                 T_older_newer=best_around(query, h, maps[h.session_index]).T_map_query,
-                log_odds=log_odds,
+                evidence=evidence,
             )
-            for h, log_odds in zip(found, odds, strict=True)
-            if log_odds > _LEAST_LOG_ODDS
+            for h, evidence in zip(found, evidence_of(found, query.likeness), strict=True)
+            if masses([evidence])[0] >= LEFT
         ]
 
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:

@@ -1,6 +1,7 @@
 """The pose graph, and loop closure over it."""
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,15 +12,9 @@ from pc2grid.geometry import F64, SE2
 from pc2grid.mapping.graph import Edge, optimise
 from pc2grid.mapping.keyframes import Keyframe, Keyframes
 from pc2grid.mapping.local_maps import LocalMap, Overlap
-from pc2grid.mapping.loops import (
-    CandidateParameters,
-    LoopCandidates,
-    LoopCloser,
-    LoopParameters,
-    PlaceMap,
-    Recognition,
-)
+from pc2grid.mapping.loops import LoopCloser, LoopParameters, PlaceMap, Recognition
 from pc2grid.mapping.part_maps import OptimisedKeyframes, interpolate_corrections
+from pc2grid.matching.evidence import Evidence
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import flat_scan
 
@@ -180,11 +175,19 @@ def test_work_and_loops_grow_with_the_way_and_not_with_its_square(monkeypatch: p
     assert len(closer.finish().loops) > 3
 
 
-class KnowsTheTruth:
-    """A recognizer that knows the true poses of the keyframes, and so of the stretches."""
+HERE = SE2(0.0, 0.0, 0.0)
+SURE = Evidence(forward=1.0, walls=100.0, backward=1.0, looked_at=100.0, lead=0.1, likeness=0.0)
+"""Evidence of a place with a mass of .99, if tracking puts it there, too."""
 
-    def __init__(self, truth: list[SE2]) -> None:
-        self._truth = truth
+
+class KnowsTheTruth:
+    """A recognizer that knows the true poses of the keyframes, and so of the stretches.
+
+    off : each place is told so often, so far off, and with this evidence.
+    """
+
+    def __init__(self, truth: list[SE2], *off: tuple[SE2, Evidence]) -> None:
+        self._truth, self._off = truth, off or ((HERE, SURE),)
         self.stretches: list[PlaceMap] = []
         self.frames: list[SE2] = []  # true pose of each stretch
 
@@ -196,7 +199,10 @@ class KnowsTheTruth:
         for older, frame in enumerate(self.frames[:-1]):
             true = frame.inverse() @ self.frames[-1]
             if math.hypot(true.x, true.y) < 8.0:
-                found.append(Recognition(older=older, newer=newest.index, T_older_newer=true, log_odds=13.8))
+                found += [
+                    Recognition(older=older, newer=newest.index, T_older_newer=true @ off, evidence=evidence)
+                    for off, evidence in self._off
+                ]
         return found
 
 
@@ -205,25 +211,15 @@ def farthest(settled: F64, truth: list[SE2]) -> float:
     return float(np.linalg.norm(T_truth_session.apply(settled[:, :2]) - array(truth)[:, :2], axis=1).max())
 
 
-def test_a_recognizer_closes_loops_beyond_the_search_window() -> None:
+def test_a_recognizer_closes_loops_where_no_local_maps_are_near() -> None:
     truth = square(100) * 2
-    poses, _ = drifting(truth, veer=0.008)
+    poses, _ = drifting(truth, veer=0.004)
     planar_scans = [scan_of(pose, BLOCK) for pose in truth]
-    narrow = LoopParameters(near_m=1.0, max_window_m=0.3, max_window_rad=math.radians(2.0))
-    alone, _ = closed(poses, planar_scans, parameters=narrow)
-    # The drift, 1.1 degrees per metre, is ten times what the default takes for possible, and bends the local
-    # maps, of which each match is some centimetres off.
-    wide = CandidateParameters(
-        drift_rad_per_m=math.radians(1.2),
-        drift_per_m=0.1,
-        short_per_m=0.1,
-        known_way_m=0.0,  # the search window is narrow here: short ways drift out of it, too
-    )
-    settled, found = closed(
-        poses, planar_scans, parameters=narrow, candidate_parameters=wide, recognizer=KnowsTheTruth(truth)
-    )
-    assert farthest(alone, truth) > 3.0
-    assert farthest(settled, truth) < 0.55 and sum(loop.accepted for loop in found.loops) > 3
+    apart = LoopParameters(compared=0)
+    alone, _ = closed(poses, planar_scans, parameters=apart)
+    settled, found = closed(poses, planar_scans, parameters=apart, recognizer=KnowsTheTruth(truth))
+    assert farthest(alone, truth) > 1.0
+    assert farthest(settled, truth) < 0.2 and sum(loop.accepted for loop in found.loops) > 3
 
 
 def test_no_stretch_reaches_across_a_lost_part() -> None:
@@ -239,62 +235,37 @@ def test_no_stretch_reaches_across_a_lost_part() -> None:
 # --- Which recognised places become loops ---
 
 
-STEP_M = 4.0
+def counts(monkeypatch: pytest.MonkeyPatch, *off: tuple[SE2, Evidence]) -> float:
+    """How much the first loop counts, of two laps of which the second is recognised; 0 without a loop.
+
+    off : so far from the tracked poses, which are true. All local maps match where they are told to be.
+    """
+    p = LoopParameters(compared=0)
+
+    def overlap(self: LocalMap, newer: LocalMap, guess: SE2, window_m: float, _: float) -> Overlap | None:
+        return Overlap(guess, INFORMATION, 1.0) if window_m == p.recognized_m else None
+
+    monkeypatch.setattr(LocalMap, "overlap", overlap)
+    truth = square(100) * 2
+    scans = [scan_of(pose, BLOCK) for pose in truth]
+    _, found = closed(truth, scans, parameters=p, recognizer=KnowsTheTruth(truth, *off))
+    full = p.information_share * INFORMATION[0, 0]
+    return float(found.loops[0].information[0, 0] / full) if found.loops else 0.0
 
 
-def corridor(count: int) -> tuple[F64, F64]:
-    """PlaceMaps along a straight corridor that was driven back and forth: poses and travel."""
-    x = STEP_M * np.minimum(np.arange(count), 2 * (count // 2) - np.arange(count))
-    nodes = np.column_stack((x, np.zeros(count), np.where(np.arange(count) < count // 2, 0.0, math.pi)))
-    return nodes, STEP_M * np.arange(count)
+def test_a_place_counts_as_it_is_likely_by_its_evidence_and_by_drift(monkeypatch: pytest.MonkeyPatch) -> None:
+    weak = replace(SURE, lead=-0.05)
+    sure, doubtful = counts(monkeypatch, (HERE, SURE)), counts(monkeypatch, (HERE, weak))
+    off = counts(monkeypatch, (SE2(0.0, 3.0, 0.0), SURE))  # after 40 m; 1.1 m are a standard deviation
+    assert sure > 0.95 and 0.05 < doubtful < 0.2 and 0.2 < off < 0.6
+    assert counts(monkeypatch, (SE2(0.0, 20.0, 0.0), SURE)) == 0.0
 
 
-NODES = corridor(41)[0]
+def test_a_building_turned_by_half_is_never_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert counts(monkeypatch, (SE2(0.0, 0.0, math.pi), replace(SURE, lead=0.2))) == 0.0
 
 
-def seen(older: int, newer: int, *, off: SE2 = SE2(0.2, 0.0, 0.0)) -> Recognition:  # noqa: B008
-    """A candidate that is `off` from where tracking puts the newer stretch."""
-    T = SE2(*NODES[older]).inverse() @ SE2(*NODES[newer]) @ off
-    return Recognition(older=older, newer=newer, T_older_newer=T, log_odds=4.6)
-
-
-def accepted(*batches: list[Recognition]) -> list[Recognition]:
-    candidates = LoopCandidates()
-    for batch in batches:
-        candidates.add(batch)
-    return candidates.take(*corridor(41))
-
-
-def test_far_from_the_tracked_pose_others_must_agree() -> None:
-    off = SE2(0.0, 4.0, 0.0)  # of 84 m; 2.4 m are a standard deviation
-    alone = [seen(10, 31, off=off)]
-    again = [seen(7, 34, off=off)]
-    contrary = [seen(7, 34, off=SE2(0.0, -4.0, 0.0))]
-    assert accepted(alone) == [] and accepted(alone, contrary) == []
-    assert accepted(alone, again) == [*alone, *again]
-    same_stretch = [seen(13, 31, off=off)]
-    assert accepted([*alone, *same_stretch]) == []
-
-
-def test_a_building_turned_by_half_is_never_accepted() -> None:
-    turned = [[seen(10 - 3 * k, 31 + 3 * k, off=SE2(0.0, 0.0, math.pi))] for k in range(3)]
-    assert accepted(*turned) == []
-
-
-def test_of_two_places_for_one_stretch_the_supported_one_is_accepted() -> None:
-    right, wrong = seen(10, 31), seen(10, 31, off=SE2(2.5, 0.0, 0.0))
-    assert accepted([right, wrong]) == []
-    support = seen(7, 34)
-    assert accepted([right, wrong], [support]) == [right, support]
-
-
-def test_what_is_not_accepted_waits_and_what_cannot_be_is_forgotten() -> None:
-    candidates = LoopCandidates()
-    off = SE2(0.0, 4.0, 0.0)
-    first, impossible = seen(10, 31, off=off), seen(10, 31, off=SE2(0.0, 90.0, 2.0))
-    candidates.add([first, impossible])
-    assert candidates.take(*corridor(41)) == []
-    second = seen(7, 34, off=off)
-    candidates.add([second])
-    assert candidates.take(*corridor(41)) == [first, second]
-    assert candidates.take(*corridor(41)) == []
+def test_of_two_places_for_one_stretch_the_tracked_one_is_likelier(monkeypatch: pytest.MonkeyPatch) -> None:
+    alike = (HERE, SURE), (SE2(0.0, 2.0, 0.0), SURE)
+    right, wrong = counts(monkeypatch, *alike), counts(monkeypatch, alike[1])
+    assert counts(monkeypatch, alike[0]) - 0.02 > right > 0.75 and wrong < 0.9

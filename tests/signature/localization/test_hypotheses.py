@@ -221,11 +221,11 @@ def test_an_earlier_place_is_recognised_and_a_new_one_is_not() -> None:
     assert list(recognizer.recognize(stretch(0, rooms(0)))) == []
     for index in (1, 2, 3):
         found = recognizer.recognize(stretch(index, rooms(index)))
-        assert all(recognition.log_odds < 2.2 for recognition in found)
+        assert all(recognition.evidence.log_odds() < 2.2 for recognition in found)
     again = SE2(0.7, -0.4, 2.0)
     found = recognizer.recognize(stretch(4, seen_from(rooms(1), again)))
-    best = max(found, key=lambda recognition: recognition.log_odds)
-    assert (best.older, best.newer) == (1, 4) and best.log_odds > 3.0
+    best = max(found, key=lambda recognition: recognition.evidence.log_odds())
+    assert (best.older, best.newer) == (1, 4) and best.evidence.log_odds() > 3.0
     assert math.hypot(best.T_older_newer.x - again.x, best.T_older_newer.y - again.y) < 0.1
     assert abs(wrap_angle(best.T_older_newer.yaw - again.yaw)) < 0.02
     assert all(recognition.older < 4 for recognition in found)
@@ -238,5 +238,5 @@ def test_tables_that_were_seen_over_and_under_do_not_hide_an_earlier_place() -> 
         recognizer = SessionRecognizer(Config())
         recognizer.recognize(stretch(0, earlier))
         found, *_ = recognizer.recognize(stretch(1, rooms(1)))
-        odds.append(found.log_odds)
+        odds.append(found.evidence.log_odds())
     assert odds[0] > 4.6 and odds[0] > odds[1] + 2.0
