@@ -82,7 +82,7 @@ if TYPE_CHECKING:
     from signature.localization.answer import Answer as Answer
     from signature.localization.localizer import Localizer as Localizer
     from signature.localization.map_index import MapIndex as MapIndex
-    from signature.localization.posterior import Prior as Prior
+    from signature.localization.prior import Prior as Prior
     from signature.localization.shown.page import Found as Found
     from signature.sessions import convert as convert, relocalize as relocalize
 
@@ -123,7 +123,7 @@ _HOMES = {
     "Answer": "signature.localization.answer",
     "Found": "signature.localization.shown.page",
     "MapIndex": "signature.localization.map_index",
-    "Prior": "signature.localization.posterior",
+    "Prior": "signature.localization.prior",
     "Localizer": "signature.localization.localizer",
 }
 __all__ = ["__version__", *_HOMES]

@@ -51,7 +51,7 @@ if TYPE_CHECKING:
     from signature.localization.localizer import Localizer as Localizer, locate_map as locate_map
     from signature.localization.map_index import MapIndex as MapIndex
     from signature.localization.pose_check import PoseCheck as PoseCheck, check_pose as check_pose
-    from signature.localization.posterior import Prior as Prior
+    from signature.localization.prior import Prior as Prior
     from signature.localization.shown.page import Found as Found
     from signature.paper import (
         Signature as Signature,
@@ -84,7 +84,7 @@ _HOMES = {
     "MapIndex": "signature.localization.map_index",
     "PoseCheck": "signature.localization.pose_check",
     "check_pose": "signature.localization.pose_check",
-    "Prior": "signature.localization.posterior",
+    "Prior": "signature.localization.prior",
     "Localizer": "signature.localization.localizer",
     "locate_map": "signature.localization.localizer",
     "add_session": "signature.sessions",

@@ -39,7 +39,7 @@ from signature.localization.localizer import Localizer, locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
 from signature.localization.pose_check import PoseCheck
-from signature.localization.posterior import Prior
+from signature.localization.prior import Prior
 from signature.localization.shown.page import Found
 from signature.paper import Signature, describe
 

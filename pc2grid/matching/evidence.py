@@ -13,7 +13,7 @@
   mean, which varies by chance as 1 / sqrt(n). No lead counts as longer than the share q of the score: what
   scores less is not searched for, so there may always be a rival so near. Places that fit equally well are
   no examples of it: they get the evidence of the best of them, and their priors divide the mass.
-- like, how well the query fits onto itself, slid along (`pc2grid.matching.score`): the walls of a
+- like, how well the query fits onto itself, slid along (`self_similarity`): the walls of a
   bare corridor tell no place along it from another.
 
 `pc2grid_lab.fit.posterior` fits b, c and d to queries whose truth is known, and judges them on buildings that
@@ -72,7 +72,7 @@ class Evidence:
     on ground known to the map and were seen from a side that it knows, weighted by
     `pc2grid.matching.walls.permanence`. backward, looked_at : the other way round, from whichever side.
     lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
-    likeness : `pc2grid.matching.score` of the query.
+    likeness : `self_similarity` of the query.
     """
 
     forward: float

@@ -25,7 +25,7 @@ from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import HYPOTHESES
-from signature.localization.posterior import POSTERIOR, PRIOR
+from signature.localization.prior import PRIOR
 
 Status = Literal["located", "ambiguous", "not_found"]
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]
@@ -38,6 +38,8 @@ it was carried away. What a map shows does not contradict a place that it does n
 is not lost but doubtful until it is located elsewhere. recovered: located elsewhere, or again after it was
 lost."""
 
+LIKELY = 0.5
+"""Least mass of what is more likely than not."""
 
 _NO_MAP = OccupancyGrid(cells=np.empty((0, 0), np.int8), resolution_m=1.0, origin_m=(0.0, 0.0))
 """Of an answer in a history, of which there may be thousands."""
@@ -113,7 +115,7 @@ class Answer:
     """Where the query was.
 
     status : located, ambiguous (several places fit) or not_found (none does).
-    confidence : mass of the first place, see `signature.localization.posterior`.
+    confidence : mass of the first place, see `signature.localization.decision`.
     places : all that fit, the likeliest first. log_odds : of the first one over "nowhere", by the walls.
     off_map : further places, of which the map shows too little to tell; odometry has carried the robot there
     from places that it shows. The likeliest first; their masses are parts of the same probability.
@@ -292,7 +294,7 @@ class Answer:
     @property
     def beside_map(self) -> Place | None:
         """Return where the robot is, beside the map, if that is more likely than all else together."""
-        return next((away for away in self.off_map if away.mass >= POSTERIOR.likely), None)
+        return next((away for away in self.off_map if away.mass >= LIKELY), None)
 
     @property
     def line(self) -> AmbiguousLine | None:
@@ -436,7 +438,7 @@ def ambiguous_line(bases: Sequence[SE2], masses: Sequence[float]) -> AmbiguousLi
     heading, or if it is not likely that the base is at one of them.
     """
     lines = (_through(bases, masses, other) for other in range(1, len(bases)))
-    likely = [line for line in lines if line is not None and line.probability >= POSTERIOR.likely]
+    likely = [line for line in lines if line is not None and line.probability >= LIKELY]
     return max(likely, key=lambda line: line.probability, default=None)
 
 

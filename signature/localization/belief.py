@@ -1,7 +1,7 @@
 """The posterior filtered over time, with a rate of kidnapping.
 
     prior_t(h)  =  1 + (1 - k) mass_s(h) / (1 - (1 - k) sum_g mass_s(g)),    k = 1 - (1 - slip)^n
-    mass_t(h)   =  prior_t(h) exp(z_h) / N        (`signature.localization.posterior`)
+    mass_t(h)   =  prior_t(h) exp(z_h) / N        (`signature.localization.decision`)
 
 The scans of a search are those of the last metres, so the searches overlap. The prior of search t follows
 from the latest search s that lies before all scans of t. Then each scan counts once, however far the robot
@@ -42,11 +42,11 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.matching.score import Fit, score_fit
-from signature.localization.answer import Answer, Place, State
-from signature.localization.decision import PriorOf
+from signature.localization.answer import LIKELY, Answer, Place, State
+from signature.localization.decision import POSTERIOR, PriorOf
 from signature.localization.hypotheses import agree, more_exact
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import POSTERIOR, PRIOR
+from signature.localization.prior import PRIOR
 from signature.localization.query import QueryMap
 
 
@@ -170,8 +170,8 @@ class Belief:
             if self._found is not None and _mass_there(now, self._found[0]) >= self._accept:
                 doubt *= self._found[1]
             self._found = likeliest, doubt
-            if on >= POSTERIOR.likely or doubt <= 1.0 - POSTERIOR.certain:
-                goes_on = on >= POSTERIOR.likely or not self._was_located
+            if on >= LIKELY or doubt <= 1.0 - POSTERIOR.certain:
+                goes_on = on >= LIKELY or not self._was_located
                 self._was_located, self._place = True, likeliest
                 return "located" if goes_on else "recovered"
         else:

@@ -3,7 +3,7 @@
     mass(h)  =  m_h exp(u_h) / (1 - sum_g m_g + sum_g m_g exp(u_g + p n_gh))
     u_h      =  d_h (a on_h + b through_h + c before_h)
 
-- m_h, the mass in the plane (`signature.localization.posterior`); what is missing to 1 is "not in this
+- m_h, the mass in the plane (`signature.localization.decision`); what is missing to 1 is "not in this
   map".
 - on_h, through_h, before_h, the shares of the rays of the query that end there on a surface of the map,
   behind one, or before one, once ICP has brought the query onto them. a, b and c are what each kind tells:

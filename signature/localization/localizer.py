@@ -30,13 +30,12 @@ from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
-from signature.localization.answer import Answer, State, fits_changed
+from signature.localization.answer import LIKELY, Answer, State, fits_changed
 from signature.localization.belief import Belief, mass_at, with_mass
-from signature.localization.decision import PriorOf, decide, judge, weighed
+from signature.localization.decision import PriorOf, decide, judge, slip_of, weighed
 from signature.localization.hypotheses import HYPOTHESES, moved_to_origin
 from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import POSTERIOR, slip_of
 from signature.localization.query import Query, QueryMap, ViewSpacing, map_as_query
 
 _MOMENTS = 10_000
@@ -193,7 +192,7 @@ class Localizer:
                 later = self.search(query.since(scans), index=index)
                 slipped *= _elsewhere(later[1], best)
         answer = weighed(answer, prior_of, off_map, slipped, index.config.accept)
-        if later and slipped * answer.places[0].mass >= POSTERIOR.likely:
+        if later and slipped * answer.places[0].mass >= LIKELY:
             return later
         answer = self._belief.in_its_map(answer)
         clock.lap("decide")

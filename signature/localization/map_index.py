@@ -25,7 +25,7 @@ from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import align, best_around, distinct, fitted
 from signature.localization.in_space import SurfaceOf, surface_reader
-from signature.localization.posterior import Prior, Region
+from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
 from signature.paper import SignatureTable
 from signature.retrieval.places import (
@@ -266,7 +266,7 @@ class MapIndex:
         self, query: QueryMap, new: Sequence[Fit], kept: Sequence[Fit] = ()
     ) -> tuple[Fit, ...]:
         """Return the new and the earlier hypotheses that score enough beside the best one to be reported
-        (`PosteriorParameters.longest_lead`), best first, each the best around itself; those that a prior
+        (`EvidenceParameters.longest_lead`), best first, each the best around itself; those that a prior
         excludes are kept beside them."""
         maps, share = self.maps_for(query), 1.0 - EVIDENCE.longest_lead
         worth: list[Fit] = []

@@ -3,7 +3,7 @@
 The session is its own database: each stretch of some metres of travel becomes a small map with a few
 described places, and every new stretch is looked up among those before it with the parts of a `MapIndex`.
 Signatures propose, the alignment of walls in both directions verifies, and the posterior of every answer
-(`signature.localization.posterior`) says how sure it is that two maps show one place. Which of several such
+(`signature.localization.decision`) says how sure it is that two maps show one place. Which of several such
 places is the right one is decided by loop closure (`pc2grid.mapping.loops`), which knows the travel between
 them.
 """

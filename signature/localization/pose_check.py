@@ -35,7 +35,7 @@ from signature.localization.answer import Answer
 from signature.localization.belief import kept
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import Prior
+from signature.localization.prior import Prior
 
 CheckStatus = Literal["fine", "lost", "unsure"]
 

@@ -94,7 +94,7 @@ class QueryMap:
 
     @cached_property
     def likeness(self) -> float:
-        """Return `pc2grid.matching.score` of the walls."""
+        """Return the `self_similarity` of the walls."""
         return self_similarity(self.walls)
 
 

@@ -25,7 +25,7 @@ from signature.database import SubmapDatabase
 from signature.localization.answer import pose_text
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, check_pose
-from signature.localization.posterior import Prior
+from signature.localization.prior import Prior
 from signature.sessions import about_query, open_places, query_config, tracked
 
 

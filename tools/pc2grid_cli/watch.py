@@ -36,7 +36,7 @@ from signature.localization.joining.building import map_of
 from signature.localization.localizer import Follower, Localizer, ResetPolicy
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch
-from signature.localization.posterior import Prior
+from signature.localization.prior import Prior
 from signature.sessions import query_config
 
 ResultT = TypeVar("ResultT")

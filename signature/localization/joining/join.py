@@ -48,7 +48,7 @@ class JoinParameters:
     side_m : of a square piece: about what a robot sees from a place.
     least_walls : wall points of a piece, by weight.
     follows : a piece that agrees less than this does not show where its neighbours begin; wrong places agree
-        by 0.6, see `signature.localization.posterior`.
+        by 0.6, see `pc2grid.matching.evidence`.
     proposed : transforms that are compared at most: a building of equal rooms has as many.
     least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
     accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.

@@ -20,7 +20,7 @@ from signature.localization.answer import Answer, Place, fits_changed
 from signature.localization.belief import Belief
 from signature.localization.decision import anywhere, decide, weighed
 from signature.localization.localizer import Follower, Localizer
-from signature.localization.posterior import Prior
+from signature.localization.prior import Prior
 from signature.localization.query import query_of
 from tests.helpers.simulated_drives import building, drive, office, plan
 

@@ -5,7 +5,7 @@
 Each file is one that `queries evidence` has written. An answer is judged by a fit without all answers whose
 query or map is of one of its buildings. Prints by kind of query how many answers are right, and how many
 would be located by the parameters in use and by those fitted without the building, rightly and wrongly; the
-log loss; and the parameters for `signature.localization.posterior`. With --in-space the same of
+log loss; and the parameters for `pc2grid.matching.evidence`. With --in-space the same of
 `signature.localization.in_space`: by the masses in the plane, the parameters in use, these with the
 rays of places drawn at random, those fitted, and those fitted without the buildings of query and map.
 

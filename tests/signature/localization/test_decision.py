@@ -1,4 +1,4 @@
-"""The masses of places, and what moves them: slips and the prior."""
+"""What is decided of a query, and what moves it: slips and the prior."""
 
 import functools
 import math
@@ -14,10 +14,10 @@ from pc2grid.matching.score import Fit
 from pc2grid.model import Health, RegisteredScan
 from signature.config import Config, RelocalizeConfig
 from signature.localization.answer import Answer
-from signature.localization.decision import decide
+from signature.localization.decision import POSTERIOR, decide, slip_of
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import POSTERIOR, Prior, slip_of
+from signature.localization.prior import Prior
 from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import TWINS, building, drive, office
 

@@ -1,30 +1,9 @@
-"""The posterior over places and "not in this map": one equation decides every answer.
+"""What is known of the pose of a robot beforehand: a region of a map (`Prior`), of one of several (`Region`).
 
-    mass(h)  =  prior(h) exp(z_h) / N                        the query lies at h
-    slipped  =  mass(h) A sum_k s exp(-c r_k)                it lay at the likeliest h until scan k
-    nowhere  =  1 / N                                        it lies at no place of this map
-    N        =  1 + sum_h prior(h) exp(z_h), and all else that is told apart from "nowhere"
-
-z_h is the evidence of a place (`pc2grid.matching.evidence`).
-
-- r_k, the log-likelihood of the scans from k on, f of these alone, a metre, times the metres since: where
-  tracking slips or the robot is carried away, the scans before fit and those after do not. s is the rate of
-  slips, per scan, higher where its pose is not fine. As in a test by the least sum (Page 1954, "Continuous
-  inspection schemes"), what has contradicted for long tells more; metres count, because neighbouring scans
-  see the same walls. Where all scans contradict, as those of a camera in a laser's map, r_k is what these
-  contradict more: the score of the place has the rest.
-- A, what the scans since the likeliest slip can be: "nowhere" and each other place of the map, found for
-  these scans alone. 1 as long as nothing contradicts the place. If that is likelier than not, what they say
-  is the answer.
-
-`located` means that one place has at least the mass `RelocalizeConfig.accept`; `ambiguous`, that the best
-place is at least as likely as "nowhere", z + ln prior >= 0; `not_found` all else.
-
-A prior (`Prior`) is a region of the map that the robot is known to be in. It excludes: a place outside has
-probability 0 and is no answer. Between places that fit equally well it decides. But what scores differently
-outside still shows what wrong places score for this query, so it remains evidence
-(`signature.localization.decision`): a place that fits poorly is not certain because few others are in the
-region, and if another place fits better by far, nothing inside is. That place is reported
+It excludes: a place outside has probability 0 and is no answer. Between places that fit equally well it
+decides. But what scores differently outside still shows what wrong places score for this query, so it remains
+evidence (`signature.localization.decision`): a place that fits poorly is not certain because few others are
+in the region, and if another place fits better by far, nothing inside is. That place is reported
 (`Answer.excluded`).
 """
 
@@ -40,9 +19,6 @@ from scipy.special import chdtri
 
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import F64, SE2, BoolGrid, wrap_angle
-from pc2grid.matching.evidence import EVIDENCE, tempered
-from pc2grid.matching.score import Fit
-from pc2grid.matching.walls import Walls
 from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.query import QueryMap
 
@@ -221,53 +197,3 @@ class Region:
         step = T_odom_prior.inverse() @ query.T_odom_base
         moved_m = math.hypot(step.x, step.y)
         return np.asarray(free_m[self.prior.may_hold(free_m, side_m, moved_m, query.since_prior_m)])
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PosteriorParameters:
-    """What the equation above is made of.
-
-    slip : s, once in 100 m of scans 0.1 m apart; by hand, since it is too rare to be fitted. At .0006 a robot
-        that is carried away notices later, at .002 one that leaves the map forgets where it was.
-    slip_weak : s of a scan whose pose is not fine; by hand: at .05 a robot that is lifted is lost while its
-        last scans fit.
-    likely : least mass of what is more likely than not.
-    certain : a robot is told where it is if the searches in a row that found it there are that sure; by hand.
-    shown : a map that knows the ground of less than this share of the walls that are seen says nothing of a
-        place; half, as where the recordings are judged.
-    """
-
-    slip: float = 0.001
-    slip_weak: float = 0.01
-    likely: float = 0.5
-    certain: float = 0.99
-    shown: float = 0.5
-
-
-POSTERIOR = PosteriorParameters()
-
-
-def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[float, int]:
-    """Return the mass of "it lay here until it was carried away or tracking slipped", as a multiple of that
-    of the place, with A = 1; and the number of scans since the likeliest slip, 0 if none contradict the
-    place.
-
-    step_m : travel after which scans are new evidence.
-    """
-    above = query.walls.facing(walls).only_explain
-    likelihood = points = 0.0
-    levels, steps = [], []
-    # Before the first scan there was nothing to slip from.
-    for count, keyframe in enumerate(reversed(query.keyframes[1:]), start=1):
-        hits_m = (fit.T_map_query @ keyframe.T_odom_base).apply(keyframe.planar_scan.hits_m)
-        values, known = walls.field.at(hits_m, above=above)
-        likelihood += float(values[known].sum())
-        points += float(np.count_nonzero(known))
-        mean = likelihood / points if points else 0.0
-        levels.append(tempered(mean, points / count))
-        steps.append(max((query.path_m - keyframe.path_m) / step_m, 1.0))
-    tail = (np.array(levels) - min([*levels[-1:], 0.0])) * steps
-    since = 1 + int(tail.argmin()) if tail.min(initial=0.0) < 0.0 else 0
-    weak = [keyframe.weak for keyframe in reversed(query.keyframes[1:])]
-    rates = np.where(weak, POSTERIOR.slip_weak, POSTERIOR.slip)
-    return float(rates @ np.exp(-EVIDENCE.fit * tail)), since
