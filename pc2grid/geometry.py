@@ -105,6 +105,17 @@ class SE2:
         )
 
 
+def lever_arm(begin: SE2, end: SE2) -> F64:
+    """Return the Jacobian J (3, 3) of x, y, yaw at one point of a rigid body by those at another one.
+
+    A turn at `begin` moves `end`: a covariance C there, in the axes of the map, is J C J' here.
+
+    >>> lever_arm(SE2(1.0, 2.0), SE2(4.0, 2.0, 0.5)) @ (0.0, 0.0, 0.1)  # 3 m away, along x
+    array([0. , 0.3, 0.1])
+    """
+    return np.array([[1.0, 0.0, begin.y - end.y], [0.0, 1.0, end.x - begin.x], [0.0, 0.0, 1.0]])
+
+
 def transform_points(T_target_source: F64, points_m: NDArray[np.floating]) -> F64:
     """Map points (N, 3) by a pose (4, 4); returns (N, 3) float64 in the target frame."""
     return np.asarray(points_m, dtype=np.float64) @ T_target_source[:3, :3].T + T_target_source[:3, 3]

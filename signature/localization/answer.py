@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from pc2grid.display import html_picture, html_table, map_png, plain, probability, short
-from pc2grid.geometry import F64, I64, SE2, frozen_arrays, wrap_angle
+from pc2grid.geometry import F64, I64, SE2, frozen_arrays, lever_arm, wrap_angle
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
@@ -508,11 +508,9 @@ def covariance_in_building(covariance: F64, T_session_base: SE2, frame: Building
     It is turned, and contains that of the session's own place, whose heading moves the pose the more the
     farther it is from the session's origin.
     """
-    T = frame.T_building_session
     there = frame.placed(T_session_base)
     turn = SE2(0.0, 0.0, there.yaw - T_session_base.yaw).matrix()
-    J = np.eye(3)
-    J[:2, 2] = T.y - there.y, there.x - T.x
+    J = lever_arm(frame.T_building_session, there)
     return np.asarray(turn @ covariance @ turn.T + J @ np.array(frame.covariance) @ J.T)
 
 

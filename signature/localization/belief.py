@@ -40,7 +40,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pc2grid.geometry import SE2
+from pc2grid.geometry import SE2, lever_arm
 from pc2grid.matching.score import Fit, score_fit
 from signature.localization.answer import LIKELY, Answer, Place, State
 from signature.localization.decision import POSTERIOR, PriorOf
@@ -83,9 +83,7 @@ def _carried(place: Place, now: QueryMap | Answer, odds: float = 1.0) -> Place:
     drift = np.array([PRIOR.drift, PRIOR.drift, PRIOR.drift_rad_m]) * way_m
     fits = []
     for fit, seen in zip(place.fits, place.seen, strict=True):
-        begin, end = fit.T_map_query @ place.T_odom_seen, fit.T_map_query @ now.T_odom_base
-        J = np.eye(3)
-        J[:2, 2] = begin.y - end.y, end.x - begin.x
+        J = lever_arm(fit.T_map_query @ place.T_odom_seen, fit.T_map_query @ now.T_odom_base)
         fits.append(replace(fit, covariance=np.asarray(J @ seen @ J.T + np.diag(drift**2))))
     return replace(place, fits=tuple(fits), mass=odds * place.mass)
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.special import chdtri
 
-from pc2grid.geometry import F32, F64, SE2, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, hand_over, lever_arm, wrap_angle
 from pc2grid.matching.score import Fit, refine, score_fit
 from pc2grid.matching.search import (
     SearchMap,
@@ -59,6 +59,9 @@ class HypothesisParameters:
 
 
 HYPOTHESES = HypothesisParameters()
+
+MAP_COVARIANCE = hand_over(np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad))))
+"""(3, 3) of x, y, yaw of what a map shows, added to that of an alignment."""
 
 ONE_PLACE = float(chdtri(3, 1.0 - 0.999))
 """Squared Mahalanobis distance of x, y, yaw within which 99.9 % of all poses of one place lie."""
@@ -129,8 +132,7 @@ def best_around(query: QueryMap, h: Fit, target: SearchMap) -> Fit:
 def fitted(query: QueryMap, session_index: int, submap_id: int, target: SearchMap, T_map_query: SE2) -> Fit:
     """Return the hypothesis that the query lies at a pose, which is refined first."""
     pose, covariance = _refined(query, target, T_map_query)
-    covariance = covariance + np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
-    fit = score_fit(target.walls, query.walls, pose, covariance)
+    fit = score_fit(target.walls, query.walls, pose, covariance + MAP_COVARIANCE)
     return replace(fit, session_index=session_index, submap_id=submap_id)
 
 
@@ -206,9 +208,7 @@ def _nearer(a: SE2, b: SE2, apart_m: float, apart_rad: float) -> bool:
 def moved_to_origin(covariance: F64, T_map_query: SE2, at: SE2) -> F64:
     """Return the covariance (3, 3) of a pose in the map at the query's origin, given that at its point
     `at`."""
-    there = T_map_query @ at
-    J = np.eye(3)
-    J[:2, 2] = there.y - T_map_query.y, T_map_query.x - there.x
+    J = lever_arm(T_map_query @ at, T_map_query)
     return np.asarray(J @ covariance @ J.T)
 
 

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64, SE2, BoolGrid, hand_over, wrap_angle
+from pc2grid.geometry import F64, SE2, BoolGrid, hand_over, lever_arm, wrap_angle
 from pc2grid.libraries import one_blas_thread
 from pc2grid.mapping.graph import Edge, information_matrix, optimise
 from pc2grid.mapping.local_maps import pose_at
@@ -412,9 +412,7 @@ def _edge(
     T_target_source = T_straight_target @ link.T_target_source @ T_straight_source.inverse()
     T_target_a, T_target_b = pose_at(target.nodes, a), T_target_source @ pose_at(source.nodes, b)
     # The covariance is that of the piece at its middle: at the node, its turn moves it as well.
-    J = np.eye(3)
-    J[:2, 2] = there.y - T_target_b.y, T_target_b.x - there.x
-    turned = SE2(0.0, 0.0, -T_target_a.yaw).matrix() @ J
+    turned = SE2(0.0, 0.0, -T_target_a.yaw).matrix() @ lever_arm(there, T_target_b)
     information = np.linalg.inv(turned @ link.covariance @ turned.T)
     T_a_b = T_target_a.inverse() @ T_target_b
     return Edge(a, b, T_a_b, np.asarray(information), loop=True)

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 import cv2
 import numpy as np
 
-from pc2grid.geometry import F32, F64, SE2, frozen_arrays, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, frozen_arrays, lever_arm, wrap_angle
 from pc2grid.matching.evidence import EVIDENCE, NO_EVIDENCE, Evidence, evidence_of, masses
 from pc2grid.matching.score import Fit, refine, score_fit, self_similarity
 from pc2grid.matching.search import SearchMap
@@ -33,7 +33,7 @@ from pc2grid.matching.walls import LIKELIHOOD, Walls
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.observer import Observer
 from signature.database.protocol import SessionInfo
-from signature.localization.hypotheses import HYPOTHESES, moved_to_origin, same_pose
+from signature.localization.hypotheses import MAP_COVARIANCE, moved_to_origin, same_pose
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap, map_as_query
 
@@ -253,8 +253,7 @@ def _refined(
     whole, covariance = refine(target.search.field, points_m, T_target_source, proposal.at_m)
     if bend_m < LIKELIHOOD.sigma_m:  # all walls are within reach of theirs at once, which is more exact
         T_target_source = whole
-    deviations = (HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)
-    covariance = covariance + np.diag(np.square(deviations)) + np.diag([bend_m**2, bend_m**2, 0.0])
+    covariance = covariance + MAP_COVARIANCE + np.diag([bend_m**2, bend_m**2, 0.0])
     return _ExactTransform(
         T_target_source=T_target_source,
         at_m=proposal.at_m,
@@ -552,12 +551,11 @@ def links_of(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[Link, ...]:
     seen = [fit.compared for fit in fits]
     shown = [k for k, walls in enumerate(seen) if walls >= JOIN.least_walls] or [int(np.argmax(seen))]
     kept = [k for k in shown if fits[k].known_agreement_both_ways >= JOIN.follows] or shown
-    noise = np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad)))
     return tuple(
         Link(
             center_m=pieces[k].center_m,
             T_target_source=fits[k].T_map_query,
-            covariance=fits[k].covariance + noise,
+            covariance=fits[k].covariance + MAP_COVARIANCE,
         )
         for k in kept
     )
@@ -578,8 +576,7 @@ def rigid(links: Sequence[Link]) -> tuple[SE2, float]:
     for _ in range(4):  # of Gauss and Newton; only the heading is not linear
         at_m = T.apply(middles_m)
         error = np.column_stack((there_m - at_m, wrap_angle(yaws - T.yaw)))
-        J = np.tile(np.eye(3), (len(links), 1, 1))
-        J[:, 0, 2], J[:, 1, 2] = T.y - at_m[:, 1], at_m[:, 0] - T.x
+        J = np.array([lever_arm(T, SE2(*at)) for at in at_m.tolist()])
         normal = np.einsum("kia,kij,kjb->ab", J, information, J)
         x, y, yaw = np.linalg.solve(normal, np.einsum("kia,kij,kj->a", J, information, error)).tolist()
         T = SE2(T.x + x, T.y + y, wrap_angle(T.yaw + yaw))
