@@ -142,17 +142,9 @@ class JoinableMap:
         return Walls.of(self.grid)
 
     @cached_property
-    def query(self) -> QueryMap:
-        """Return the map as a query."""
-        return QueryMap(
-            stamp_ns=0,
-            path_m=0.0,
-            T_odom_base=SE2(),
-            grid=self.grid,
-            views=(),
-            walls=self.walls,
-            center_m=(0.0, 0.0),
-        )
+    def likeness(self) -> float:
+        """Return the `self_similarity` of its walls."""
+        return self_similarity(self.walls)
 
     @cached_property
     def pieces(self) -> tuple[Piece, ...]:
@@ -165,7 +157,7 @@ class JoinableMap:
         return tuple(mirrored(piece, self.index) for piece in self.pieces)
 
     @property
-    def search(self) -> SearchMap:
+    def search_map(self) -> SearchMap:
         """Return the map, prepared to be searched."""
         return self.index.maps[0]
 
@@ -247,10 +239,10 @@ def _refined(
 ) -> _ExactTransform:
     """Make the transform that one piece proposes exact by the walls of all."""
     pose = proposal.T_target_source
-    fits = align_pieces(target.search, pieces, pose, proposal.at_m)
+    fits = align_pieces(target.search_map, pieces, pose, proposal.at_m)
     links = links_of(pieces, fits)
     T_target_source, bend_m = rigid(links)
-    whole, covariance = refine(target.search.field, points_m, T_target_source, proposal.at_m)
+    whole, covariance = refine(target.search_map.field, points_m, T_target_source, proposal.at_m)
     if bend_m < LIKELIHOOD.sigma_m:  # all walls are within reach of theirs at once, which is more exact
         T_target_source = whole
     covariance = covariance + MAP_COVARIANCE + np.diag([bend_m**2, bend_m**2, 0.0])
@@ -306,7 +298,7 @@ def _evidence(source: JoinableMap, candidate: _ExactTransform, number: int, fits
         )
         for score in scores.tolist()
     ]
-    return evidence_of(whole, source.query.likeness)[number]
+    return evidence_of(whole, source.likeness)[number]
 
 
 def _bound(evidence: Evidence, prior: float) -> float:
