@@ -27,7 +27,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import compress
 
 import numpy as np
@@ -68,45 +68,38 @@ LEFT = 0.05
 class Evidence:
     """What tells for one place.
 
-    forward : `pc2grid.matching.score.Fit.known_agreement`. walls : wall points of the query that lie
-    on ground known to the map and were seen from a side that it knows, weighted by
-    `pc2grid.matching.walls.permanence`. backward, looked_at : the other way round, from whichever side.
+    known_agreement, compared, backward, looked_at : see `pc2grid.matching.score.Fit`.
     lead : score less that of the best place that does not fit equally well, at most `longest_lead` of it.
     likeness : `self_similarity` of the query.
     """
 
-    forward: float
-    walls: float
+    known_agreement: float
+    compared: float
     backward: float
     looked_at: float
     lead: float
     likeness: float
 
     @property
-    def agreement(self) -> float:
-        """Return the better agreement of the two directions, 0..1."""
-        return max(self.forward, self.backward)
-
-    @property
     def log_likelihood(self) -> float:
         """Return f + g: below 0 the place fits less than wrong places do."""
-        return tempered(self.forward, self.walls) + tempered(self.backward, self.looked_at)
+        return tempered(self.known_agreement, self.compared) + tempered(self.backward, self.looked_at)
 
     @property
     def terms(self) -> tuple[float, float, float]:
         """Return the factors of b, c and d."""
-        sharpness = math.sqrt(self.walls * (1.0 - self.likeness**2))
+        sharpness = math.sqrt(self.compared * (1.0 - self.likeness**2))
         return 1.0, self.log_likelihood, self.lead * sharpness
 
     def log_odds(self, p: EvidenceParameters = EVIDENCE) -> float:
         """Return z, the logarithm of the mass of the place over that of "nowhere"; minus infinity without
         walls."""
-        if not self.walls:
+        if not self.compared:
             return -math.inf
         return float(np.dot((p.bias, p.fit, p.lead), self.terms))
 
 
-NO_EVIDENCE = Evidence(forward=0.0, walls=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
+NO_EVIDENCE = Evidence(known_agreement=0.0, compared=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
 
 
 def evidence_of(
@@ -114,26 +107,38 @@ def evidence_of(
 ) -> tuple[Evidence, ...]:
     """Return the evidence of places, one fit each.
 
-    likeness : `pc2grid.matching.score.self_similarity` of the query. rivals : of places that are no answers,
-    but examples of what wrong places score as well.
+    likeness : `self_similarity` of the query. rivals : of places that are no answers, but examples of what
+    wrong places score as well.
     """
-    scores = np.array([fit.score for fit in (*fits, *rivals)])
-    alike = np.abs(scores[: len(fits), None] - scores) <= EVIDENCE.alike
     each = [
         Evidence(
-            forward=fit.known_agreement,
-            walls=fit.compared,
+            known_agreement=fit.known_agreement,
+            compared=fit.compared,
             backward=fit.backward,
             looked_at=fit.looked_at,
-            lead=min(
-                EVIDENCE.longest_lead * fit.score,
-                fit.score - float(np.max(scores[~equal], initial=-math.inf)),
-            ),
+            lead=0.0,
             likeness=likeness,
         )
-        for fit, equal in zip(fits, alike, strict=True)
+        for fit in fits
     ]
-    return tuple(max(compress(each, equal), key=Evidence.log_odds) for equal in alike)
+    return with_leads(each, [fit.score for fit in (*fits, *rivals)])
+
+
+def with_leads(each: Sequence[Evidence], scores: Sequence[float]) -> tuple[Evidence, ...]:
+    """Return the evidence of places with their leads; of those that fit equally well, that of the best.
+
+    scores : of these places, then of their other rivals.
+    """
+    every = np.array(scores)
+    alike = np.abs(every[: len(each), None] - every) <= EVIDENCE.alike
+    led = [
+        replace(
+            one,
+            lead=min(EVIDENCE.longest_lead * score, score - float(np.max(every[~equal], initial=-math.inf))),
+        )
+        for one, score, equal in zip(each, scores, alike, strict=False)
+    ]
+    return tuple(max(compress(led, equal), key=Evidence.log_odds) for equal in alike)
 
 
 def masses(

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from pc2grid.geometry import F32, F64, SE2, frozen_arrays, lever_arm, wrap_angle
-from pc2grid.matching.evidence import EVIDENCE, NO_EVIDENCE, Evidence, evidence_of, masses
+from pc2grid.matching.evidence import EVIDENCE, NO_EVIDENCE, Evidence, evidence_of, masses, with_leads
 from pc2grid.matching.score import Fit, refine, score_fit, self_similarity
 from pc2grid.matching.search import SearchMap
 from pc2grid.matching.walls import LIKELIHOOD, Walls
@@ -268,7 +268,7 @@ def _best(
     By branch and bound: what is not judged is neither joined nor more probable than the best.
     """
     fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)])
-    found = [_evidence(source, one, k, fits) for k, one in enumerate(candidates)]
+    found = [_evidence(source, k, fits) for k in range(len(candidates))]
     bounds = [_bound(evidence, prior) for evidence in found]
     best = UNJOINED
     for k in sorted(range(len(candidates)), key=lambda k: -bounds[k]):
@@ -279,26 +279,21 @@ def _best(
     return best
 
 
-def _evidence(source: JoinableMap, candidate: _ExactTransform, number: int, fits: PieceFits) -> Evidence:
+def _evidence(source: JoinableMap, number: int, fits: PieceFits) -> Evidence:
     """Return the evidence for a transform: the walls of the source that lie on known ground of the target.
 
     number : its row in `fits`; the other rows are of its rivals.
     """
     forward, backward, scores = fits.of_part(number)
-    whole = [
-        Fit(
-            T_map_query=candidate.T_target_source,
-            forward=forward,
-            backward=backward,
-            overlap=1.0,
-            compared=float(fits.seen[number].sum()),
-            looked_at=float(fits.looked_at[number].sum()),
-            score=score,
-            covariance=candidate.covariance,
-        )
-        for score in scores.tolist()
-    ]
-    return evidence_of(whole, source.likeness)[number]
+    part = Evidence(
+        known_agreement=forward,
+        compared=float(fits.seen[number].sum()),
+        backward=backward,
+        looked_at=float(fits.looked_at[number].sum()),
+        lead=0.0,
+        likeness=source.likeness,
+    )
+    return with_leads([part] * len(scores), scores.tolist())[number]
 
 
 def _bound(evidence: Evidence, prior: float) -> float:

@@ -176,7 +176,7 @@ def test_work_and_loops_grow_with_the_way_and_not_with_its_square(monkeypatch: p
 
 
 HERE = SE2(0.0, 0.0, 0.0)
-SURE = Evidence(forward=1.0, walls=100.0, backward=1.0, looked_at=100.0, lead=0.1, likeness=0.0)
+SURE = Evidence(known_agreement=1.0, compared=100.0, backward=1.0, looked_at=100.0, lead=0.1, likeness=0.0)
 """Evidence of a place with a mass of .99, if tracking puts it there, too."""
 
 

@@ -16,7 +16,7 @@ from pc2grid.matching.score import Fit
 AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
 WALLS = [5.0, 30.0, 100.0, 300.0, 2000.0]
 LEADS = [-0.1, 0.0, 0.01, 0.05, 0.1, 0.15]
-USUAL = Evidence(forward=0.9, walls=200.0, backward=0.9, looked_at=150.0, lead=0.15, likeness=0.4)
+USUAL = Evidence(known_agreement=0.9, compared=200.0, backward=0.9, looked_at=150.0, lead=0.15, likeness=0.4)
 
 
 def mass(evidence: Evidence) -> float:
@@ -24,24 +24,26 @@ def mass(evidence: Evidence) -> float:
 
 
 @pytest.mark.parametrize(
-    ("field", "values"), [("forward", AGREEMENTS), ("backward", AGREEMENTS), ("lead", LEADS)]
+    ("field", "values"), [("known_agreement", AGREEMENTS), ("backward", AGREEMENTS), ("lead", LEADS)]
 )
 def test_more_agreement_or_a_longer_lead_never_lowers_the_mass(field: str, values: list[float]) -> None:
     for agreement, walls, lead in itertools.product(AGREEMENTS[::2], WALLS, LEADS[::2]):
-        other = replace(USUAL, forward=agreement, backward=agreement, walls=walls, looked_at=walls, lead=lead)
+        other = replace(
+            USUAL, known_agreement=agreement, backward=agreement, compared=walls, looked_at=walls, lead=lead
+        )
         along = [mass(replace(other, **{field: value})) for value in values]
         assert along == sorted(along) and along[-1] > along[0]
 
 
 def test_masses_and_what_they_leave_add_up_to_one() -> None:
     """ "Nowhere" has the weight 1 beside exp(z) of each place."""
-    places = [replace(USUAL, lead=0.01), replace(USUAL, lead=-0.01, forward=0.85)]
+    places = [replace(USUAL, lead=0.01), replace(USUAL, lead=-0.01, known_agreement=0.85)]
     odds = np.exp([p.log_odds() for p in places])
     assert masses(places) == pytest.approx(odds / (1.0 + odds.sum()))
 
 
 def test_of_two_equal_places_each_has_at_most_half() -> None:
-    twins = [replace(USUAL, forward=1.0, backward=1.0, walls=1e6, looked_at=1e6, lead=0.0)] * 2
+    twins = [replace(USUAL, known_agreement=1.0, backward=1.0, compared=1e6, looked_at=1e6, lead=0.0)] * 2
     assert masses(twins).max() <= 0.5
     assert masses([replace(USUAL)] * 2).sum() > 0.9  # which of them is open, not whether it is one
 
@@ -58,12 +60,12 @@ def test_what_neither_side_knows_says_nothing() -> None:
     assert mass(replace(USUAL, backward=1.0, looked_at=0.0)) == pytest.approx(
         mass(replace(USUAL, backward=0.0, looked_at=0.0))
     )
-    assert masses([replace(USUAL, walls=0.0)])[0] == 0.0 and masses([NO_EVIDENCE])[0] == 0.0
+    assert masses([replace(USUAL, compared=0.0)])[0] == 0.0 and masses([NO_EVIDENCE])[0] == 0.0
     assert len(masses([])) == 0
 
 
 def test_a_place_where_fewer_points_agree_than_at_wrong_ones_speaks_against_itself() -> None:
-    poor = replace(USUAL, forward=0.4, backward=0.4)
+    poor = replace(USUAL, known_agreement=0.4, backward=0.4)
     assert poor.log_likelihood < 0.0 < USUAL.log_likelihood
     assert mass(poor) < 0.9 < mass(USUAL)
 
@@ -76,7 +78,13 @@ def test_a_lead_says_the_less_the_more_the_query_is_like_itself() -> None:
 def test_a_corridor_that_the_map_lacks_is_not_located_in_another() -> None:
     """Figures of a real laser, 73 m from where it was: 406 wall points fit, most of them slid along, too."""
     corridor = replace(
-        USUAL, forward=0.913, walls=406.0, backward=0.826, looked_at=582.0, lead=0.033, likeness=0.835
+        USUAL,
+        known_agreement=0.913,
+        compared=406.0,
+        backward=0.826,
+        looked_at=582.0,
+        lead=0.033,
+        likeness=0.835,
     )
     assert mass(corridor) < 0.88
     assert mass(replace(corridor, lead=0.17)) > 0.9  # a corridor that no other resembles
@@ -108,4 +116,4 @@ def test_equal_places_are_no_example_of_what_wrong_places_score() -> None:
 def test_what_differs_between_equal_places_is_chance() -> None:
     """Their scores are equal, as the one that agrees less lies on more known ground."""
     twins = evidence_of([found(0.9, 0.85), found(0.9, 0.95)])
-    assert twins[0] == twins[1] and twins[0].forward == 0.95
+    assert twins[0] == twins[1] and twins[0].known_agreement == 0.95

@@ -14,7 +14,7 @@ from pc2grid_lab.fit.posterior import Compared, compared_of, fit_factor_in_space
 from signature.localization.in_space import masses_in_space
 
 TRUTH = np.array([6.0, -15.0, -60.0, -2.0])
-FITS = Evidence(forward=0.9, walls=80.0, backward=0.8, looked_at=80.0, lead=0.1, likeness=0.3)
+FITS = Evidence(known_agreement=0.9, compared=80.0, backward=0.8, looked_at=80.0, lead=0.1, likeness=0.3)
 IN_MAP = {"log": "a", "map": "a", "start": "one 0.0", "travel_m": 5.0, "place": "in the map"}
 
 

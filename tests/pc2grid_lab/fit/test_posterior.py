@@ -17,8 +17,8 @@ TRUTH = replace(EVIDENCE, bias=-4.0, fit=2.0, lead=4.0)
 
 def place(rng: np.random.Generator, lead: float) -> Evidence:
     return Evidence(
-        forward=float(rng.uniform(0.3, 0.98)),
-        walls=float(rng.uniform(30, 300)),
+        known_agreement=float(rng.uniform(0.3, 0.98)),
+        compared=float(rng.uniform(30, 300)),
         backward=float(rng.uniform(0.3, 0.98)),
         looked_at=float(rng.uniform(30, 300)),
         lead=lead,
@@ -82,7 +82,9 @@ def row(log: str, evidence: Evidence, error: list[float], **changes: Any) -> dic
 
 def test_one_command_fits_and_judges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rng = np.random.default_rng(0)
-    good, poor = (replace(place(rng, lead), forward=f, backward=f) for lead, f in ((0.2, 0.98), (0.01, 0.3)))
+    good, poor = (
+        replace(place(rng, lead), known_agreement=f, backward=f) for lead, f in ((0.2, 0.98), (0.01, 0.3))
+    )
     rows = []
     for log in ("a", "fr079"):
         rows += [row(log, good, [0.1, 0.01]), row(log, poor, [7.0, 0.0])]

@@ -31,7 +31,9 @@ def test_each_question_says_what_tells_for_its_places() -> None:
     ]
     inside, elsewhere, standing, blanked = asked
     assert inside["errors"][0][0] < 0.1 and inside["travel_m"] > 10.0
-    assert standing["travel_m"] == 0.0 < standing["evidence"][0]["walls"] < inside["evidence"][0]["walls"]
+    assert (
+        standing["travel_m"] == 0.0 < standing["evidence"][0]["compared"] < inside["evidence"][0]["compared"]
+    )
     assert all(error_m == math.inf for error_m, _ in elsewhere["errors"])
     assert all(error_m > 0.5 for error_m, _ in blanked["errors"])
     known = {one.kind: one for one in known_of([inside, elsewhere])}

@@ -142,7 +142,7 @@ class _Likelihood:
         terms = np.tile((np.inf, 0.0, 0.0), (len(answers), most, 1))
         for n, answer in enumerate(answers):
             for k, evidence in enumerate(answer.places):
-                if evidence.walls:
+                if evidence.compared:
                     terms[n, k] = evidence.terms
         first = np.array([most if a.first is None else a.first for a in answers])
         return _Likelihood(terms, first)
