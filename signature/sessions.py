@@ -34,7 +34,7 @@ from signature.config import Config
 from signature.database import Label, Provenance, SubmapDatabase, open_database
 from signature.database.maintenance import exists, store
 from signature.database.postgres import is_url
-from signature.localization.answer import Answer, followed
+from signature.localization.answer import Answer, corrected_path
 from signature.localization.localizer import Localizer, locate_map
 from signature.localization.map_index import MapIndex
 from signature.localization.place_recognition import recognizer_for
@@ -220,7 +220,7 @@ def find(
         way = Trajectory(stamps_ns=np.array(stamps_ns), T_session_base=np.array(poses), health=health)
         read, sensor = log.report(), log.choose().sensor
         about = about_query(path, answer, read, span, health, sensor)
-        return Found.of(answer, about=about, poses=followed(way, answer), read=read, **asked)
+        return Found.of(answer, about=about, poses=corrected_path(way, answer), read=read, **asked)
 
 
 def tracked(

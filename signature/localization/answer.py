@@ -525,7 +525,7 @@ def _in_space(pose: PoseInSpace, frame: BuildingFrame) -> PoseInSpace:
     return replace(pose, T_map_base=T @ pose.T_map_base, covariance=covariance)
 
 
-def followed(poses: Trajectory, answer: Answer) -> Trajectory:
+def corrected_path(poses: Trajectory, answer: Answer) -> Trajectory:
     """Return the query's poses (odometry frame of its last scan), corrected where it was located on the way.
 
     Between two located moments the correction is interpolated along the travel, in position and heading of

@@ -154,7 +154,7 @@ class Belief:
             if past.part == query.part and query.slipped_m <= past.path_m < first_m
         ]
 
-    def follow(self, query: QueryMap, answer: Answer) -> State:
+    def update(self, query: QueryMap, answer: Answer) -> State:
         """Return the state of a running robot after a search. Keep its masses; forget those that no later
         query continues."""
         now = replace(answer.moment, places=with_mass(answer), T_odom_base=answer.T_odom_base)

@@ -111,7 +111,7 @@ class Localizer:
         self._history.append(answer.history[-1])
         answer = replace(
             answer,
-            state=self._belief.follow(query, answer),
+            state=self._belief.update(query, answer),
             T_odometry_base=None if T_odometry_base is None else SE2.from_matrix(T_odometry_base),
             elapsed_s=time.perf_counter() - begin,
         )

@@ -47,8 +47,8 @@ class JoinParameters:
 
     side_m : of a square piece: about what a robot sees from a place.
     least_walls : wall points of a piece, by weight.
-    follows : a piece that agrees less than this does not show where its neighbours begin; wrong places agree
-        by 0.6, see `pc2grid.matching.evidence`.
+    least_agreement : a piece that agrees less than this does not show where its neighbours begin, and a whole
+        map that does is not joined; wrong places agree by 0.6, see `pc2grid.matching.evidence`.
     proposed : transforms that are compared at most: a building of equal rooms has as many.
     least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
     accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
@@ -59,7 +59,7 @@ class JoinParameters:
 
     side_m: float = 12.0
     least_walls: float = 20.0
-    follows: float = 0.6
+    least_agreement: float = 0.6
     proposed: int = 20
     least_m2: float = 20.0
     accept: float = 0.99
@@ -331,7 +331,7 @@ def _judged(
     equal = int(np.count_nonzero(np.abs(scores - scores[number]) <= EVIDENCE.alike))
     probability = float(masses([evidence] * equal, odds)[0])
     # Of thousands of wall points a small lead is much, even where walls fit as wrong places do.
-    enough = common_m2 >= parameters.least_m2 and min(forward, backward) >= JOIN.follows
+    enough = common_m2 >= parameters.least_m2 and min(forward, backward) >= JOIN.least_agreement
     # That the source lies here, or at a place that fits equally well, is more probable than not.
     doubt: JoinStatus = "ambiguous" if evidence.log_odds() + math.log(odds) > 0.0 else "different"
     return Join(
@@ -473,7 +473,7 @@ def align_pieces(
         points_m = piece.query.walls.facing(target.walls).points_m
         pose, covariance = refine(target.field, points_m, start, piece.center_m)
         fits[number] = fit = score_fit(target.walls, piece.query.walls, pose, covariance)
-        if fit.known_agreement_both_ways >= JOIN.follows:
+        if fit.known_agreement_both_ways >= JOIN.least_agreement:
             trusted.append(number)
     return tuple(fits[number] for number in range(len(pieces)))
 
@@ -537,7 +537,7 @@ def links_of(pieces: Sequence[Piece], fits: Sequence[Fit]) -> tuple[Link, ...]:
     """Return the pieces that agree with the target. Those on ground that it hardly knows do not count."""
     seen = [fit.compared for fit in fits]
     shown = [k for k, walls in enumerate(seen) if walls >= JOIN.least_walls] or [int(np.argmax(seen))]
-    kept = [k for k in shown if fits[k].known_agreement_both_ways >= JOIN.follows] or shown
+    kept = [k for k in shown if fits[k].known_agreement_both_ways >= JOIN.least_agreement] or shown
     return tuple(
         Link(
             center_m=pieces[k].center_m,

@@ -84,9 +84,9 @@ class Found(Answer):
     """The answer of `pc2grid.relocalize`, with the query and the database it is about: it can be drawn.
 
     about : the query as documents describe it, see `signature.sessions.about_query`. database : where was
-    looked. accept : the confidence that `located` needed. poses : the query in its own frame, see `followed`;
-    empty for a map. drawn : the query if it is a map. read : what was read of a recording, and what was lost;
-    None for a map.
+    looked. accept : the confidence that `located` needed. poses : the query in its own frame, see
+    `corrected_path`; empty for a map. drawn : the query if it is a map. read : what was read of a recording,
+    and what was lost; None for a map.
     """
 
     about: dict[str, Any]

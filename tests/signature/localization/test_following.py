@@ -167,7 +167,7 @@ def test_a_place_is_given_up_when_it_is_as_certain_that_the_robot_is_not_there()
     query, found = localizer.query.map(), localizer.answer()
     belief = Belief(accept=0.75)
     states = [
-        belief.follow(query, said(found, mass, located=sure))
+        belief.update(query, said(found, mass, located=sure))
         for mass, sure in ((0.995, True), (0.5, False), (0.3, False), (0.8, True), (0.2, False), (0.5, False))
     ]
     assert states == ["located", "doubtful", "doubtful", "located", "lost", "lost"]
@@ -196,7 +196,7 @@ def test_a_place_is_told_when_a_second_search_agrees() -> None:
         ([(here, 0.995), (there, 0.8), (there, 0.96)], ["located", "lost", "recovered"]),
     ):
         belief = Belief(accept=0.75)
-        states = [belief.follow(query, said(at, mass)) for at, mass in looks]
+        states = [belief.update(query, said(at, mass)) for at, mass in looks]
         assert states == expected
 
 
