@@ -134,7 +134,7 @@ def relocalize(
     if prior is not None and is_drawn_map(Path(query)):
         raise ConfigError("prior: there is no robot in a map")
     observer = observer or ProgressBars()
-    with open_places(database, config, observer.on_warning) as opened:
+    with open_database_or_map(database, config, observer.on_warning) as opened:
         found = find(
             Path(query),
             opened,
@@ -150,7 +150,7 @@ def relocalize(
 
 
 @contextlib.contextmanager
-def open_places(
+def open_database_or_map(
     place: str | Path, config: Config = Config(), warn: Callable[[str], object] = lambda sentence: None
 ) -> Iterator[SubmapDatabase]:
     """Open a database, or a map, which becomes a database for as long as it is used.
@@ -160,8 +160,8 @@ def open_places(
 
     Raises the errors of `signature.open_database`, and MapFileError for a map.
 
-    >>> with open_places("map.yaml") as places:
-    ...     [session.name for session in places.sessions()]
+    >>> with open_database_or_map("map.yaml") as database:
+    ...     [session.name for session in database.sessions()]
     ['map']
     """
     with contextlib.ExitStack() as stack:

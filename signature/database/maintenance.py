@@ -51,13 +51,13 @@ def rename(target: Location, old: str, new: str) -> None:
     engine_of(target).change(target, lambda rows: rows.rename(old, new))
 
 
-def place(target: Location, frames: Mapping[str, BuildingFrame | None]) -> None:
-    """Store the places of sessions in their building, by name, all or none; None: nowhere.
+def store_frames(target: Location, frames: Mapping[str, BuildingFrame | None]) -> None:
+    """Store where sessions lie in their building, by name, all or none; None: nowhere.
 
     All else stays as it is. Raises DatabaseError for a name that no session has, OutputError, DatabaseBusy,
     and as `open_database`.
     """
-    engine_of(target).change(target, lambda rows: rows.place(frames))
+    engine_of(target).change(target, lambda rows: rows.store_frames(frames))
 
 
 def exists(target: Location) -> bool:

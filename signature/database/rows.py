@@ -279,8 +279,8 @@ class Rows(ABC):
             new, text, row_crc(values), row.building, row.id,
         )  # fmt: skip
 
-    def place(self, frames: Mapping[str, BuildingFrame | None]) -> None:
-        """Store the places of sessions in their building, by name; None: nowhere.
+    def store_frames(self, frames: Mapping[str, BuildingFrame | None]) -> None:
+        """Store where sessions lie in their building, by name; None: nowhere.
 
         Raises DatabaseError for a name that no session has.
         """

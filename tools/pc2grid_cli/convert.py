@@ -207,7 +207,7 @@ def _join_added(done: ConvertedInputs, given: options.Convert, terminal: console
         if given.join is None and not opened.frames():
             return
         found = join_sessions(opened, only=names, observer=terminal)
-    maintenance.place(given.output, found.frames)
+    maintenance.store_frames(given.output, found.frames)
     done.joined = [joined_document(name, found.frames[name]) for name in names if name in found.frames]
     for document in done.joined:
         terminal.note(f"{document['session']}: joined, in the frame of {document['frame']}")

@@ -140,7 +140,7 @@ def join(given: options.DbJoin, terminal: console.Console) -> None:
         if given.plot is not None:
             _draw(given.plot, opened, found)
     if not given.dry_run:  # those that lie in no building are no longer in one
-        maintenance.place(given.database, {name: found.frames.get(name) for name in names})
+        maintenance.store_frames(given.database, {name: found.frames.get(name) for name in names})
     alone = [name for name in names if name not in found.frames]
     about = {
         "database": shown(given.database),

@@ -26,7 +26,7 @@ from signature.localization.answer import pose_text
 from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, check_pose
 from signature.localization.prior import Prior
-from signature.sessions import about_query, open_places, query_config, tracked
+from signature.sessions import about_query, open_database_or_map, query_config, tracked
 
 
 def validate(known: KnownPose, *, is_map: bool = False) -> None:
@@ -87,7 +87,7 @@ def searched(given: options.SearchedSessions) -> Iterator[tuple[SubmapDatabase, 
 
     Yields it, and what is damaged in it and left out, of which the user is warned.
     """
-    with open_places(given.database, warn=console.warn) as opened:
+    with open_database_or_map(given.database, warn=console.warn) as opened:
         if given.building is not None or given.floor is not None:
             opened.keep_only(building=given.building, floor=given.floor)
         left_out = [f"{problem.where}: {problem.what}" for problem in opened.leave_out_damaged()]

@@ -3,7 +3,8 @@
 1. Every two sessions are compared (`signature.localization.joining.join`).
 2. Pairs are taken in the order of their probability (Kruskal's algorithm), so each building begins with what
    is surest, and never two sessions in one building whose labels name different buildings or floors. Then one
-   pose graph over the sessions, each pair a robust edge, gives where they lie, and how exactly (`place`).
+   pose graph over the sessions, each pair a robust edge, gives where they lie, and how exactly
+   (`solve_frames`).
 3. One pose graph over all that the sessions have measured gives how they are bent: what one of them knows
    straightens another one (`straighten`). A session is the graph that it was mapped by, the steps of its way
    and its own loops, in a frame of its own (the anchors of Kim et al., "Multiple relative pose graphs for
@@ -127,7 +128,7 @@ def _lying(
 ) -> tuple[dict[str, BuildingFrame], set[Names]]:
     """Return how the sessions of one building lie and are bent, and the names of the pairs that count."""
     within = [pair for pair in joined if pair.target in tree and pair.source in tree]
-    placed, counted = place(tree, anchor, within, stay)
+    placed, counted = solve_frames(tree, anchor, within, stay)
     links = {pair.names: pair.join.links for pair in within if pair.names in counted}
     return straighten(bodies_of(database, placed, stay), placed, links, placed.keys() & stay), counted
 
@@ -177,13 +178,13 @@ def _frame_of(name: str) -> BuildingFrame:
     return BuildingFrame(name=name, T_building_session=SE2(), covariance=_rows(np.zeros((3, 3))))
 
 
-def place(
+def solve_frames(
     tree: nx.Graph,
     anchor: tuple[str, BuildingFrame],
     joined: Sequence[SessionPair],
     stay: Mapping[str, BuildingFrame],
 ) -> tuple[dict[str, BuildingFrame], set[Names]]:
-    """Place the sessions of a building by all its joined pairs; return also the names of those that count."""
+    """Return where the sessions of a building lie by all its joined pairs, and which of these count."""
     first, at = anchor
     poses = _along_tree(tree, anchor, stay)
     number = {name: k for k, name in enumerate(poses)}

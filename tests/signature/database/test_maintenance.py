@@ -78,7 +78,7 @@ def test_what_is_refused_changes_nothing(place: str | Path, tmp_path: Path) -> N
         (lambda: maintenance.rename(place, "friday", "sunday"), "no session 'friday'"),
         (lambda: maintenance.remove(place, ["monday", "friday"]), "no session 'friday'"),
         (lambda: maintenance.split(place, ["monday", "friday"], none), "no session 'friday'"),
-        (lambda: maintenance.place(place, {"monday": THERE, "friday": HERE}), "no session 'friday'"),
+        (lambda: maintenance.store_frames(place, {"monday": THERE, "friday": HERE}), "no session 'friday'"),
     ):
         with pytest.raises(DatabaseError, match=words) as caught:
             act()
@@ -158,7 +158,7 @@ FRAMES = {"monday": HERE, "tuesday": THERE}
 @pytest.fixture
 def joined(place: str | Path) -> str | Path:
     """A database of two sessions that are joined, on each engine."""
-    maintenance.place(place, FRAMES)
+    maintenance.store_frames(place, FRAMES)
     return place
 
 
@@ -178,9 +178,9 @@ def test_what_is_stored_is_read_again_and_all_else_is_as_it_was(joined: str | Pa
 def test_a_session_that_is_taken_apart_again_is_stored_as_before(path: Path) -> None:
     rows = "SELECT * FROM part ORDER BY session_id, name"
     before = sql(path, rows)
-    maintenance.place(path, {"monday": HERE})
+    maintenance.store_frames(path, {"monday": HERE})
     assert frames(path) == {"monday": HERE}
-    maintenance.place(path, {"monday": None})
+    maintenance.store_frames(path, {"monday": None})
     assert sql(path, rows) == before
 
 

@@ -122,7 +122,7 @@ def test_what_is_added_joins_and_the_others_stay(tmp_path: Path) -> None:
     # The building's frame is some other one, whose session has been removed.
     T_building_west = SE2(100.0, -50.0, 2.0)
     west = BuildingFrame(name="gone", T_building_session=T_building_west, covariance=NONE)  # type: ignore[arg-type]
-    maintenance.place(path, {"west": west})
+    maintenance.store_frames(path, {"west": west})
     with open_database(path) as opened:
         frames = join_sessions(opened, only=["east"]).frames
     assert frames.keys() == {"west", "east"} and frames["west"] == west and frames["east"].name == "gone"
