@@ -128,7 +128,7 @@ def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[flo
     """
     above = query.walls.facing(walls).only_explain
     likelihood = points = 0.0
-    levels, steps = [], []
+    levels, steps, weak = [], [], []
     # Before the first scan there was nothing to slip from.
     for count, keyframe in enumerate(reversed(query.keyframes[1:]), start=1):
         hits_m = (fit.T_map_query @ keyframe.T_odom_base).apply(keyframe.planar_scan.hits_m)
@@ -138,9 +138,9 @@ def slip_of(query: QueryMap, fit: Fit, walls: Walls, step_m: float) -> tuple[flo
         mean = likelihood / points if points else 0.0
         levels.append(tempered(mean, points / count))
         steps.append(max((query.path_m - keyframe.path_m) / step_m, 1.0))
+        weak.append(keyframe.weak)
     tail = (np.array(levels) - min([*levels[-1:], 0.0])) * steps
     since = 1 + int(tail.argmin()) if tail.min(initial=0.0) < 0.0 else 0
-    weak = [keyframe.weak for keyframe in reversed(query.keyframes[1:])]
     rates = np.where(weak, POSTERIOR.slip_weak, POSTERIOR.slip)
     return float(rates @ np.exp(-EVIDENCE.fit * tail)), since
 

@@ -198,11 +198,8 @@ def more_exact(a: Fit, b: Fit) -> bool:
 
 def same_pose(a: SE2, b: SE2) -> bool:
     """Return whether two poses are so near that hypotheses there are one."""
-    return _nearer(a, b, HYPOTHESES.same_m, HYPOTHESES.same_rad)
-
-
-def _nearer(a: SE2, b: SE2, apart_m: float, apart_rad: float) -> bool:
-    return math.hypot(a.x - b.x, a.y - b.y) < apart_m and abs(wrap_angle(a.yaw - b.yaw)) < apart_rad
+    near = math.hypot(a.x - b.x, a.y - b.y) < HYPOTHESES.same_m
+    return near and abs(wrap_angle(a.yaw - b.yaw)) < HYPOTHESES.same_rad
 
 
 def moved_to_origin(covariance: F64, T_map_query: SE2, at: SE2) -> F64:

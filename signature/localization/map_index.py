@@ -188,11 +188,11 @@ class MapIndex:
 
     def at_look(self, number: int) -> MapIndex:
         """Return an index whose searches end in time for a robot: beside the likeliest places they take one
-        part of the others, at each look the next one.
+        batch of the others, at each look the next one.
 
-        number : of the look. All that is prepared is shared. If there is only one part, it is this index.
+        number : of the look. All that is prepared is shared. If there is only one batch, it is this index.
         """
-        if len(_parts(len(self.places.table))) <= 2:
+        if len(_batches(len(self.places.table))) <= 2:
             return self
         limited = copy.copy(self)
         limited.look = number
@@ -223,14 +223,14 @@ class MapIndex:
         maps = self.maps_for(query)
         found = self._worth_keeping(query, self._fitted(query, known))
         rows, mass = self.places.order(query.views, query.center_m, self.config)
-        parts = _parts(len(rows))
-        if self.look is not None and len(parts) > 1:
-            parts = [parts[0], parts[1 + self.look % (len(parts) - 1)]]
-        batches = [self.places.areas(rows[part]) for part in parts]
-        batches[0] = chain(batches[0], self._allowed(query))
-        aligned, left = align(query, batches, self.places, maps, self.config), 1.0
-        for part, fits in zip(parts, aligned, strict=True):
-            found, left = self._worth_keeping(query, fits, found), left - float(mass[part].sum())
+        batches = _batches(len(rows))
+        if self.look is not None and len(batches) > 1:
+            batches = [batches[0], batches[1 + self.look % (len(batches) - 1)]]
+        areas = [self.places.areas(rows[batch]) for batch in batches]
+        areas[0] = chain(areas[0], self._allowed(query))
+        aligned, left = align(query, areas, self.places, maps, self.config), 1.0
+        for batch, fits in zip(batches, aligned, strict=True):
+            found, left = self._worth_keeping(query, fits, found), left - float(mass[batch].sum())
             yield found, left
 
     def in_region(self, query: QueryMap, known: tuple[Fit, ...] = ()) -> tuple[Fit, ...]:
@@ -289,7 +289,7 @@ class MapIndex:
         return frame, other
 
 
-def _parts(count: int) -> list[I64]:
-    """Return the numbers of so many places, likeliest first, in the parts that are searched one after the
+def _batches(count: int) -> list[I64]:
+    """Return the numbers of so many places, likeliest first, in the batches that are searched one after the
     other."""
     return np.split(np.arange(count), range(FIRST_PLACES, count, 10 * FIRST_PLACES))
