@@ -1,7 +1,7 @@
 """Recognises places within a session while it is made, for loop closure.
 
-The session is its own database: each stretch of some metres of travel becomes a small map with a few
-described places, and every new stretch is looked up among those before it with the parts of a `MapIndex`.
+The session is its own database: some metres of travel make a place map with a few described places, and
+every new place map is looked up among those before it with the parts of a `MapIndex`.
 Signatures propose, the alignment of walls in both directions verifies, and the posterior of every answer
 (`signature.localization.decision`) says how sure it is that two maps show one place. Which of several such
 places is the right one is decided by loop closure (`pc2grid.mapping.loops`), which knows the travel between
@@ -33,9 +33,9 @@ from signature.retrieval.places import LazySequence, Places
 class RecognitionParameters:
     """Numbers of place recognition within a session, chosen by the time of `convert` on killian (1.9 km).
 
-    views : places of a stretch that are described. They are both what is asked and what is asked for.
+    views : places of a place map that are described. They are both what is asked and what is asked for.
     shortlist : so many earlier places are compared with it, those that are likeliest by their signatures.
-    maps : prepared maps of earlier stretches that stay in memory, about 4 MB each.
+    maps : prepared maps of earlier place maps that stay in memory, about 4 MB each.
     """
 
     views: int = 12
@@ -47,7 +47,7 @@ RECOGNITION = RecognitionParameters()
 
 
 class SessionRecognizer:
-    """The stretches of one session as a database of places that grows: a `PlaceRecognizer`.
+    """The place maps of one session as a database of places that grows: a `PlaceRecognizer`.
 
     >>> import pc2grid, signature
     >>> config = signature.Config()
@@ -58,18 +58,18 @@ class SessionRecognizer:
     """
 
     def __init__(self, config: Config, parameters: RecognitionParameters = RECOGNITION) -> None:
-        """Begin without any stretch. config : stretches are described as the places of a database with this
+        """Begin without any place map. config : they are described as the places of a database with this
         configuration."""
         self._made_with = config
         self._config = config.relocalize.model_copy(update={"views": parameters.views})
         self._parameters = parameters
-        # Grids are kept compressed: some 10 kB a stretch, so that a long session needs little memory.
+        # Grids are kept compressed: some 10 kB each, so that a long session needs little memory.
         self._stored: list[bytes] = []
         self._map = lru_cache(parameters.maps)(lambda index: SearchMap.of(self._grid(index)))
         self._places: Places | None = None
 
     def recognize(self, newest: PlaceMap) -> Sequence[Recognition]:
-        """Return the earlier stretches that look like the newest one, each place with its own evidence."""
+        """Return the earlier place maps that look like the newest one, each place with its own evidence."""
         query = query_of(newest.grid, newest.poses[:, :2], self._made_with, self._config)
         found = [] if self._places is None else self._look_up(query, self._places)
         self._remember(newest.grid, query)
@@ -91,7 +91,7 @@ class SessionRecognizer:
         ]
 
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:
-        """Add the newest stretch to the places that later ones are looked up in."""
+        """Add the newest place map to the places that later ones are looked up in."""
         index = len(self._stored)
         self._stored.append(zlib.compress(pickle.dumps(grid), 1))
         table = SignatureTable.bare(

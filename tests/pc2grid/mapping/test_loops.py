@@ -181,19 +181,19 @@ SURE = Evidence(known_agreement=1.0, compared=100.0, backward=1.0, looked_at=100
 
 
 class KnowsTheTruth:
-    """A recognizer that knows the true poses of the keyframes, and so of the stretches.
+    """A recognizer that knows the true poses of the keyframes, and so of the place maps.
 
     off : each place is told so often, so far off, and with this evidence.
     """
 
     def __init__(self, truth: list[SE2], *off: tuple[SE2, Evidence]) -> None:
         self._truth, self._off = truth, off or ((HERE, SURE),)
-        self.stretches: list[PlaceMap] = []
-        self.frames: list[SE2] = []  # true pose of each stretch
+        self.place_maps: list[PlaceMap] = []
+        self.frames: list[SE2] = []  # true pose of each
 
     def recognize(self, newest: PlaceMap) -> list[Recognition]:
         anchor = int(np.flatnonzero(np.abs(newest.poses).sum(axis=1) < 1e-9)[0])
-        self.stretches.append(newest)
+        self.place_maps.append(newest)
         self.frames.append(self._truth[newest.scans[anchor]])
         found = []
         for older, frame in enumerate(self.frames[:-1]):
@@ -222,14 +222,14 @@ def test_a_recognizer_closes_loops_where_no_local_maps_are_near() -> None:
     assert farthest(settled, truth) < 0.2 and sum(loop.accepted for loop in found.loops) > 3
 
 
-def test_no_stretch_reaches_across_a_lost_part() -> None:
+def test_no_place_map_reaches_across_a_lost_part() -> None:
     truth = square(100)
     recognizer = KnowsTheTruth(truth)
     poses = truth[:35] + [SE2(5.0, 5.0, 1.0) @ pose for pose in truth[35:]]
     closed(poses, [scan_of(pose, BLOCK) for pose in truth], restart=35, recognizer=recognizer)
-    assert recognizer.stretches
-    for stretch in recognizer.stretches:
-        assert np.linalg.norm(np.diff(stretch.poses[:, :2], axis=0), axis=1).max() < 1.0
+    assert recognizer.place_maps
+    for place_map in recognizer.place_maps:
+        assert np.linalg.norm(np.diff(place_map.poses[:, :2], axis=0), axis=1).max() < 1.0
 
 
 # --- Which recognised places become loops ---
@@ -265,7 +265,7 @@ def test_a_building_turned_by_half_is_never_accepted(monkeypatch: pytest.MonkeyP
     assert counts(monkeypatch, (SE2(0.0, 0.0, math.pi), replace(SURE, lead=0.2))) == 0.0
 
 
-def test_of_two_places_for_one_stretch_the_tracked_one_is_likelier(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_two_places_for_one_place_map_the_tracked_one_is_likelier(monkeypatch: pytest.MonkeyPatch) -> None:
     alike = (HERE, SURE), (SE2(0.0, 2.0, 0.0), SURE)
     right, wrong = counts(monkeypatch, *alike), counts(monkeypatch, alike[1])
     assert counts(monkeypatch, alike[0]) - 0.02 > right > 0.75 and wrong < 0.9
