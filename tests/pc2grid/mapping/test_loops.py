@@ -235,7 +235,7 @@ def test_no_place_map_reaches_across_a_lost_part() -> None:
 # --- Which recognised places become loops ---
 
 
-def counts(monkeypatch: pytest.MonkeyPatch, *off: tuple[SE2, Evidence]) -> float:
+def counts(monkeypatch: pytest.MonkeyPatch, *off: tuple[SE2, Evidence], side: float = 10.0) -> float:
     """How much the first loop counts, of two laps of which the second is recognised; 0 without a loop.
 
     off : so far from the tracked poses, which are true. All local maps match where they are told to be.
@@ -246,7 +246,7 @@ def counts(monkeypatch: pytest.MonkeyPatch, *off: tuple[SE2, Evidence]) -> float
         return Overlap(guess, INFORMATION, 1.0) if window_m == p.recognized_m else None
 
     monkeypatch.setattr(LocalMap, "overlap", overlap)
-    truth = square(100) * 2
+    truth = square(100, side) * 2
     scans = [scan_of(pose, BLOCK) for pose in truth]
     _, found = closed(truth, scans, parameters=p, recognizer=KnowsTheTruth(truth, *off))
     full = p.information_share * INFORMATION[0, 0]
@@ -269,3 +269,21 @@ def test_of_two_places_for_one_place_map_the_tracked_one_is_likelier(monkeypatch
     alike = (HERE, SURE), (SE2(0.0, 2.0, 0.0), SURE)
     right, wrong = counts(monkeypatch, *alike), counts(monkeypatch, alike[1])
     assert counts(monkeypatch, alike[0]) - 0.02 > right > 0.75 and wrong < 0.9
+
+
+def test_a_place_a_short_way_back_is_no_loop(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lap of 12 m is shorter than two place maps, one of 20 m with its turns longer."""
+    assert counts(monkeypatch, (HERE, SURE), side=3.0) == 0.0
+    assert counts(monkeypatch, (HERE, SURE), side=5.0) > 0.2
+
+
+def test_a_recognised_place_ties_what_was_lost_to_the_rest() -> None:
+    """After the first lap tracking is lost, and starts again 2 m and 40 degrees beside the truth."""
+    truth = square(100) * 2
+    beside = truth[100] @ SE2(1.6, -1.2, math.radians(40.0)) @ truth[100].inverse()
+    poses = truth[:100] + [beside @ pose for pose in truth[100:]]
+    scans = [scan_of(pose, BLOCK) for pose in truth]
+    apart = LoopParameters(compared=0)
+    alone, _ = closed(poses, scans, restart=100, parameters=apart)
+    settled, _ = closed(poses, scans, restart=100, parameters=apart, recognizer=KnowsTheTruth(truth))
+    assert farthest(alone, truth) > 1.0 and farthest(settled, truth) < 0.2
