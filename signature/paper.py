@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from typing_extensions import Self
 
 from pc2grid.geometry import F32, F64, frozen_arrays
 from pc2grid.model import Submap
@@ -78,33 +79,46 @@ _LARGEST_EXPONENT = 300.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SignatureTable:
-    """Signatures of N submaps, one row each.
+@frozen_arrays(session_index=(np.int32, "N"), submap_id=(np.int32, "N"), center_m=(np.float64, "N", 2))
+class PlaceTable:
+    """The places of a database, N submaps, one row each.
 
-    boundary (N, Nb), freespace (N, Nf), symmetry (N, 2) : float32, as in `Signature`.
     session_index (N,), submap_id (N,) : int32, the submap that a row describes.
     center_m (N, 2) : float64, centre of the submap in its session's map frame.
+    """
+
+    session_index: I32
+    submap_id: I32
+    center_m: F64
+
+    def __len__(self) -> int:
+        return len(self.session_index)
+
+    @classmethod
+    def concatenated(cls, tables: Sequence[Self]) -> Self:
+        """Return the rows of several tables, one table after the other."""
+        names = [field.name for field in fields(cls)]
+        return cls(**{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+@frozen_arrays(
+    session_index=(np.int32, "N"),
+    submap_id=(np.int32, "N"),
+    center_m=(np.float64, "N", 2),
+    boundary=(np.float32, "N", "bins"),
+    freespace=(np.float32, "N", "lengths"),
+    symmetry=(np.float32, "N", 2),
+)
+class SignatureTable(PlaceTable):
+    """The places of a database with their signatures.
+
+    boundary (N, Nb), freespace (N, Nf), symmetry (N, 2) : float32, as in `Signature`.
     """
 
     boundary: F32
     freespace: F32
     symmetry: F32
-    session_index: I32
-    submap_id: I32
-    center_m: F64
-
-    def __post_init__(self) -> None:
-        n = len(self.boundary)
-        for name in ("boundary", "freespace", "symmetry", "center_m"):
-            value = getattr(self, name)
-            if value.ndim != 2 or len(value) != n:
-                raise ValueError(f"SignatureTable.{name}: expected {n} rows, got shape {value.shape}")
-        for name in ("session_index", "submap_id"):
-            if getattr(self, name).shape != (n,):
-                raise ValueError(f"SignatureTable.{name}: expected {n} entries")
-
-    def __len__(self) -> int:
-        return len(self.boundary)
 
     def __repr__(self) -> str:
         return f"SignatureTable({len(self)} submaps of {len(np.unique(self.session_index))} sessions)"
@@ -129,37 +143,15 @@ class SignatureTable:
             boundary=stack("boundary"),
             freespace=stack("freespace"),
             symmetry=stack("symmetry"),
-            session_index=np.zeros(n, np.int32)
-            if session_index is None
-            else np.asarray(session_index, np.int32),
-            submap_id=np.arange(n, dtype=np.int32) if submap_id is None else np.asarray(submap_id, np.int32),
-            center_m=np.asarray(center_m, np.float64).reshape(n, 2),
+            session_index=np.asarray(np.zeros(n) if session_index is None else session_index, np.int32),
+            submap_id=np.asarray(np.arange(n) if submap_id is None else submap_id, np.int32),
+            center_m=np.asarray(center_m).reshape(n, 2),
         )
 
-    @staticmethod
-    def bare(center_m: F64, session_index: I32) -> SignatureTable:
-        """Return places that are told apart by what is seen from them alone: centres (N, 2) of sessions
-        (N,)."""
-        none = np.empty((len(center_m), 0), np.float32)
-        return SignatureTable(
-            boundary=none,
-            freespace=none,
-            symmetry=none,
-            session_index=session_index,
-            submap_id=np.arange(len(center_m), dtype=np.int32),
-            center_m=center_m,
-        )
-
-    def without_histograms(self) -> SignatureTable:
-        """Return the rows with their ids and positions, and no bins: 36 bytes instead of some 400 each."""
-        none = np.empty((len(self), 0), np.float32)
-        return replace(self, boundary=none, freespace=none)
-
-    @staticmethod
-    def concatenated(tables: Sequence[SignatureTable]) -> SignatureTable:
-        """Return the rows of several tables, one table after the other."""
-        names = [field.name for field in fields(SignatureTable)]
-        return SignatureTable(**{name: np.concatenate([getattr(t, name) for t in tables]) for name in names})
+    @property
+    def places(self) -> PlaceTable:
+        """Return the rows without signatures: 24 bytes instead of some 400 each."""
+        return PlaceTable(session_index=self.session_index, submap_id=self.submap_id, center_m=self.center_m)
 
 
 def distances(query: Signature, table: SignatureTable, config: SignatureConfig = SignatureConfig()) -> F64:

@@ -27,7 +27,7 @@ from signature.localization.hypotheses import align, best_around, distinct, fitt
 from signature.localization.in_space import SurfaceOf, surface_reader
 from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
-from signature.paper import SignatureTable
+from signature.paper import PlaceTable
 from signature.retrieval.places import (
     AT_ONCE_M2,
     FIRST_PLACES,
@@ -61,7 +61,7 @@ class MapIndex:
     def __init__(
         self,
         grids: Mapping[str, OccupancyGrid],
-        table: SignatureTable,
+        table: PlaceTable,
         made_with: Config,
         config: Config,
         labels: Mapping[str, Label] | None = None,
@@ -142,14 +142,12 @@ class MapIndex:
             lacking.append(name)
             return None
 
-        table, made_with = database.signatures(), database.config()
-        if is_large:
-            table = table.without_histograms()
+        places, made_with = database.signatures().places, database.config()
         frames: Mapping[str, BuildingFrame] = {}
         with contextlib.suppress(DatabaseCorrupt):  # without them a search takes longer, and finds the same
             frames = database.frames()
         drawn = {name for name, info in infos.items() if info.sensor == "map"}
-        index = MapIndex(grids, table, made_with, config, labels, areas_m2, stored, frames, drawn)
+        index = MapIndex(grids, places, made_with, config, labels, areas_m2, stored, frames, drawn)
         index.surface_of = surface_reader(database)
         with observer.step("prepare places"):
             index.places.index(observer.on_progress)
@@ -163,7 +161,7 @@ class MapIndex:
     @staticmethod
     def of_session(database: SubmapDatabase, session: str) -> MapIndex:
         """Return the index of one session of a database by itself, without points."""
-        table, config = database.signatures(session), database.config()
+        table, config = database.signatures(session).places, database.config()
         table = replace(table, session_index=np.zeros(len(table), np.int32))
         return MapIndex({session: database.grid(session)}, table, config, config, stored=database.seen_places)
 

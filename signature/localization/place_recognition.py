@@ -2,10 +2,9 @@
 
 The session is its own database: some metres of travel make a place map with a few described places, and
 every new place map is looked up among those before it with the parts of a `MapIndex`.
-Signatures propose, the alignment of walls in both directions verifies, and the posterior of every answer
-(`signature.localization.decision`) says how sure it is that two maps show one place. Which of several such
-places is the right one is decided by loop closure (`pc2grid.mapping.loops`), which knows the travel between
-them.
+Signatures propose, the alignment of walls in both directions verifies, and the evidence
+(`pc2grid.matching.evidence`) is that of an answer. How likely each place is says loop closure
+(`pc2grid.mapping.loops`), which knows the travel between them.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from pc2grid.model import OccupancyGrid
 from signature.config import Config
 from signature.localization.hypotheses import align, best_around, distinct
 from signature.localization.query import QueryMap, query_of
-from signature.paper import SignatureTable
+from signature.paper import PlaceTable
 from signature.retrieval.places import LazySequence, Places
 
 
@@ -94,15 +93,17 @@ class SessionRecognizer:
         """Add the newest place map to the places that later ones are looked up in."""
         index = len(self._stored)
         self._stored.append(zlib.compress(pickle.dumps(grid), 1))
-        table = SignatureTable.bare(
-            np.array([view.center_m for view in query.views]).reshape(-1, 2),
-            np.full(len(query.views), index, np.int32),
+        count = len(query.views)
+        table = PlaceTable(
+            session_index=np.full(count, index, np.int32),
+            submap_id=np.arange(count, dtype=np.int32),
+            center_m=np.array([view.center_m for view in query.views]).reshape(-1, 2),
         )
         if not len(table):
             return
         known = self._places
         if known is not None:
-            table = SignatureTable.concatenated((known.table, table))
+            table = PlaceTable.concatenated((known.table, table))
         count = len(self._stored)
         grids = LazySequence(self._grid, count, most=0)
         self._places = Places(table, grids, self._made_with.partition.radius_m, [0.0] * count, known)

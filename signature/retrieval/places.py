@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pc2grid.geometry import F64, I64, cells_of
 from pc2grid.model import OccupancyGrid
 from signature.config import RelocalizeConfig, ShortlistBy
-from signature.paper import SignatureTable
+from signature.paper import PlaceTable
 from signature.retrieval.index import PlaceBlock, PlaceIndex, Poses
 from signature.visible import SeenPlaces, View
 from signature.weights import seen_spread, seen_weights
@@ -79,12 +79,12 @@ class Order(NamedTuple):
 class Places:
     """All places of a database, ready for retrieval.
 
-    table : their signatures. sight_m : length of the rays by which they are described.
+    table : where they are. sight_m : length of the rays by which they are described.
     """
 
     def __init__(
         self,
-        table: SignatureTable,
+        table: PlaceTable,
         grids: Sequence[OccupancyGrid],
         sight_m: float,
         areas_m2: Sequence[float],

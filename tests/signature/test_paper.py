@@ -127,7 +127,7 @@ def test_empty_tables_and_wrong_shapes() -> None:
     with pytest.raises(ValueError, match="bins"):
         histogram_distance(np.ones((1, 80), np.float32) / 80, np.ones((1, 60), np.float32) / 60, CONFIG)
     rows = {"boundary": np.zeros((2, 80)), "freespace": np.zeros((1, 80)), "symmetry": np.zeros((2, 2))}
-    with pytest.raises(ValueError, match="rows"):
+    with pytest.raises(ValueError, match=r"SignatureTable.freespace: expected shape \(2, "):
         SignatureTable(
             **rows, session_index=np.zeros(2, int), submap_id=np.zeros(2, int), center_m=np.zeros((2, 2))
         )
