@@ -163,7 +163,7 @@ class RelocalizeConfig(Section):
         8.0, gt=0, description="length of the latest part of its path that a query is made of"
     )
     step_m: float = Field(1.0, gt=0, description="metres of travel between two searches of the database")
-    views: int = Field(8, gt=0, description="number of views that describe a query, along its path")
+    views: int = Field(8, gt=0, description="number of views that describe a query, half of them on its path")
     view_spacing_m: float = Field(1.2, gt=0, description="least distance of two views")
     shortlist_by: ShortlistBy = Field(
         "signatures",

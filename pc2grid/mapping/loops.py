@@ -140,7 +140,8 @@ class LoopCloser:
     """Closes loops while a session is recorded.
 
     keyframes : gets those of the session; local maps are drawn from them when needed.
-    recognizer : gets every place map; None: loops are searched near the tracked pose only.
+    recognizer : gets the place maps whose overlaps are not all known; None: loops are searched near the
+        tracked pose only.
     projection : how the grids for the recognizer are drawn.
     """
 

@@ -1,7 +1,7 @@
 """What a robot has seen over its last metres, made ready to be looked up.
 
-A robot rarely stands where it has seen most. So the query is described not where the robot is but at
-those places of its own path whose surroundings it has observed best; each is a view.
+A robot rarely stands where it has seen most. So the query is described not where the robot is but where it
+has observed the surroundings best, half on its path and half on other free ground; each is a view.
 """
 
 from __future__ import annotations

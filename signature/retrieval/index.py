@@ -228,9 +228,9 @@ def best_headings(
     """Add up the `scores` (K, V) of all views at the best heading, into `out` (P,), and write the number of
     that heading into `at_best` (P,).
 
-    squares : (K, 2) viewpoints in units of the lattice. block, low, shape, first, at : as in
-    `place_index.Raster`. viewpoint, view : (P,) which view is put on which viewpoint. steps :
-    `place_index.steps_between` in units of the lattice.
+    squares : (K, 2) viewpoints in units of the lattice. block, low, shape, first, at : as in `Raster`.
+    viewpoint, view : (P,) which view is put on which viewpoint. steps : from there to the other views, at
+    each heading, in units of the lattice.
     """
     headings, views = steps.shape[0], steps.shape[1]
     for pose in range(len(viewpoint)):

@@ -81,7 +81,7 @@ JoinStatus = Literal["joined", "ambiguous", "different"]
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SessionPair:
     """Two sessions that were compared. accepted : whether their join counts: the pair is joined, and neither
-    labels nor the other pairs contradict it."""
+    labels contradict it nor other pairs, unless it alone ties the two together."""
 
     target: str
     source: str

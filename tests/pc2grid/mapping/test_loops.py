@@ -272,7 +272,7 @@ def test_of_two_places_for_one_place_map_the_tracked_one_is_likelier(monkeypatch
 
 
 def test_a_place_a_short_way_back_is_no_loop(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A lap of 12 m is shorter than two place maps, one of 20 m with its turns longer."""
+    """Two place maps are 24 m: of two laps of 12 m no places lie so far apart, of two of 20 m some do."""
     assert counts(monkeypatch, (HERE, SURE), side=3.0) == 0.0
     assert counts(monkeypatch, (HERE, SURE), side=5.0) > 0.2
 
