@@ -229,6 +229,11 @@ class Answer:
         return None if self.best is None else self.best.T_map_query @ self.T_odom_base
 
     @property
+    def best_session(self) -> str | None:
+        """Return the session that the best fit is in, certain or not; None: nothing fits."""
+        return None if self.best is None else self.sessions[self.best.session_index]
+
+    @property
     def located(self) -> Fit | None:
         """Return the fit that is the answer; None unless one place is certain."""
         return self.best if self.status == "located" else None
@@ -236,7 +241,7 @@ class Answer:
     @property
     def session(self) -> str | None:
         """Return the session whose map frame the pose is in; None unless located."""
-        return None if self.located is None else self.sessions[self.located.session_index]
+        return self.best_session if self.located else None
 
     @property
     def T_map_odom(self) -> SE2 | None:
@@ -402,7 +407,7 @@ def _moment_json(answer: Answer) -> dict[str, Any]:
         "stamp_ns": answer.stamp_ns,
         "path_m": answer.path_m,
         "status": answer.status,
-        "session": answer.best and answer.sessions[answer.best.session_index],
+        "session": answer.best_session,
         **(_planar(answer.pose) if answer.pose else dict.fromkeys(("x", "y", "yaw"))),
         "confidence": answer.confidence,
     }

@@ -360,10 +360,10 @@ def _warn_of_prior(answer: Answer) -> None:
     if answer.prior == "ahead":
         console.warn("the time of --near-pose lies after the last scan, so that pose was not used")
     excluded = answer.excluded
-    if excluded is None or excluded.best is None or excluded.pose is None:
+    if excluded is None or excluded.pose is None:
         return
-    session, pose = excluded.sessions[excluded.best.session_index], excluded.pose
-    where = f"{one_line(session)}: x {pose.x:.2f} m, y {pose.y:.2f} m"
+    pose = excluded.pose
+    where = f"{one_line(excluded.best_session or '')}: x {pose.x:.2f} m, y {pose.y:.2f} m"
     how = "is certain" if excluded.status == "located" else "fits better"
     console.warn(
         f"a place that --near excludes {how}: {where}, confidence {probability(excluded.confidence)}"

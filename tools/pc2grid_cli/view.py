@@ -318,13 +318,13 @@ class Progress:
     def tell(self, answer: Answer) -> None:
         """Publish an answer; if it is not located, with the best place all the same."""
         self.flush()
-        best, pose = answer.best, answer.pose
+        pose = answer.pose
         self.events.publish(
             "moment",
             {
                 "path_m": answer.path_m,
                 "status": answer.status,
-                "session": best and answer.sessions[best.session_index],
+                "session": answer.best_session,
                 "confidence": answer.confidence,
                 "pose": pose and [pose.x, pose.y, pose.yaw],
                 "base": _planar(answer.T_odom_base),
