@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
 from scipy.special import chdtri
 
 from pc2grid.geometry import F32, F64, SE2, hand_over, lever_arm, wrap_angle
+from pc2grid.matching.evidence import EVIDENCE
 from pc2grid.matching.score import Fit, refine, score_fit
 from pc2grid.matching.search import (
     SearchMap,
@@ -127,6 +129,21 @@ def best_around(query: QueryMap, h: Fit, target: SearchMap) -> Fit:
         for x, y, yaw, _ in poses.tolist()
     )
     return max((h, *found), key=lambda one: one.score)
+
+
+def worth_keeping(
+    query: QueryMap, new: Iterable[Fit], maps: Sequence[SearchMap], most: int, kept: Sequence[Fit] = ()
+) -> tuple[Fit, ...]:
+    """Return the new and the earlier hypotheses that score enough beside the best one to be reported
+    (`EvidenceParameters.longest_lead`), best first, each the best around itself; at most so many."""
+    share, found = 1.0 - EVIDENCE.longest_lead, list(kept)
+    best = max((h.score for h in found), default=0.0)
+    for h in sorted(new, key=lambda h: -h.score):
+        if h.score >= share * best:
+            found.append(best_around(query, h, maps[h.session_index]))
+            best = max(best, found[-1].score)
+    enough = (h for h in distinct(query, found) if h.score >= share * best)
+    return tuple(islice(enough, most))
 
 
 def fitted(query: QueryMap, session_index: int, submap_id: int, target: SearchMap, T_map_query: SE2) -> Fit:

@@ -7,7 +7,7 @@ import copy
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, islice
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,7 +15,6 @@ import numpy as np
 from pc2grid.errors import DatabaseCorrupt
 from pc2grid.geometry import I64
 from pc2grid.libraries import one_blas_thread
-from pc2grid.matching.evidence import EVIDENCE
 from pc2grid.matching.icp_in_space import MapSurface
 from pc2grid.matching.score import Fit
 from pc2grid.matching.search import SearchMap
@@ -23,7 +22,7 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.hypotheses import align, best_around, distinct, fitted
+from signature.localization.hypotheses import align, fitted, worth_keeping
 from signature.localization.in_space import SurfaceOf, surface_reader
 from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
@@ -263,20 +262,11 @@ class MapIndex:
     def _worth_keeping(
         self, query: QueryMap, new: Sequence[Fit], kept: Sequence[Fit] = ()
     ) -> tuple[Fit, ...]:
-        """Return the new and the earlier hypotheses that score enough beside the best one to be reported
-        (`EvidenceParameters.longest_lead`), best first, each the best around itself; those that a prior
-        excludes are kept beside them."""
-        maps, share = self.maps_for(query), 1.0 - EVIDENCE.longest_lead
-        worth: list[Fit] = []
+        """Return `worth_keeping` of the hypotheses, and beside them that of those that a prior excludes."""
+        maps, worth = self.maps_for(query), list[Fit]()
         for inside in (True, False):
-            found = [h for h in kept if self.allows(query, h) is inside]
-            best = max((h.score for h in found), default=0.0)
-            for h in sorted((h for h in new if self.allows(query, h) is inside), key=lambda h: -h.score):
-                if h.score >= share * best:
-                    found.append(best_around(query, h, maps[h.session_index]))
-                    best = max(best, found[-1].score)
-            enough = (h for h in distinct(query, found) if h.score >= share * best)
-            worth += islice(enough, self.config.hypotheses)
+            of_new, of_kept = ([h for h in of if self.allows(query, h) is inside] for of in (new, kept))
+            worth += worth_keeping(query, of_new, maps, self.config.hypotheses, of_kept)
         return tuple(sorted(worth, key=lambda h: -h.score))
 
     def joined(self, a: int, b: int) -> tuple[BuildingFrame, BuildingFrame] | None:

@@ -22,7 +22,7 @@ from pc2grid.matching.evidence import LEFT, evidence_of, masses
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
-from signature.localization.hypotheses import align, best_around, distinct
+from signature.localization.hypotheses import align, worth_keeping
 from signature.localization.query import QueryMap, query_of
 from signature.paper import PlaceTable
 from signature.retrieval.places import LazySequence, Places
@@ -77,12 +77,13 @@ class SessionRecognizer:
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
         rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
         maps = LazySequence(self._map, len(self._stored), most=0)
-        found = distinct(query, next(align(query, [places.areas(rows)], places, maps, self._config)))
+        aligned = next(align(query, [places.areas(rows)], places, maps, self._config))
+        found = worth_keeping(query, aligned, maps, self._config.hypotheses)
         return [
             Recognition(
                 older=h.session_index,
                 newer=len(self._stored),
-                T_older_newer=best_around(query, h, maps[h.session_index]).T_map_query,
+                T_older_newer=h.T_map_query,
                 evidence=evidence,
             )
             for h, evidence in zip(found, evidence_of(found, query.likeness), strict=True)
