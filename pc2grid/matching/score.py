@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64, SE2, U8, BoolGrid, wrap_angle
 from pc2grid.libraries import compiled
-from pc2grid.matching.walls import LIKELIHOOD, LikelihoodField, Walls
+from pc2grid.matching.walls import LIKELIHOOD, WALLS, LikelihoodField, Walls
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -288,14 +288,14 @@ class SelfSimilarityParameters:
 
     nearest_m, farthest_m : lengths of a shift, in any direction: farther than two hypotheses that are one,
         and about as far as a robot sees.
-    cell_m : shifts are multiples of about this, the spacing of wall points.
+    cell_m : shifts are multiples of about the spacing of wall points.
     overlap : least share of the walls, by weight, on known ground, shifted forward and back. The known ground
         of a single scan hardly overlaps with itself, so it is compared with nothing.
     """
 
     nearest_m: float = 1.0
     farthest_m: float = 8.0
-    cell_m: float = 0.1
+    cell_m: float = WALLS.spacing_m
     overlap: float = 0.5
 
 

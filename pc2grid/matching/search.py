@@ -54,16 +54,16 @@ class SearchParameters:
     step_rad : headings at most this far apart are tried. It moves a wall 8 m away by 0.24 m, a little more
         than the likelihood field is wide; chosen by hand.
     floor, keep : poses scoring below `floor`, or below `keep` times the best, are not reported.
-    most : poses reported at most.
+    most : poses reported at most. By default the best one alone, whatever it scores.
     apart_m, apart_rad : two reported poses differ by more than one of these; a pose nearer to a better one
         lies on the shoulder of its peak. The pair with the least log loss on real recordings, of 0.5 m and 10
         degrees to 1.5 m and 30.
     """
 
     step_rad: float = math.radians(1.7)
-    floor: float = 0.45
-    keep: float = 0.8
-    most: int = 10
+    floor: float = 0.0
+    keep: float = 1.0
+    most: int = 1
     apart_m: float = 0.75
     apart_rad: float = math.radians(15.0)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -14,6 +14,7 @@ from pc2grid.geometry import F32, F64, SE2, hand_over, lever_arm, wrap_angle
 from pc2grid.matching.evidence import EVIDENCE
 from pc2grid.matching.score import Fit, refine, score_fit
 from pc2grid.matching.search import (
+    MOST_POINTS,
     SearchMap,
     SearchParameters,
     search_windows,
@@ -28,7 +29,7 @@ from signature.retrieval.places import SQUARE_M, Area, Places
 class HypothesisParameters:
     """How places are verified. All chosen by hand, checked on fr079 and intel.
 
-    few_points : near wall points in the coarse search, and as many far ones; enough to rank poses.
+    few_points : near wall points in the coarse search, and as many far ones: together all that it can add up.
     few_spacing_m : they are at least about so far apart.
     near_m : near are walls up to so far from the centre of rotation. A small error of yaw moves those beyond
         by more than a wall's width, so that they must not outweigh the near ones.
@@ -36,7 +37,7 @@ class HypothesisParameters:
         lidar were found with the walls between 8 and 20 m and not without them.
     refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
     around_m, around_rad : each place that may be the answer is searched so far around itself: by a square of
-        the coarse search, which may have found the shoulder of a peak, to each side. Two hypotheses that are
+        the coarse search to each side, which may have found the shoulder of a peak. Two hypotheses that are
         nearer are one peak. By their covariances they are not: of 21 windows of a laser in a lidar's map, two
         were ambiguous with their own shoulder, .12 and .16 m off, which is six standard deviations.
     same_m, same_rad : two hypotheses nearer than this are one.
@@ -47,12 +48,12 @@ class HypothesisParameters:
         lidars, 2.4 and 5.9 times, with them 0.6 and 0.9.
     """
 
-    few_points: int = 128
+    few_points: int = MOST_POINTS // 2
     few_spacing_m: float = 0.25
     near_m: float = 8.0
     far_m: float = 20.0
     refined: int = 2
-    around_m: float = 0.8
+    around_m: float = SQUARE_M
     around_rad: float = math.radians(5.0)
     same_m: float = 0.5
     same_rad: float = math.radians(10.0)
@@ -69,18 +70,50 @@ ONE_PLACE = float(chdtri(3, 1.0 - 0.999))
 """Squared Mahalanobis distance of x, y, yaw within which 99.9 % of all poses of one place lie."""
 
 
-def align(
+def look_up(
+    query: QueryMap,
+    batches: Iterable[Iterable[Area]],
+    places: Places,
+    maps: Sequence[SearchMap],
+    config: RelocalizeConfig,
+    known: Iterable[Fit] = (),
+    allows: Callable[[Fit], bool] = lambda h: True,
+) -> Iterator[tuple[Fit, ...]]:
+    """Look the walls of a local map up: the same call for an answer, a loop and a join.
+
+    Yields, after each batch of areas, the hypotheses so far that are worth keeping, best first: the `known`
+    ones, refined, and what fits there with any heading.
+
+    batches : likeliest first; what is clearly less than the best so far is not looked for in the next.
+    maps : prepared map of each session, by session_index.
+    allows : those that it excludes are kept beside the others, and do not compete with them.
+    """
+
+    def kept(new: Iterable[Fit], before: Sequence[Fit] = ()) -> tuple[Fit, ...]:
+        found: list[Fit] = []
+        for inside in (True, False):
+            of_new, of_before = ([h for h in some if allows(h) is inside] for some in (new, before))
+            found += _worth_keeping(query, of_new, maps, config.hypotheses, of_before)
+        return tuple(sorted(found, key=lambda h: -h.score))
+
+    refined = [
+        fitted(query, h.session_index, h.submap_id, maps[h.session_index], h.T_map_query) for h in known
+    ]
+    found = kept(refined)
+    for fits in _align(query, batches, places, maps, config):
+        found = kept(fits, found)
+        yield found
+
+
+def _align(
     query: QueryMap,
     batches: Iterable[Iterable[Area]],
     places: Places,
     maps: Sequence[SearchMap],
     config: RelocalizeConfig,
 ) -> Iterator[tuple[Fit, ...]]:
-    """Align the query with any heading wherever the robot may stand; yields what fits in each batch of areas.
-
-    batches : likeliest first; what is clearly less than the best so far is not looked for in the next.
-    maps : prepared map of each session, by session_index.
-    """
+    """Align the query with any heading wherever the robot may stand; yields what fits in each batch of
+    areas."""
     most = HYPOTHESES.refined * config.hypotheses
     submap_ids = np.append(places.table.submap_id, -1)  # row -1: there is no place
     scores, enough = [0.0], 0.0  # the best so far, and what is worth refining
@@ -122,7 +155,6 @@ def best_around(query: QueryMap, h: Fit, target: SearchMap) -> Fit:
         np.array([[at.x, at.y, at.yaw]]),
         half_t_m=p.around_m,
         half_a_rad=p.around_rad,
-        parameters=SearchParameters(floor=0.0, most=1),
     )
     found = (
         fitted(query, h.session_index, h.submap_id, target, _about(center_m, SE2(x, y, yaw)))
@@ -131,7 +163,7 @@ def best_around(query: QueryMap, h: Fit, target: SearchMap) -> Fit:
     return max((h, *found), key=lambda one: one.score)
 
 
-def worth_keeping(
+def _worth_keeping(
     query: QueryMap, new: Iterable[Fit], maps: Sequence[SearchMap], most: int, kept: Sequence[Fit] = ()
 ) -> tuple[Fit, ...]:
     """Return the new and the earlier hypotheses that score enough beside the best one to be reported

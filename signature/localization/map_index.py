@@ -22,7 +22,7 @@ from pc2grid.model import OccupancyGrid
 from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.hypotheses import align, fitted, worth_keeping
+from signature.localization.hypotheses import look_up
 from signature.localization.in_space import SurfaceOf, surface_reader
 from signature.localization.prior import Prior, Region
 from signature.localization.query import QueryMap
@@ -217,23 +217,26 @@ class MapIndex:
 
         What has less than the share `RelocalizeConfig.coarse_keep` of the best coarse score is left out.
         """
-        maps = self.maps_for(query)
-        found = self._worth_keeping(query, self._fitted(query, known))
         rows, mass = self.places.order(query.views, query.center_m, self.config)
         batches = _batches(len(rows))
         if self.look is not None and len(batches) > 1:
             batches = [batches[0], batches[1 + self.look % (len(batches) - 1)]]
         areas = [self.places.areas(rows[batch]) for batch in batches]
         areas[0] = chain(areas[0], self._allowed(query))
-        aligned, left = align(query, areas, self.places, maps, self.config), 1.0
-        for batch, fits in zip(batches, aligned, strict=True):
-            found, left = self._worth_keeping(query, fits, found), left - float(mass[batch].sum())
+        left = 1.0
+        for batch, found in zip(batches, self._look_up(query, areas, known), strict=True):
+            left -= float(mass[batch].sum())
             yield found, left
 
     def in_region(self, query: QueryMap, known: tuple[Fit, ...] = ()) -> tuple[Fit, ...]:
         """Return `known` and what fits anywhere in the region of the prior."""
-        fits = next(align(query, [self._allowed(query)], self.places, self.maps_for(query), self.config))
-        return self._worth_keeping(query, (*self._fitted(query, known), *fits))
+        return next(self._look_up(query, [self._allowed(query)], known))
+
+    def _look_up(
+        self, query: QueryMap, areas: Iterable[Iterable[Area]], known: tuple[Fit, ...]
+    ) -> Iterator[tuple[Fit, ...]]:
+        maps = self.maps_for(query)
+        return look_up(query, areas, self.places, maps, self.config, known, lambda h: self.allows(query, h))
 
     def _allowed(self, query: QueryMap) -> Iterator[Area]:
         """Yield the region of the prior, if there is one that applies."""
@@ -241,13 +244,6 @@ class MapIndex:
         if region is not None:
             squares_m = region.squares(query, self.places.ground[region.session_index][0], SQUARE_M)
             yield Area(region.session_index, squares_m)
-
-    def _fitted(self, query: QueryMap, known: Iterable[Fit]) -> list[Fit]:
-        """Return the known hypotheses, refined."""
-        maps = self.maps_for(query)
-        return [
-            fitted(query, h.session_index, h.submap_id, maps[h.session_index], h.T_map_query) for h in known
-        ]
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
         """Return the maps as they are searched for a query: to one in a lower plane, their free space is
@@ -258,16 +254,6 @@ class MapIndex:
             return (self._from_above if below else self.maps)[i]
 
         return LazySequence(facing, len(self.maps), 0)
-
-    def _worth_keeping(
-        self, query: QueryMap, new: Sequence[Fit], kept: Sequence[Fit] = ()
-    ) -> tuple[Fit, ...]:
-        """Return `worth_keeping` of the hypotheses, and beside them that of those that a prior excludes."""
-        maps, worth = self.maps_for(query), list[Fit]()
-        for inside in (True, False):
-            of_new, of_kept = ([h for h in of if self.allows(query, h) is inside] for of in (new, kept))
-            worth += worth_keeping(query, of_new, maps, self.config.hypotheses, of_kept)
-        return tuple(sorted(worth, key=lambda h: -h.score))
 
     def joined(self, a: int, b: int) -> tuple[BuildingFrame, BuildingFrame] | None:
         """Return where two sessions lie in the building in which they are joined; None if they are not."""

@@ -22,7 +22,7 @@ from pc2grid.matching.evidence import LEFT, evidence_of, masses
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
-from signature.localization.hypotheses import align, worth_keeping
+from signature.localization.hypotheses import look_up
 from signature.localization.query import QueryMap, query_of
 from signature.paper import PlaceTable
 from signature.retrieval.places import LazySequence, Places
@@ -77,8 +77,7 @@ class SessionRecognizer:
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
         rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
         maps = LazySequence(self._map, len(self._stored), most=0)
-        aligned = next(align(query, [places.areas(rows)], places, maps, self._config))
-        found = worth_keeping(query, aligned, maps, self._config.hypotheses)
+        found = next(look_up(query, [places.areas(rows)], places, maps, self._config))
         return [
             Recognition(
                 older=h.session_index,
