@@ -12,6 +12,7 @@ import numpy as np
 from pc2grid.display import html_table, short
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
 from pc2grid.model import Loop, OccupancyGrid, PointMap, SessionMap, Submap, Trajectory
+from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid.submaps.submaps import view_at
 from signature.config import Config
 from signature.database import document
@@ -21,7 +22,6 @@ from signature.database.document import (
     StoredSession,
     SubmapArrays,
     explained,
-    graph_from_arrays,
     stored_session,
 )
 from signature.database.protocol import BuildingFrame, Label, Problem, Provenance, SessionInfo
@@ -133,7 +133,8 @@ class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
 
     def graph(self, session: str) -> nx.Graph:
         """Return the junction graph of a session's free space (`pc2grid.submaps.junction_graph`)."""
-        return graph_from_arrays(self._parts(session, "grid", "graph")["graph"])
+        found = self._parts(session, "grid")
+        return junction_graph(found["grid"], found["info"].provenance.config.partition)
 
     def points(self, session: str) -> PointMap | None:
         """Return the points of a session in space; None if none were stored."""

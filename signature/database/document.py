@@ -26,17 +26,16 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Optional, get_type_hints
+from typing import Any, Optional, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, Pc2GridError
-from pc2grid.geometry import F32, F64, I64, frozen_arrays
+from pc2grid.geometry import F32, F64, frozen_arrays
 from pc2grid.io.messages.types import EDGES_M, FARTHEST_M
 from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Submap, Trajectory
-from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid.submaps.submaps import divide
 from signature.boundary import boundary_bins
 from signature.config import Config
@@ -44,92 +43,6 @@ from signature.database.protocol import BuildingFrame, Entry, Problem, SessionIn
 from signature.freespace import freespace_bins
 from signature.paper import I32, Signature, SignatureTable, describe
 from signature.visible import SIGNATURE_COLUMNS, SeenPlaces
-
-if TYPE_CHECKING:
-    import networkx as nx
-
-
-NODE_KINDS = ("junction", "end")
-"""What a node may be; `GraphArrays.kind` counts from 0 in this order."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-@frozen_arrays(
-    center_m=(np.float64, "N", 2),
-    kind=(np.uint8, "N"),
-    pixels=(np.int32, "N"),
-    edges=(np.int32, "E", 2),
-    length_m=(np.float64, "E"),
-    path_start=(np.int64, "S"),
-    path_m=(np.float32, "K", 2),
-)
-class GraphArrays:
-    """A junction graph as plain arrays, to be stored.
-
-    center_m : (N, 2) float64. kind : (N,) uint8, index into `NODE_KINDS`. pixels : (N,) int32.
-    edges : (E, 2) int32, numbers of nodes, the lower one first. length_m : (E,) float64.
-    path_start : (E + 1,) int64; `path_m[path_start[e]:path_start[e + 1]]` is the way of edge e.
-    path_m : (K, 2) float32.
-    """
-
-    center_m: F64
-    kind: NDArray[np.uint8]
-    pixels: NDArray[np.int32]
-    edges: NDArray[np.int32]
-    length_m: F64
-    path_start: I64
-    path_m: F32
-
-
-def graph_to_arrays(graph: nx.Graph) -> GraphArrays:
-    """Return a junction graph as arrays; `graph_from_arrays` is the inverse."""
-    nodes = [graph.nodes[node] for node in range(len(graph))]
-    edges = [(min(a, b), max(a, b), way) for a, b, way in graph.edges(data=True)]
-    paths = [np.asarray(way["path_m"], np.float32).reshape(-1, 2) for _, _, way in edges]
-    return GraphArrays(
-        center_m=np.array([node["center_m"] for node in nodes], np.float64).reshape(-1, 2),
-        kind=np.array([NODE_KINDS.index(node["kind"]) for node in nodes], np.uint8),
-        pixels=np.array([node["pixels"] for node in nodes], np.int32),
-        edges=np.array([(a, b) for a, b, _ in edges], np.int32).reshape(-1, 2),
-        length_m=np.array([way["length_m"] for _, _, way in edges], np.float64),
-        path_start=np.cumsum([0, *map(len, paths)], dtype=np.int64),
-        path_m=np.concatenate((np.empty((0, 2), np.float32), *paths)),
-    )
-
-
-def graph_from_arrays(arrays: GraphArrays) -> nx.Graph:
-    """Return the junction graph of arrays from `graph_to_arrays`.
-
-    Raises ValueError if the arrays are no junction graph: a kind that does not exist, an edge to a node that
-    does not exist, from a node to itself or given twice, a length that is not positive, numbers that are not
-    finite, paths that do not follow each other.
-    """
-    import networkx as nx
-
-    nodes, starts = len(arrays.kind), arrays.path_start
-    edges = arrays.edges.tolist()
-    positive = np.isfinite(arrays.length_m) & (arrays.length_m > 0)
-    valid = {
-        "kind": (arrays.kind < len(NODE_KINDS)).all(),
-        "edges": all(0 <= a < b < nodes for a, b in edges) and len(set(map(tuple, edges))) == len(edges),
-        "center_m": np.isfinite(arrays.center_m).all(),
-        "length_m": positive.all(),
-        "path_start": len(starts) == len(edges) + 1
-        and starts[0] == 0
-        and starts[-1] == len(arrays.path_m)
-        and (np.diff(starts) >= 0).all(),
-        "path_m": np.isfinite(arrays.path_m).all(),
-    }
-    for name, good in valid.items():
-        if not good:
-            raise ValueError(f"GraphArrays.{name}: not that of a junction graph")
-    graph = nx.Graph()
-    about = zip(arrays.kind.tolist(), arrays.center_m.tolist(), arrays.pixels.tolist(), strict=True)
-    for node, (kind, (x, y), pixels) in enumerate(about):
-        graph.add_node(node, kind=NODE_KINDS[kind], center_m=(x, y), pixels=pixels)
-    for k, ((a, b), length_m) in enumerate(zip(edges, arrays.length_m.tolist(), strict=True)):
-        graph.add_edge(a, b, length_m=length_m, path_m=arrays.path_m[starts[k] : starts[k + 1]])
-    return graph
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,7 +99,7 @@ class SubmapArrays:
 class StoredSession:
     """Everything that is stored of a session.
 
-    graph : its junction graph. submaps : their centres and signatures. seen : visible surroundings of their
+    submaps : their centres and signatures. seen : visible surroundings of their
     centres. frame : its place in its building; None if it was not joined with another session.
     """
 
@@ -194,7 +107,6 @@ class StoredSession:
     grid: OccupancyGrid
     trajectory: Trajectory
     loops: tuple[Loop, ...]
-    graph: GraphArrays
     points: PointMap | None
     submaps: SubmapArrays
     seen: SeenPlaces
@@ -205,7 +117,7 @@ PARTS = tuple(field.name for field in fields(StoredSession))[1:]
 """The parts of a session beside its info; each is read only when it is asked for."""
 SEARCHED = ("grid", "submaps")
 """The parts that every search reads."""
-RECOVERED = ("graph", "points", "submaps", "seen", "frame")
+RECOVERED = ("points", "submaps", "seen", "frame")
 """The parts that a session can lose: see `completed`."""
 _UNCOMPRESSED = ("submaps",)
 """Stored as they are, because a search reads all of them."""
@@ -230,7 +142,7 @@ _ADAPTERS = {
 def stored_session(entry: Entry) -> StoredSession:
     """Return a session as it is stored. Raises ValueError for content that its settings do not make."""
     session_map, signatures, provenance = entry
-    grid, config, graph = session_map.grid, provenance.config, session_map.graph
+    grid, config = session_map.grid, provenance.config
     submaps = SubmapArrays.of(session_map.submaps, signatures, config)
     return StoredSession(
         info=SessionInfo(
@@ -252,7 +164,6 @@ def stored_session(entry: Entry) -> StoredSession:
         grid=grid,
         trajectory=session_map.trajectory,
         loops=session_map.loops,
-        graph=graph_to_arrays(graph if len(graph) else junction_graph(grid, config.partition)),
         points=session_map.points,
         submaps=submaps,
         seen=seen_from(submaps, grid, config),
@@ -270,14 +181,12 @@ def completed(parts: Mapping[str, Any]) -> StoredSession:
         parts["grid"],
         parts["info"].provenance.config,
     )
-    if not {"graph", "submaps"} <= found.keys():
-        graph, submaps = divide(grid, config.partition)
-        found.setdefault("graph", graph_to_arrays(graph))
-        if "submaps" not in found:
-            signatures = [describe(submap, config.signature) for submap in submaps]
-            found["submaps"] = SubmapArrays.of(submaps, signatures, config)
-            found["info"] = replace(found["info"], submaps=len(submaps))
-            found.pop("seen", None)
+    if "submaps" not in found:
+        _, submaps = divide(grid, config.partition)
+        signatures = [describe(submap, config.signature) for submap in submaps]
+        found["submaps"] = SubmapArrays.of(submaps, signatures, config)
+        found["info"] = replace(found["info"], submaps=len(submaps))
+        found.pop("seen", None)
     if found["points"] is None:
         found["info"] = replace(found["info"], points=0)
     found.setdefault("seen", seen_from(found["submaps"], grid, config))
@@ -470,12 +379,6 @@ def check_loops(loops: tuple[Loop, ...], info: SessionInfo, _: object = None) ->
     _each(np.array(between, bool), f"loop {{}} is not between two of {info.scans} poses")
 
 
-def check_graph(graph: GraphArrays, _: SessionInfo, grid: OccupancyGrid | None) -> None:
-    """Check that a junction graph lies on its map."""
-    graph_from_arrays(graph)
-    _on_map(graph.center_m, grid, "node")
-
-
 def check_points(points: PointMap | None, info: SessionInfo, _: object = None) -> None:
     """Check that the voxels of points increase by x, then y, then z, none twice. None: there are no
     points."""
@@ -533,7 +436,6 @@ _CHECKS: dict[str, Callable[[Any, SessionInfo, OccupancyGrid | None], None]] = {
     "grid": check_grid,
     "trajectory": check_trajectory,
     "loops": check_loops,
-    "graph": check_graph,
     "points": check_points,
     "submaps": check_submaps,
     "seen": check_seen,

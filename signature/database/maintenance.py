@@ -89,8 +89,8 @@ def copy(
 ) -> tuple[Problem, ...]:
     """Write a compact copy, on the same or another engine.
 
-    With `recover`, parts that follow from the map of a session (junction graph, submaps and their signatures,
-    visible surroundings) are computed again where they are damaged; damaged points, and sessions of which
+    With `recover`, parts that follow from the map of a session (submaps and their signatures, visible
+    surroundings) are computed again where they are damaged; damaged points, and sessions of which
     another part is damaged, are left out. Returns all damage. Raises DatabaseCorrupt for damage without
     `recover`, OutputError if `target` exists without `overwrite`.
     """

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import networkx as nx
 import numpy as np
 
 from pc2grid.geometry import SE2
@@ -33,7 +32,7 @@ from pc2grid.submaps.submaps import view_at
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database import Label, Provenance, SubmapDatabase, open_database
-from signature.database.document import graph_to_arrays, row_crc, unpack
+from signature.database.document import row_crc, unpack
 from signature.database.protocol import Entry
 from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
 from signature.freespace import freespace_bins
@@ -79,7 +78,6 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
             )
             for k in range(3)
         ),
-        graph=small_graph(seed),
         odometry=OdometryCheck(
             compared=9, overruled=2,
             stretches=(OdometryOutlier(from_ns=10**9, to_ns=2 * 10**9, distance_m=0.3, turn_rad=0.5),),
@@ -106,23 +104,11 @@ def make_entry(name: str = "monday", seed: int = 0, submaps: int = 3, config: Co
     return session_map, signatures, origin
 
 
-def small_graph(seed: int) -> nx.Graph:
-    """Two junctions and an end, inside the map of `make_entry`."""
-    graph = nx.Graph()
-    for node, kind in enumerate(("junction", "end", "junction")):
-        graph.add_node(node, kind=kind, center_m=(node - 1 / 3, 1.0 + 0.1 * seed % 1.5), pixels=node + 1)
-    for a, b in ((0, 1), (0, 2)):
-        path_m = np.array([graph.nodes[node]["center_m"] for node in (a, a, b)], np.float32)
-        graph.add_edge(a, b, length_m=float(b - a) + 1e-3 * seed, path_m=path_m)
-    return graph
-
-
 MONDAY, TUESDAY = make_entry("monday", 0), make_entry("tuesday", 1, submaps=5)
 READ_PART: dict[str, Callable[[Any], object]] = {
     "grid": lambda database: database.grid("monday"),
     "trajectory": lambda database: database.trajectory("monday"),
     "loops": lambda database: database.loops("monday"),
-    "graph": lambda database: database.graph("monday"),
     "points": lambda database: database.points("monday"),
     "seen": lambda database: database.seen_places("monday"),
     "submaps": lambda database: (list(database.submaps("monday")), database.signatures()),
@@ -153,7 +139,6 @@ def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
     assert info.consistency == session_map.consistency
     assert info.precision == session_map.precision
     assert info.odometry == session_map.odometry
-    assert_same_graph(database.graph(name), session_map.graph)
     places = np.unique(database.seen_places(name).place)
     assert np.array_equal(places, np.arange(len(session_map.submaps)))
     points, wanted_points = database.points(name), session_map.points
@@ -181,13 +166,6 @@ def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
     assert [tuple(c) for c in table.center_m[mine]] == [s.center_m for s in session_map.submaps]
 
 
-def assert_same_graph(found: nx.Graph, wanted: nx.Graph) -> None:
-    """Equal nodes and edges, with equal values."""
-    arrays, expected = graph_to_arrays(found), graph_to_arrays(wanted)
-    for field in arrays.__slots__:
-        np.testing.assert_array_equal(getattr(arrays, field), getattr(expected, field))
-
-
 def everything(place: str | Path) -> dict[str, str]:
     """A digest of all content of each session of a database."""
     with open_database(place) as database:
@@ -203,8 +181,6 @@ def digests_of(database: SubmapDatabase) -> dict[str, str]:
         trajectory = database.trajectory(info.name)
         digest.update(trajectory.stamps_ns.tobytes() + trajectory.T_session_base.tobytes())
         digest.update(repr((trajectory.health, database.loops(info.name))).encode())
-        arrays = graph_to_arrays(database.graph(info.name))
-        digest.update(repr([getattr(arrays, field).tolist() for field in arrays.__slots__]).encode())
         seen = database.seen_places(info.name)
         digest.update(seen.place.tobytes() + seen.signatures.tobytes())
         points = database.points(info.name)

@@ -1,8 +1,6 @@
 """Partition into submaps (paper III-A)."""
 
-import dataclasses
 import math
-from typing import Any
 
 import cv2
 import networkx as nx
@@ -36,7 +34,6 @@ from pc2grid.submaps.submaps import (
     submap_at,
     visible_submap,
 )
-from signature.database.document import GraphArrays, graph_from_arrays, graph_to_arrays
 from tests.helpers.field import DATA
 from tests.helpers.rooms import RESOLUTION_M, canvas, cross, grid_of
 from tests.helpers.simulated_drives import plan
@@ -185,35 +182,6 @@ def test_edges_are_the_shortest_ways_along_the_skeleton(seed: int) -> None:
         for node, end in ((min(a, b), path_m[0]), (max(a, b), path_m[-1])):
             members = grid.to_point(pixels[places[node]])
             assert np.linalg.norm(members - end, axis=1).min() < 1e-5
-
-
-@pytest.mark.parametrize("seed", [None, 0, 1])
-def test_graph_comes_back_from_arrays(seed: int | None) -> None:
-    graph = nx.Graph() if seed is None else junction_graph(rooms(seed))
-    again = graph_from_arrays(graph_to_arrays(graph))
-    assert list(again.nodes(data=True)) == list(graph.nodes(data=True))
-    assert list(again.edges) == list(graph.edges)
-    for a, b, way in graph.edges(data=True):
-        assert again.edges[a, b]["length_m"] == way["length_m"]
-        assert np.array_equal(again.edges[a, b]["path_m"], way["path_m"])
-
-
-@pytest.mark.parametrize(
-    ("field", "index", "value"),
-    [
-        ("kind", 0, 2), ("edges", (0, 0), -1), ("edges", (0, 1), 10_000), ("edges", (0, 1), 0),
-        ("edges", 1, (0, 0)), ("center_m", (0, 0), np.nan), ("length_m", 0, -1.0), ("length_m", 0, np.inf),
-        ("path_start", 0, 1), ("path_start", -1, 3), ("path_start", 1, -1), ("path_m", (0, 0), np.inf),
-    ],
-)  # fmt: skip
-def test_arrays_that_are_no_graph_are_refused(field: str, index: Any, value: Any) -> None:
-    arrays = graph_to_arrays(junction_graph(rooms(0)))
-    parts = {f.name: np.array(getattr(arrays, f.name)) for f in dataclasses.fields(arrays)}
-    if value == (0, 0):
-        value = parts["edges"][0]  # the first edge again
-    parts[field][index] = value
-    with pytest.raises(ValueError, match=f"GraphArrays.{field}"):
-        graph_from_arrays(GraphArrays(**parts))
 
 
 # --- Isovists against hand-made rooms and a slow oracle ---

@@ -145,18 +145,6 @@ PARTS: dict[str, tuple[Any, dict[str, tuple[str, tuple[int, ...]]]]] = {
         {"health": ["fine", "degenerate", "fine", "fine", "fine", "fine", "lost"]},
         {"stamps_ns": ("int64", (7,)), "T_session_base": ("float64", (7, 4, 4))},
     ),
-    "graph": (
-        {},
-        {
-            "center_m": ("float64", (3, 2)),
-            "kind": ("uint8", (3,)),
-            "pixels": ("int32", (3,)),
-            "edges": ("int32", (2, 2)),
-            "length_m": ("float64", (2,)),
-            "path_start": ("int64", (3,)),
-            "path_m": ("float32", (6, 2)),
-        },
-    ),
     "points": ({"voxel_m": 0.1}, {"origin_m": ("float64", (3,)), "steps": ("int32", (40, 3))}),
     "submaps": (
         {},

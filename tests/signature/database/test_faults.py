@@ -461,20 +461,18 @@ def test_structure_that_no_row_shows(path: Path, statement: str, words: str) -> 
 
 
 def test_what_follows_from_the_map_is_made_again(empty: maintenance.Location, tmp_path: Path) -> None:
-    """Damaged submaps, signatures, graphs and views cost nothing; a damaged grid costs the session."""
+    """Damaged submaps, signatures and views cost nothing; a damaged grid costs the session."""
     place = empty
     config, grid = Config(), small_house()
     empty = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
-    graph, submaps = divide(grid, config.partition)
-    house = SessionMap(
-        session="house", sensor="map", grid=grid, submaps=submaps, trajectory=empty, graph=graph
-    )
+    _, submaps = divide(grid, config.partition)
+    house = SessionMap(session="house", sensor="map", grid=grid, submaps=submaps, trajectory=empty)
     signatures = [describe(submap, config.signature) for submap in submaps]
     entry = house, signatures, Provenance(source="house.yaml", digest="0" * 64, config=config)
     store(place, [MONDAY, entry, TUESDAY], keep=False)
     with open_database(place) as database:
         before = database.seen_places("house")
-    damaged = [(1, "grid"), (2, "submaps"), (2, "graph"), (2, "seen"), (3, "points"), (3, "seen")]
+    damaged = [(1, "grid"), (2, "submaps"), (2, "seen"), (3, "points"), (3, "seen")]
     for session, part in damaged:
         sql(place, "UPDATE part SET crc32 = crc32 + 1 WHERE session_id = ? AND name = ?", session, part)
     good = tmp_path / "good.submaps"
@@ -587,11 +585,6 @@ CASES: list[tuple[Change, str]] = [
     (document("loops.1.T_older_newer.yaw", NAN), "loops: 1.T_older_newer.yaw: .* finite number"),
     (document("loops.1.information", [1.0]), "loops: 1: .*expected shape"),
     (whole("loops", ({}, {})), "loops: Input should be a valid tuple"),
-    (entry("graph.edges", 3, 3), "graph: .*edges: not that of a junction graph"),
-    (entry("graph.kind", 2, 2), "graph: .*kind: not that of a junction graph"),
-    (entry("graph.center_m", 4, 1.9), "graph: node 2 lies outside its map"),
-    (entry("graph.length_m", 1, -1.0), "graph: .*length_m: not that of a junction graph"),
-    (entry("graph.path_start", 1, 7), "graph: .*path_start: not that of a junction graph"),
     (entry(STEPS, 3, -20 * 64), "points: a voxel outside 0"),
     (entry(STEPS, 0, 2**21 * 64), "points: a voxel outside 0"),
     (array(STEPS, np.zeros((40, 3), np.int32)), "points: the voxel after 0 is not after it"),
@@ -707,7 +700,6 @@ def _read_everything(path: Path) -> None:
     with open_database(path) as database:
         for info in database.sessions():
             database.grid(info.name)
-            assert all(way > 0 for *_, way in database.graph(info.name).edges(data="length_m"))
             trajectory = database.trajectory(info.name)
             assert all(loop.newer < len(trajectory) for loop in database.loops(info.name))
             assert np.isfinite(trajectory.T_session_base).all()
@@ -742,9 +734,7 @@ def test_fuzz_any_value_in_any_column_with_a_right_checksum(two: bytes, path: Pa
 
     def odd_array(content: Content) -> None:
         """Bytes changed in an array whose own checksum is right as well."""
-        arrays = content.parts[str(rng.choice(["grid", "trajectory", "graph", "points", "submaps", "seen"]))][
-            1
-        ]
+        arrays = content.parts[str(rng.choice(["grid", "trajectory", "points", "submaps", "seen"]))][1]
         name = str(rng.choice(sorted(arrays)))
         was = arrays[name]
         arrays[name] = np.frombuffer(changed(was.tobytes()), was.dtype).reshape(was.shape)
