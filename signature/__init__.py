@@ -23,7 +23,7 @@ Databases
     build_session       the same without storing; provenance: what a session was made from
     build_sessions      the same; several, if the recording does not hang together
     add_session         store a session
-    create_database, open_database, SubmapDatabase, Label
+    open_database, SubmapDatabase, Label
 
 Answers
     relocalize          where in a database a recording was made: a Found, an Answer that can be drawn
@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from signature.database import (
         Label as Label,
         SubmapDatabase as SubmapDatabase,
-        create_database as create_database,
         open_database as open_database,
     )
     from signature.localization.answer import Answer as Answer
@@ -73,7 +72,6 @@ _HOMES = {
     "Config": "signature.config",
     "Label": "signature.database",
     "SubmapDatabase": "signature.database",
-    "create_database": "signature.database",
     "open_database": "signature.database",
     "Signature": "signature.paper",
     "signature_of": "signature.paper:describe",

@@ -453,7 +453,7 @@ def add_session(
 
     overwrite : replace a session of the same name.
 
-    Raises the errors of `SubmapDatabase.add`.
+    Raises the errors of `signature.database.maintenance.store`.
 
     >>> import pc2grid, signature
     >>> config = signature.Config()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator
 from dataclasses import fields
 from typing import TYPE_CHECKING, Any, cast
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from pc2grid.display import html_table, short
 from pc2grid.errors import DatabaseCorrupt, DatabaseError
-from pc2grid.model import Loop, OccupancyGrid, PointMap, SessionMap, Submap, Trajectory
+from pc2grid.model import Loop, OccupancyGrid, PointMap, Submap, Trajectory
 from pc2grid.submaps.junction_graph import junction_graph
 from pc2grid.submaps.submaps import view_at
 from signature.config import Config
@@ -22,11 +22,10 @@ from signature.database.document import (
     StoredSession,
     SubmapArrays,
     explained,
-    stored_session,
 )
-from signature.database.protocol import BuildingFrame, Label, Problem, Provenance, SessionInfo
+from signature.database.protocol import BuildingFrame, Label, Problem, SessionInfo
 from signature.database.rows import Rows, SessionRow, no_session
-from signature.paper import Signature, SignatureTable
+from signature.paper import SignatureTable
 from signature.visible import SeenPlaces
 
 if TYPE_CHECKING:
@@ -34,17 +33,17 @@ if TYPE_CHECKING:
 
 
 class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
-    """Sessions and their submaps. Reading never changes it; `add` changes all or nothing.
+    """Sessions and their submaps, to be read.
 
-    A handle shows the database as it was when it was opened; after `add` its own handle shows the new state.
+    A handle shows the database as it was when it was opened.
     (A server keeps deleted rows for it, so services should open a new handle now and then.)
 
     Every read raises DatabaseCorrupt if a row does not match its checksum, or has impossible content.
     """
 
-    def __init__(self, rows: Rows, *, writable: bool = False, damaged: bool = False) -> None:
+    def __init__(self, rows: Rows, *, damaged: bool = False) -> None:
         """Wrap the rows of an engine. damaged : know only the sessions whose own row can be read."""
-        self._rows, self._writable, self._damaged = rows, writable, damaged
+        self._rows, self._damaged = rows, damaged
         self._left_out: set[int] = set()
         self._labelled: dict[str, str] = {}
 
@@ -173,30 +172,6 @@ class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
             with contextlib.suppress(*[DatabaseCorrupt] if recover and part in document.RECOVERED else []):
                 parts[part] = self._rows.part(row, part, parts)
         return document.completed(parts)
-
-    def add(
-        self,
-        session_map: SessionMap,
-        signatures: Sequence[Signature],
-        provenance: Provenance,
-        *,
-        overwrite: bool = False,
-    ) -> None:
-        """Store a session in one transaction.
-
-        The same session again changes nothing; another one of the same name is refused with DatabaseError, or
-        replaced with `overwrite`.
-
-        Of the submaps their centres are stored: they are cut from the map again, with the settings of
-        `provenance`. Raises ValueError for submaps and signatures of other sizes than these settings make.
-        """
-        if not self._writable:
-            raise DatabaseError(f"{self.location}: opened for reading only")
-        session = stored_session((session_map, signatures, provenance))
-        try:
-            self._rows.change(self._rows.source, lambda rows: rows.store([session], overwrite=overwrite))
-        finally:
-            self._rows.renew()
 
     def keep_only(self, *, building: str | None = None, floor: str | None = None) -> None:
         """Restrict this handle to the sessions of a building and floor; None: any, "": not labelled.

@@ -6,9 +6,9 @@ import contextlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
-from pc2grid.errors import DatabaseCorrupt, DatabaseError
+from pc2grid.errors import DatabaseCorrupt, DatabaseError, OutputError
 from pc2grid.io.source import is_submap_file
-from signature.database import SubmapDatabase, engine_of, open_database, refuse_existing
+from signature.database import SubmapDatabase, engine_of, open_database
 from signature.database.document import DatabaseDamage, StoredSession, clean, stored_session
 from signature.database.postgres import is_url, location
 from signature.database.protocol import BuildingFrame, Entry, Location, Problem, SessionInfo
@@ -23,7 +23,10 @@ def store(target: Location, entries: Iterable[Entry], *, keep: bool, overwrite: 
     overwrite : replace a session of the same name instead of refusing the new one, and with it the other
         parts of the recording that it was made from.
 
-    Raises as `SubmapDatabase.add`.
+    The same session again changes nothing; another one of the same name is refused with DatabaseError, or
+    replaced with `overwrite`. Of the submaps their centres are stored: they are cut from the map again, with
+    the settings of its provenance. Raises ValueError for submaps and signatures of other sizes than these
+    settings make, OutputError, DatabaseBusy, and as `open_database`.
     """
     names = [clean(session_map.session) for session_map, _, _ in entries] if overwrite else []
 
@@ -94,7 +97,7 @@ def copy(
     another part is damaged, are left out. Returns all damage. Raises DatabaseCorrupt for damage without
     `recover`, OutputError if `target` exists without `overwrite`.
     """
-    refuse_existing(target, overwrite)
+    _refuse_existing(target, overwrite)
     problems = check(source)
     if problems and not recover:
         more = f" and {len(problems) - 1} more" if len(problems) > 1 else ""
@@ -109,7 +112,7 @@ def merge(sources: Sequence[Location], target: Location, *, overwrite: bool = Fa
     A session that is in several of them is taken once. Raises DatabaseError if a database is named twice, if
     two different sessions share a name, or were made with settings whose submaps cannot be compared.
     """
-    refuse_existing(target, overwrite)
+    _refuse_existing(target, overwrite)
     _refuse_repeated(sources)
     chosen: dict[str, tuple[SessionInfo, Location]] = {}
     for source in sources:
@@ -134,7 +137,7 @@ def split(source: Location, names: Sequence[str], target: Location, *, overwrite
     Raises DatabaseError for a name that no session has, or for a `target` that is `source`; OutputError if
     `target` exists without `overwrite`.
     """
-    refuse_existing(target, overwrite)
+    _refuse_existing(target, overwrite)
     _refuse_repeated([source, target])
     with open_database(source) as database:
         known = [database.session(name).name for name in dict.fromkeys(names)]
@@ -161,6 +164,12 @@ def _write(
     engine_of(target).change(
         target, lambda rows: rows.store(sessions(), overwrite=False), keep=False, create=True
     )
+
+
+def _refuse_existing(target: Location, overwrite: bool) -> None:
+    """Raise OutputError if there is something already, and `overwrite` is not set."""
+    if not overwrite and exists(target):
+        raise OutputError(f"{shown(target)}: exists already", hint="--force replaces it")
 
 
 def _refuse_repeated(sources: Sequence[Location]) -> None:

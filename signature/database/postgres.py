@@ -39,10 +39,6 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
 
-_ATTEMPTS = 5
-"""How often a transaction is tried that conflicts with one of another writer; chosen by hand."""
-
-
 class PostgresRows(Rows):
     """The rows of a schema `pc2grid` on a PostgreSQL server; read in one snapshot."""
 
@@ -58,7 +54,7 @@ class PostgresRows(Rows):
             rows.connection.set_autocommit(False)
             rows.connection.set_isolation_level(driver().IsolationLevel.REPEATABLE_READ)
             rows.connection.set_read_only(True)
-            rows.renew()
+            rows.execute("SELECT 1 FROM about")  # takes the snapshot
             undo.pop_all()
         return rows
 
@@ -76,7 +72,7 @@ class PostgresRows(Rows):
             if create:
                 initialise(rows.connection, rows.location)
             inspect(rows.connection, rows.location)
-            for attempt in range(1, _ATTEMPTS + 1):
+            while True:
                 try:
                     with served(rows.location), rows.connection.transaction():
                         if not keep:
@@ -87,8 +83,7 @@ class PostgresRows(Rows):
                     return
                 except DatabaseError as error:
                     # Another writer has just stored a session of that name: compare with it.
-                    again = isinstance(error.__cause__, errors.UniqueViolation | errors.DeadlockDetected)
-                    if attempt == _ATTEMPTS or not again:
+                    if not isinstance(error.__cause__, errors.UniqueViolation | errors.DeadlockDetected):
                         raise
 
     @classmethod
@@ -105,12 +100,6 @@ class PostgresRows(Rows):
     @classmethod
     def _connected(cls, place: Location) -> Self:
         return cls(place, location(str(place)), connect(str(place)))
-
-    def renew(self) -> None:
-        """Take the snapshot of now."""
-        with served(self.location):
-            self.connection.rollback()
-            self.connection.execute("SELECT 1 FROM about")
 
     def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query. Raises the errors of `served`."""

@@ -110,10 +110,6 @@ class Rows(ABC):
     def new_id(self) -> int:
         """Return a number for a further session, larger than all others."""
 
-    @abstractmethod
-    def renew(self) -> None:
-        """Take a new snapshot of the database."""
-
     def close(self) -> None:
         """Close the file or connection."""
         self.connection.close()

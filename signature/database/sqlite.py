@@ -103,11 +103,6 @@ class SqliteRows(Rows):
         ((largest,),) = self.select("SELECT coalesce(max(id), 0) FROM session")
         return int(largest) + 1
 
-    def renew(self) -> None:
-        """Open the present file."""
-        self.close()
-        self.connection = self.open(self.source).connection
-
     def damaged_structure(self) -> Iterator[Problem]:
         """Yield a wrong header, tables that are not those of the format, and the findings of SQLite
         itself."""

@@ -10,10 +10,10 @@ import pytest
 from pc2grid.errors import DatabaseError, NotADatabase, OutputError
 from pc2grid.model import Trajectory
 from signature.config import Config
-from signature.database import Label, create_database, maintenance, open_database
+from signature.database import Label, maintenance, open_database
 from signature.database.maintenance import copy, merge, store
 from tests.helpers import postgresql
-from tests.helpers.databases import MONDAY, TUESDAY, assert_holds, digests_of, everything, make_entry
+from tests.helpers.databases import MONDAY, TUESDAY, assert_holds, everything, make_entry
 
 
 def test_what_goes_in_comes_out(place: str | Path) -> None:
@@ -32,8 +32,6 @@ def test_what_goes_in_comes_out(place: str | Path) -> None:
         assert [info.name for info in database.sessions(["tuesday", "friday"])] == ["tuesday"]
         with pytest.raises(DatabaseError, match="no session 'sunday'"):
             database.grid("sunday")
-        with pytest.raises(DatabaseError, match="reading only"):
-            database.add(*make_entry("wednesday", 2))
 
 
 def test_sessions_of_which_nothing_was_measured_without_submaps_or_poses(place: str | Path) -> None:
@@ -60,15 +58,18 @@ def test_nothing_there_is_no_database(empty: str | Path) -> None:
 
 
 def test_a_handle_sees_what_was_there_when_it_was_opened(empty: str | Path) -> None:
-    with create_database(empty) as first:
+    store(empty, [], keep=False)
+    with open_database(empty) as first:
         assert (first.sessions(), len(first.signatures()), first.config()) == ((), 0, Config())
-        first.add(*MONDAY)
+        store(empty, [MONDAY], keep=True)
         with open_database(empty) as reader:
-            first.add(*TUESDAY)
+            store(empty, [TUESDAY], keep=True)
             assert [info.name for info in reader.sessions()] == ["monday"]
             assert len(reader.signatures()) == 3
-        assert [info.name for info in first.sessions()] == ["monday", "tuesday"]
-        assert_holds(first, TUESDAY)
+        assert first.sessions() == ()
+    with open_database(empty) as database:
+        assert [info.name for info in database.sessions()] == ["monday", "tuesday"]
+        assert_holds(database, TUESDAY)
 
 
 def test_a_database_can_be_narrowed_to_a_building_or_floor(empty: str | Path) -> None:
@@ -132,8 +133,8 @@ def test_copy_and_merge_between_engines(place: str | Path, other: str, tmp_path:
 
 def test_any_name_of_a_file(path: Path) -> None:
     odd = path.rename(path.with_name("odd name #1?%41.submaps"))
-    with open_database(odd, writable=True) as database:
-        database.add(*make_entry("friday", 5))
+    store(odd, [make_entry("friday", 5)], keep=True)
+    with open_database(odd) as database:
         assert_holds(database, MONDAY)
     assert list(path.parent.iterdir()) == [odd]
 
@@ -153,8 +154,6 @@ def test_queries_leave_bytes_and_folder_as_they_are(path: Path) -> None:
         database.grid("monday")
         maintenance.check(database.location)
         assert sorted(path.parent.iterdir()) == folder
-        with pytest.raises(DatabaseError, match="reading only"):
-            database.add(*make_entry("wednesday", 2))
     assert path.read_bytes() == before
     assert sorted(path.parent.iterdir()) == folder == [path]
 
@@ -162,8 +161,7 @@ def test_queries_leave_bytes_and_folder_as_they_are(path: Path) -> None:
 def test_same_sessions_give_same_bytes(path: Path, tmp_path: Path) -> None:
     other = tmp_path / "other.submaps"
     store(other, [MONDAY], keep=False)
-    with open_database(other, writable=True) as database:
-        database.add(*TUESDAY)
+    store(other, [TUESDAY], keep=True)
     copied = tmp_path / "copy.submaps"
     copy(path, copied)
     rebuilt = tmp_path / "rebuilt.submaps"
@@ -177,39 +175,25 @@ def test_same_sessions_give_same_bytes(path: Path, tmp_path: Path) -> None:
 
 def test_adding_again_changes_nothing_and_another_of_the_name_needs_force(place: str | Path) -> None:
     before = everything(place)
-    with open_database(place, writable=True) as database:
-        database.add(*MONDAY)
-        assert digests_of(database) == before
-        assert len(database.sessions()) == 2
-        with pytest.raises(DatabaseError, match="another session named 'monday'") as caught:
-            database.add(*make_entry("monday", 7))
-        assert "overwrite=True" in str(caught.value)
-        assert_holds(database, MONDAY)
-        database.add(*make_entry("monday", 7), overwrite=True)
+    store(place, [MONDAY], keep=True)
+    assert everything(place) == before
+    with pytest.raises(DatabaseError, match="another session named 'monday'") as caught:
+        store(place, [make_entry("monday", 7)], keep=True)
+    assert "overwrite=True" in str(caught.value)
+    assert everything(place) == before
+    store(place, [make_entry("monday", 7)], keep=True, overwrite=True)
+    with open_database(place) as database:
         assert_holds(database, make_entry("monday", 7))
         assert_holds(database, TUESDAY)
         assert [info.name for info in database.sessions()] == ["monday", "tuesday"]
         assert maintenance.check(database.location) == ()
 
 
-def test_create_refuses_to_overwrite_and_leaves_what_is_there(place: str | Path) -> None:
-    before = everything(place)
-    with pytest.raises(OutputError, match="exists"):
-        create_database(place)
-    assert everything(place) == before
-    with create_database(place, overwrite=True) as database:
-        assert database.sessions() == ()
-        assert len(database.signatures()) == 0
-
-
 def test_sessions_made_with_other_settings_are_not_mixed(place: str | Path) -> None:
     config = Config.model_validate({"signature": {"boundary_bin_m": 0.3}})
     before = everything(place)
-    with (
-        open_database(place, writable=True) as database,
-        pytest.raises(DatabaseError, match=r"signature\.boundary_bin_m = 0\.2 and with 0\.3"),
-    ):
-        database.add(*make_entry("wednesday", 3, config=config))
+    with pytest.raises(DatabaseError, match=r"signature\.boundary_bin_m = 0\.2 and with 0\.3"):
+        store(place, [make_entry("wednesday", 3, config=config)], keep=True)
     assert everything(place) == before
 
 
@@ -235,8 +219,9 @@ def test_missing_file_folder_and_url(tmp_path: Path) -> None:
 def test_zero_byte_file_is_place_without_force(tmp_path: Path) -> None:
     file = tmp_path / "new.submaps"
     file.touch()
-    with create_database(file) as database:
-        database.add(*make_entry())
+    assert not maintenance.exists(file)
+    store(file, [make_entry()], keep=True)
+    with open_database(file) as database:
         assert_holds(database, make_entry())
 
 

@@ -25,7 +25,7 @@ from pc2grid.errors import (
     Pc2GridError,
 )
 from signature.config import Config
-from signature.database import create_database, maintenance, open_database, postgres
+from signature.database import maintenance, open_database, postgres
 from signature.database.maintenance import store
 from tests.helpers import postgresql
 from tests.helpers.databases import MONDAY, assert_holds, everything, make_entry, sql
@@ -48,7 +48,7 @@ from tests.helpers.postgresql import with_user
 )
 def test_wrong_urls_are_one_line_without_the_password(bad: str, error: type, words: str) -> None:
     pytest.importorskip("psycopg")
-    for attempt in (open_database, create_database, maintenance.check):
+    for attempt in (open_database, maintenance.exists, maintenance.check):
         with pytest.raises(error, match=words) as caught:
             attempt(bad)
         assert "\n" not in str(caught.value)
@@ -132,7 +132,7 @@ def test_a_user_who_may_not_make_tables() -> None:
     url = postgresql.new_database()
     sql(url, "CREATE ROLE guest LOGIN")
     with pytest.raises(DatabaseError, match="permission denied for database") as caught:
-        create_database(with_user(url, "guest", ""))
+        store(with_user(url, "guest", ""), [], keep=True)
     assert "ask an administrator" in str(caught.value)
 
 
@@ -159,10 +159,10 @@ def test_rights_that_a_robot_needs(url: str) -> None:
     writer, viewer = (with_user(url, role, "") for role in ("writer", "viewer"))
     store(writer, [make_entry("friday", 5)], keep=True)
     store(writer, [make_entry("friday", 6)], keep=True, overwrite=True)
-    with open_database(viewer, writable=True) as database:
+    with pytest.raises(DatabaseError, match="permission denied"):
+        store(viewer, [make_entry("sunday", 7)], keep=True)
+    with open_database(viewer) as database:
         assert_holds(database, make_entry("friday", 6))
-        with pytest.raises(DatabaseError, match="permission denied"):
-            database.add(*make_entry("sunday", 7))
         assert len(database.sessions()) == 3
 
 
