@@ -16,8 +16,8 @@ their weight. Loops and tracked steps are ten times as exact and decide wherever
 
 The heights of keyframes drift as their positions do. For gravity-aligned poses height is independent of x, y
 and yaw, so `optimised_heights` is a linear least-squares problem of its own: steps of tracking between
-keyframes, the height above the floor where it is visible, and the heights of loops. One recording is one
-floor, and a floor is level.
+keyframes, and the height above the floor where it is visible. One recording is one floor, and a floor is
+level.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix, identity
+from scipy.sparse import coo_matrix, csc_matrix, identity, vstack
 from scipy.sparse.linalg import splu
 
 from pc2grid.clouds.ground import LEVEL
@@ -299,129 +299,37 @@ def _from_axis(direction_rad: F64, axis_rad: float) -> F64:
     return wrap_angle(4.0 * (direction_rad - axis_rad)) / 4.0
 
 
-@dataclass(frozen=True, slots=True)
-class HeightStep:
-    """The height of one keyframe above another one, in metres, with its standard deviation."""
-
-    first: int
-    second: int
-    rise_m: float
-    sigma_m: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FloorLevelParameters:
-    """Numbers of the least squares; chosen by hand.
-
-    rounds : of reweighting; the first begins so wide that the worst has half of its weight (Cauchy), each
-        narrows it by `annealing`, to `PoseGraphParameters.robust_sigmas`.
-    around : keyframes on either side of the two of a loop whose points are compared.
-    reach_m : the passes of a loop differ in height by no more. layer_m, cell_m : height and edge of the
-        voxels in which they are. thin : layers that a column without a wall fills at most: floor, table and
-        ceiling. beside, stands_out : the overlap of level surfaces is a peak over the heights, `stands_out`
-        times as high as `beside` layers away from it.
-    known_m : standard deviation of the first height; it matters where no floor is visible. lost_m : of a step
-        where tracking was lost.
-    apart_from_m : spread of the floors of a map above which there is a warning.
-    """
-
-    rounds: int = 12
-    annealing: float = 2.0
-    around: int = 2
-    reach_m: float = 0.6
-    layer_m: float = 0.04
-    thin: int = 6
-    cell_m: float = 0.1
-    beside: int = 3
-    stands_out: float = 1.5
-    known_m: float = 100.0
-    lost_m: float = 1.0
-    apart_from_m: float = 0.1
-
-
-FLOOR_LEVELS = FloorLevelParameters()
+_LOST_M = 1.0
+"""Standard deviation of the height of a step where tracking was lost; chosen by hand."""
 
 
 def optimised_heights(
-    tracked_m: F64,
-    travel_m: F64,
-    above_floor_m: F64,
-    restarts: Sequence[int] | I64,
-    loops: Sequence[HeightStep] = (),
-    parameters: FloorLevelParameters = FLOOR_LEVELS,
+    tracked_m: F64, travel_m: F64, above_floor_m: F64, restarts: Sequence[int] | I64
 ) -> F64:
-    """Return the heights (K,) of keyframes above their one floor; without a floor, above any level.
+    """Return the heights (K,) of keyframes above their one floor, by robust least squares.
 
     tracked_m : (K,) z as tracked. travel_m : (K,) metres of travel at each. above_floor_m : (K,) as measured,
-    NaN where no floor is visible. restarts : the keyframes before which tracking was lost.
+    NaN where no floor is visible; it is visible somewhere. restarts : the keyframes before which tracking was
+    lost.
+
+    The robust scale begins so wide that the worst has half of its weight (Cauchy), and shrinks as that of
+    `optimise`.
     """
-    p, count = parameters, len(tracked_m)
-    seen = np.flatnonzero(np.isfinite(above_floor_m))
-    steps_m = np.sqrt(LEVEL.drift_per_m * np.maximum(np.diff(travel_m), 1e-3))
-    steps_m[np.asarray(restarts, np.int64) - 1] = p.lost_m
-    chain = np.arange(count - 1)
-    # One row for each observation: the height of `second` less that of `first`, which is -1 for the floor.
-    first = np.array([*chain, -1, *np.full(len(seen), -1), *(loop.first for loop in loops)], np.int64)
-    second = np.concatenate((chain + 1, [0], seen, [loop.second for loop in loops])).astype(np.int64)
-    rise_m = np.concatenate(
-        (np.diff(tracked_m), tracked_m[:1], above_floor_m[seen], [loop.rise_m for loop in loops])
-    )
-    sigma_m = np.concatenate(
-        (steps_m, [p.known_m], np.full(len(seen), LEVEL.seen_m), [loop.sigma_m for loop in loops])
-    )
-    may_be_wrong = np.arange(len(first)) >= count
-    row = np.arange(len(first))
-    inner = first >= 0
-    values = np.concatenate((np.ones(len(row)), -np.ones(int(inner.sum()))))
-    A = coo_matrix(
-        (values, (np.concatenate((row, row[inner])), np.concatenate((second, first[inner])))),
-        shape=(len(row), count),
-    ).tocsc()
-    weight, scale, heights_m = sigma_m**-2, np.inf, tracked_m
-    for _ in range(p.rounds):
+    seen, steps = np.flatnonzero(np.isfinite(above_floor_m)), len(tracked_m) - 1
+    sigma_m = np.full(steps + len(seen), LEVEL.seen_m)
+    sigma_m[:steps] = np.sqrt(LEVEL.drift_per_m * np.maximum(np.diff(travel_m), 1e-3))
+    sigma_m[np.asarray(restarts, np.int64) - 1] = _LOST_M
+    rise_m = np.concatenate((np.diff(tracked_m), above_floor_m[seen]))
+    # One row for each observation: the steps of tracking, then the floors.
+    heights = identity(steps + 1, format="csr")
+    A = vstack((heights[1:] - heights[:-1], heights[seen]))
+    weight, scale, robust_sigmas = sigma_m**-2, np.inf, POSE_GRAPH.robust_sigmas
+    for _ in range(POSE_GRAPH.iterations):
         heights_m = splu((A.T @ A.multiply(weight[:, None])).tocsc()).solve(A.T @ (weight * rise_m))
         off = np.abs(A @ heights_m - rise_m) / sigma_m
-        scale = max(min(scale / p.annealing, off[may_be_wrong].max(initial=0.0)), POSE_GRAPH.robust_sigmas)
-        weight = sigma_m**-2 * np.where(may_be_wrong, 1.0 / (1.0 + (off / scale) ** 2), 1.0)
+        scale = max(min(scale / POSE_GRAPH.annealing, off[steps:].max()), robust_sigmas)
+        weight[steps:] = 1.0 / (sigma_m**2 * (1.0 + (off / scale) ** 2))[steps:]
     return np.asarray(heights_m)
-
-
-def rise_between(
-    first_m: F64, second_m: F64, parameters: FloorLevelParameters = FLOOR_LEVELS
-) -> float | None:
-    """Return the rise that brings points (M, 3) onto others (N, 3); None if no level surface of both fixes
-    it.
-
-    first_m : the others. Floors, tables and ceilings meet at one height, walls at all.
-    """
-    p = parameters
-    most = round(p.reach_m / p.layer_m)
-    edges_m = np.array((p.cell_m, p.cell_m, p.layer_m))
-    first, second = (np.floor(points / edges_m).astype(np.int64) for points in (first_m, second_m))
-    columns = [cells[:, :2] @ (1 << 20, 1) for cells in (first, second)]
-    shared = np.intersect1d(*columns)
-    if not len(shared):
-        return None
-    lowest = min(first[:, 2].min(), second[:, 2].min()) - most
-    layers = int(max(first[:, 2].max(), second[:, 2].max()) - lowest) + most + 1
-    full = np.zeros((2, len(shared), layers), np.bool_)
-    for cloud, cells, column in zip(full, (first, second), columns, strict=True):
-        both = np.isin(column, shared)
-        cloud[np.searchsorted(shared, column[both]), cells[both, 2] - lowest] = True
-    # A wall meets itself at any height, in as many layers as it is high.
-    full = full[:, full.sum(axis=2).max(axis=0) <= p.thin]
-    inner = full[1, :, most:-most]
-    meet = np.array(
-        [(full[0, :, k : k + inner.shape[1]] & inner).sum() for k in range(2 * most + 1)], np.float64
-    )
-    best = int(np.argmax(meet))
-    if not p.beside <= best < len(meet) - p.beside:
-        return None
-    if meet[best] < p.stands_out * max(meet[best - p.beside], meet[best + p.beside], 1.0):
-        return None
-    before, peak, after = meet[best - 1 : best + 2]
-    between = 0.5 * (before - after) / min(before - 2.0 * peak + after, -1.0)
-    return float((best - most + between) * p.layer_m)
 
 
 def floors_apart_m(heights_m: F64, above_floor_m: F64) -> float | None:
@@ -437,9 +345,12 @@ def floors_apart_m(heights_m: F64, above_floor_m: F64) -> float | None:
     return float(high_m - low_m)
 
 
-def floor_warning(apart_m: float | None, parameters: FloorLevelParameters = FLOOR_LEVELS) -> str | None:
-    """Return a warning with the spread of the floors of a map and what to do; None if there is none."""
-    if apart_m is None or apart_m < parameters.apart_from_m:
+def floor_warning(apart_m: float | None, obstacle_m: float) -> str | None:
+    """Return a warning with the spread of the floors of a map and what to do; None if there is none.
+
+    obstacle_m : height above the floor from which anything is an obstacle.
+    """
+    if apart_m is None or apart_m < obstacle_m:
         return None
     return (
         f"a floor is level, but what was seen of it lies over {apart_m:.2f} m of height: where it was passed "

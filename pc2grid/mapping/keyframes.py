@@ -144,14 +144,6 @@ class KeyframePoints:
     def __iter__(self) -> Iterator[tuple[int, F32]]:
         return (self[number] for number in range(len(self._scans)))
 
-    def around(self, number: int, most: int, T_session_base: F64) -> F64:
-        """Return the points (M, 3) of a keyframe and `most` on either side, at the poses (N, 4, 4) of their
-        scans."""
-        near = range(max(number - most, 0), min(number + most + 1, len(self._scans)))
-        return np.concatenate(
-            [transform_points(T_session_base[k], m) for k, m in map(self.__getitem__, near)]
-        )
-
     def registered(self, T_session_base: F64, chosen: BoolGrid | None = None) -> PointMap | None:
         """Return the points at the poses (N, 4, 4) of their scans, one a voxel; None if there are none.
 

@@ -9,19 +9,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.clouds.ground import LEVEL
 from pc2grid.errors import TrackingLost
 from pc2grid.estimation.tracker import check_odometry
 from pc2grid.geometry import F64, I64, SE2, wrap_angle
 from pc2grid.mapping.graph import (
-    FLOOR_LEVELS,
-    HeightStep,
     between,
     compose,
     floor_warning,
     floors_apart_m,
     optimised_heights,
-    rise_between,
 )
 from pc2grid.mapping.keyframes import KeyframePoints, Keyframes, Track, grid_of
 from pc2grid.mapping.parts import PARTS, odometry_warnings
@@ -103,7 +99,7 @@ def draw_parts(
     The maps have no name, no sensor and no submaps yet.
     """
     part, T_part_base = _optimised(track.trajectory, closed)
-    floors_m = _level(T_part_base, part, closed, np.array(keyframes.above_floor_m), points)
+    floors_m = _level(T_part_base, part, closed, np.array(keyframes.above_floor_m))
     everywhere = dataclasses.replace(track.trajectory, T_session_base=T_part_base)
     drawn = []
     for number in range(int(part.max(initial=0)) + 1):
@@ -122,7 +118,7 @@ def draw_parts(
         warnings = (
             consistency_warning(consistency, trajectory, with_odometry=odometry.compared > 0),
             precision_warning(precision, trajectory),
-            floor_warning(floors_m[number]),
+            floor_warning(floors_m[number], projection.band_min_m),
         )
         drawn.append(
             SessionMap(
@@ -182,9 +178,7 @@ def _moved_in_plane(T_session_base: F64, tracked: F64, optimised: F64) -> F64:
     return np.array([(SE2(*new) @ SE2(*old).inverse()).lift() for new, old in pairs]) @ T_session_base
 
 
-def _level(
-    T_part_base: F64, part: I64, closed: OptimisedKeyframes, above_floor_m: F64, points: KeyframePoints | None
-) -> list[float | None]:
+def _level(T_part_base: F64, part: I64, closed: OptimisedKeyframes, above_floor_m: F64) -> list[float | None]:
     """Set the heights of the poses (N, 4, 4) of all scans to those above one level floor, in place.
 
     above_floor_m : (K,) of the keyframes, as measured. Returns the spread of the floors of each part. Where
@@ -200,32 +194,12 @@ def _level(
         tracked_m, way = T_part_base[scans, 2, 3], closed.poses[own, :2]
         travel_m = np.append(0.0, np.cumsum(np.hypot(*np.diff(way, axis=0).T)))
         restarts = np.flatnonzero(np.diff(closed.segments[own])) + 1
-        loops = [] if points is None else _height_loops(T_part_base, closed, own, points)
-        heights_m = optimised_heights(tracked_m, travel_m, seen_m, restarts, loops)
+        heights_m = optimised_heights(tracked_m, travel_m, seen_m, restarts)
         apart_m.append(floors_apart_m(heights_m, seen_m))
         raised_m = heights_m - tracked_m
         of_part = np.flatnonzero(part == number)
         T_part_base[of_part, 2, 3] += np.interp(of_part, scans, raised_m - raised_m[0])
     return apart_m
-
-
-def _height_loops(
-    T_part_base: F64, closed: OptimisedKeyframes, own: I64, points: KeyframePoints
-) -> list[HeightStep]:
-    """Return the loops between some keyframes (K,) whose relative height the points of both fix."""
-    number, found = {int(closed.scans[k]): i for i, k in enumerate(own)}, []
-    for loop in closed.loops:
-        if not loop.accepted or loop.older not in number or loop.newer not in number:
-            continue
-        first, second = number[loop.older], number[loop.newer]
-        older_m, newer_m = (
-            points.around(int(own[k]), FLOOR_LEVELS.around, T_part_base) for k in (first, second)
-        )
-        rise_m = rise_between(older_m, newer_m)
-        if rise_m is not None:
-            apart_m = float(T_part_base[loop.newer, 2, 3] - T_part_base[loop.older, 2, 3])
-            found.append(HeightStep(first, second, apart_m + rise_m, LEVEL.seen_m))
-    return found
 
 
 def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
