@@ -448,7 +448,7 @@ class SessionGraph:
                 if part[edge.first] == part[edge.second] == part[own[0]]
             ]
             walls = [self._walls[local_map] for local_map in own]
-            sigma_m[own] = position_sigmas(solution.poses[own], within, walls)[0]
+            sigma_m[own] = position_sigmas(solution.poses[own], within, walls)
         return sigma_m
 
 

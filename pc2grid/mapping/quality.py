@@ -12,22 +12,21 @@ only a large share counts.
 Precision. A corridor that was driven once cannot contradict anything, but the covariance of the pose graph
 grows along it, and shrinks wherever a loop ties it to the rest. The covariance of the poses is the inverse of
 the information matrix (Thrun, Burgard and Fox, "Probabilistic Robotics", chapter 11). It is given relative to
-the well-constrained part of the session, not to the first pose: the error of each position is that which
-remains after the whole has been fitted to the truth, weighted by how well each place is known (the
-S-transformation of Baarda, 1973, as free networks are adjusted in geodesy).
+the whole of the session, not to the first pose: the error of each position is that which remains after the
+whole has been fitted to the truth (the S-transformation of Baarda, 1973, as free networks are adjusted in
+geodesy).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from itertools import chain, tee
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import diags
 from scipy.sparse.linalg import splu
 from scipy.spatial import cKDTree
 
@@ -237,81 +236,42 @@ def _contradictions(
     return tuple(sorted(found, key=lambda one: (-one.length_m, one.from_ns)))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PrecisionParameters:
-    """Numbers of the estimate.
-
-    promised_m : standard deviation of a position from which a place is called uncertain. Beyond it, an answer
-        that is exact to the walls around it is off in the map by more than that as often as one in three.
-    rounds : in which the weights of the places are found; they change little after two.
-    first_information : per square metre and radian, on the first pose, so that the matrix can be inverted.
-        The result does not depend on it.
-    """
-
-    promised_m: float = 0.5
-    rounds: int = 3
-    first_information: float = 1e4
+PROMISED_M = 0.5
+"""Standard deviation of a position from which a place is called uncertain. Beyond it, an answer that is exact
+to the walls around it is off in the map by more than that as often as one in three."""
 
 
-PRECISION = PrecisionParameters()
-
-_TOGETHER = 64
-"""Poses whose covariance is computed at once; memory grows linearly with the length of a session."""
-
-
-def position_sigmas(
-    poses: F64,
-    edges: Sequence[Edge],
-    walls: Sequence[WallDirection] | None = None,
-    parameters: PrecisionParameters = PRECISION,
-) -> tuple[F64, F64]:
-    """Return the standard deviation (N,) of each position in metres, in its least certain direction, and
-    weights (N,).
+def position_sigmas(poses: F64, edges: Sequence[Edge], walls: Sequence[WallDirection] | None = None) -> F64:
+    """Return the standard deviation (N,) of each position in metres, in its least certain direction.
 
     poses : (N, 3) x, y, yaw that agree best with the edges. edges : those that count; they connect all poses.
     walls : of each pose, if the building's axes constrain the headings.
-    weights : of the places, when the map is fitted to the truth.
     """
-    count = len(poses)
-    sigma, weight = np.zeros(count), np.ones(count)
-    if count < 2:
-        return sigma, weight
-    first = np.zeros(3 * count)
-    first[:3] = parameters.first_information
-    information = information_matrix(poses, edges, walls) + diags(first)
-    solve = splu(information.tocsc(), permc_spec="MMD_AT_PLUS_A").solve
-    blocks = _diagonal_blocks(solve, count)
+    if len(poses) < 2:
+        return np.zeros(len(poses))
+    # The first pose is fixed. Which one is does not matter, as the whole is placed afterwards.
+    information = information_matrix(poses, edges, walls).tocsc()[3:, 3:]
+    factors = splu(information, permc_spec="MMD_AT_PLUS_A")
+
+    def with_covariance(columns: F64) -> F64:
+        """Return the product of the covariance (3 N, 3 N) of all poses with columns (3 N, K)."""
+        return np.concatenate((np.zeros((3, columns.shape[1])), factors.solve(columns[3:])))
+
+    blocks = np.empty((len(poses), 2, 2))
+    for k in range(len(poses)):
+        unit = np.zeros((3 * len(poses), 2))
+        unit[3 * k, 0] = unit[3 * k + 1, 1] = 1.0
+        blocks[k] = with_covariance(unit)[3 * k : 3 * k + 2]
+    # The whole is placed by least squares: its motion is `placement` (3, 3 N) times the errors.
     moved = _moved_by_whole(poses)
-    for _ in range(parameters.rounds):
-        # The whole is placed by weighted least squares: its motion is `placement` (3, 3 N) times the errors.
-        normal = np.einsum("n,nai,naj->ij", weight, moved, moved)
-        by_pose = np.zeros((count, 3, 3))
-        by_pose[:, :2] = weight[:, None, None] * moved @ np.linalg.inv(normal)
-        placement = by_pose.reshape(-1, 3)
-        with_errors = solve(placement)
-        of_whole = placement.T @ with_errors
-        across = with_errors.reshape(-1, 3, 3)[:, :2] @ moved.transpose(0, 2, 1)
-        covariance = blocks - across - across.transpose(0, 2, 1)
-        covariance += moved @ of_whole @ moved.transpose(0, 2, 1)
-        sigma = np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
-        weight = 1.0 / (sigma**2 + parameters.promised_m**2)
-    return sigma, weight
-
-
-def _diagonal_blocks(solve: Callable[[F64], F64], count: int) -> F64:
-    """Return the covariance (N, 2, 2) of x and y of each of the poses.
-
-    solve : the product of columns (3 N, K) with the covariance (3 N, 3 N) of all.
-    """
-    blocks = np.empty((count, 2, 2))
-    for begin in range(0, count, _TOGETHER):
-        some = np.arange(begin, min(begin + _TOGETHER, count))
-        rows = (3 * some[:, None] + np.arange(2)).ravel()
-        columns = np.zeros((3 * count, len(rows)))
-        columns[rows, np.arange(len(rows))] = 1.0
-        found = solve(columns)[rows].reshape(len(some), 2, len(some), 2)
-        blocks[some] = found[some - begin, :, some - begin]
-    return blocks
+    by_pose = np.zeros((len(poses), 3, 3))
+    by_pose[:, :2] = moved @ np.linalg.inv(np.einsum("nai,naj->ij", moved, moved))
+    placement = by_pose.reshape(-1, 3)
+    with_errors = with_covariance(placement)
+    across = with_errors.reshape(-1, 3, 3)[:, :2] @ moved.transpose(0, 2, 1)
+    covariance = blocks - across - across.transpose(0, 2, 1)
+    covariance += moved @ (placement.T @ with_errors) @ moved.transpose(0, 2, 1)
+    return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
 
 
 def _moved_by_whole(poses: F64) -> F64:
@@ -323,9 +283,7 @@ def _moved_by_whole(poses: F64) -> F64:
     return moved
 
 
-def precision_of(
-    trajectory: Trajectory, scans: I64, sigma_m: F64, parameters: PrecisionParameters = PRECISION
-) -> Precision:
+def precision_of(trajectory: Trajectory, scans: I64, sigma_m: F64) -> Precision:
     """Return the precision of a map, from the standard deviations (N,) at some of its scans (N,), in their
     order."""
     if not len(scans):
@@ -334,7 +292,7 @@ def precision_of(
     # Every local map stands for the travel up to the middle between it and the next.
     middles = (scans[1:] + scans[:-1]) // 2
     begins, ends = np.append(0, middles), np.append(middles, len(trajectory) - 1)
-    edges = np.flatnonzero(np.diff(np.concatenate(([False], sigma_m > parameters.promised_m, [False]))))
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], sigma_m > PROMISED_M, [False]))))
     found = []
     for begin, end in edges.reshape(-1, 2).tolist():
         first, last = int(begins[begin]), int(ends[end - 1])

@@ -26,7 +26,7 @@ from pc2grid.io.maps import is_map_file
 from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import stamp_text, write_trajectory
 from pc2grid.mapping.drawn import is_drawn_map
-from pc2grid.mapping.quality import PRECISION
+from pc2grid.mapping.quality import PROMISED_M
 from pc2grid.matching.score import Fit
 from pc2grid.model import SENSOR_MODELS, Trajectory
 from pc2grid.observer import Observer, TimeSpan
@@ -346,7 +346,7 @@ def map_sigma_m(answer: Answer, database: SubmapDatabase) -> float | None:
 
 def _about_map(sigma_m: float | None) -> str:
     """Return a line about the map where it is not known well enough to rely on; else nothing."""
-    if sigma_m is None or sigma_m <= PRECISION.promised_m:
+    if sigma_m is None or sigma_m <= PROMISED_M:
         return ""
     return (
         f"\n  the map itself may be off by {sigma_m:.1f} m here (standard deviation), see `pc2grid db info`"

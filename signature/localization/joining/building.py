@@ -296,7 +296,7 @@ def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision 
         Edge(a, b, pose_at(nodes, a).inverse() @ pose_at(nodes, b), information)
         for a, b, information in measured
     ]
-    variance = float(np.square(position_sigmas(nodes, edges)[0]).mean())
+    variance = float(np.square(position_sigmas(nodes, edges)).mean())
     known = float(np.square(np.maximum(precision.sigma_m, _LEAST_SIGMA_M)).mean())
     return SessionBody(
         nodes, tuple(replace(edge, information=variance / known * edge.information) for edge in edges)

@@ -192,8 +192,8 @@ def test_a_wing_at_another_angle_keeps_it() -> None:
 def test_a_heading_that_the_axes_hold_is_stated_to_be_more_precise() -> None:
     truth = corridor(TURNING)
     _, edges = tracked(truth, np.zeros(len(truth) - 1))
-    alone, _ = position_sigmas(truth, edges)
-    held, _ = position_sigmas(truth, edges, walls_seen(truth, 0.0))
+    alone = position_sigmas(truth, edges)
+    held = position_sigmas(truth, edges, walls_seen(truth, 0.0))
     assert held.max() < 0.7 * alone.max()
 
 

@@ -152,20 +152,17 @@ def edges(truth: F64, *, loops: bool = True, rng: np.random.Generator | None = N
     return found
 
 
-def placed(poses: F64, truth: F64, weight: F64) -> F64:
-    """Errors (N, 2) of positions after the weighted least squares placement on the truth."""
-    share = weight / weight.sum()
-    a, b = poses[:, :2] - share @ poses[:, :2], truth[:, :2] - share @ truth[:, :2]
-    turn = np.arctan2(share @ (a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]), share @ (a * b).sum(axis=1))
-    return SE2(0.0, 0.0, float(turn)).apply(a) - b
+def placed(poses: F64, truth: F64) -> F64:
+    """Errors (N, 2) of positions after the least squares placement on the truth."""
+    return SE2.fit(poses[:, :2], truth[:, :2]).apply(poses[:, :2]) - truth[:, :2]
 
 
 @pytest.mark.parametrize("loops", [True, False])
 def test_repeated_drives_scatter_as_stated(loops: bool) -> None:
     rng = np.random.default_rng(5)
-    sigma, weight = position_sigmas(TRUTH, edges(TRUTH, loops=loops))
+    sigma = position_sigmas(TRUTH, edges(TRUTH, loops=loops))
     errors = np.array(
-        [placed(optimise(TRUTH, edges(TRUTH, loops=loops, rng=rng)).poses, TRUTH, weight) for _ in range(80)]
+        [placed(optimise(TRUTH, edges(TRUTH, loops=loops, rng=rng)).poses, TRUTH) for _ in range(80)]
     )
     scatter = np.sqrt([np.linalg.eigvalsh(np.cov(errors[:, k].T))[-1] for k in range(len(TRUTH))])
     assert np.all(np.abs(np.log(scatter / sigma)) < np.log(1.5))
@@ -173,13 +170,13 @@ def test_repeated_drives_scatter_as_stated(loops: bool) -> None:
 
 
 def test_loops_make_places_surer_and_the_end_of_a_wing_is_known_least() -> None:
-    sigma, _ = position_sigmas(TRUTH, edges(TRUTH))
+    sigma = position_sigmas(TRUTH, edges(TRUTH))
     assert np.all(np.diff(sigma[WING]) > 0.0)
     assert sigma[-1] > 3.0 * np.median(sigma[: 2 * ROUND])
-    without, _ = position_sigmas(TRUTH, edges(TRUTH, loops=False))
+    without = position_sigmas(TRUTH, edges(TRUTH, loops=False))
     assert sigma.max() < 0.7 * without.max()
     back = Edge(0, len(TRUTH) - 1, SE2(*TRUTH[0]).inverse() @ SE2(*TRUTH[-1]), LOOP, loop=True)
-    tied, _ = position_sigmas(TRUTH, [*edges(TRUTH), back])
+    tied = position_sigmas(TRUTH, [*edges(TRUTH), back])
     assert tied[-1] < 0.5 * sigma[-1]
 
 
