@@ -21,8 +21,8 @@ import numpy as np
 
 from pc2grid.errors import LogError, MapFileError
 from pc2grid.geometry import F64, I64
-from pc2grid.io.messages.clouds import HEADER_BYTES, parser
-from pc2grid.io.messages.types import Header
+from pc2grid.io.messages.clouds import parser
+from pc2grid.io.messages.types import HEADER_BYTES, Header
 from pc2grid.io.sensors.pointcloud2 import decode
 from pc2grid.io.source import LFS_HINT, is_lfs_pointer
 from pc2grid.settings import ReadConfig

@@ -148,7 +148,6 @@ def write_graph(path: str | Path, graph: nx.Graph) -> None:
 
 # --- recordings ---------------------------------------------------------------------------------------
 
-_FARTHEST_DEPTH_M = 65.0  # an image of 16UC1 ends at 65.535 m
 _MARKER_TYPES = {"lines": 5, "spheres": 7}  # LINE_LIST, SPHERE_LIST of visualization_msgs/Marker
 
 
@@ -252,11 +251,10 @@ class LogWriter:
         self.write(topic, stamp_ns, new("sensor_msgs/LaserScan", header(stamp_ns, frame), *scan))
 
     def depth_image(self, topic: str, stamp_ns: int, frame: str, depth_m: ArrayLike) -> None:
-        """Write a sensor_msgs/Image of encoding 16UC1: millimetres, 0 without a return or beyond 65 m."""
-        depth = np.asarray(depth_m, dtype=np.float64)
-        millimetres = np.zeros(depth.shape, dtype=np.uint16)
-        good = np.isfinite(depth) & (depth > 0) & (depth < _FARTHEST_DEPTH_M)
-        millimetres[good] = np.rint(depth[good] * 1000.0).astype(np.uint16)
+        """Write a sensor_msgs/Image of encoding 16UC1: millimetres; 0: no return, or from 65.535 m on."""
+        depth = np.rint(np.asarray(depth_m, dtype=np.float64) * 1000.0)
+        seen = (depth > 0) & (depth < np.iinfo(np.uint16).max)
+        millimetres = np.where(seen, depth, 0)
         height, width = depth.shape
         image = (height, width, "16UC1", 0, 2 * width, _bytes_of(millimetres, "<u2"))
         self.write(topic, stamp_ns, new("sensor_msgs/Image", header(stamp_ns, frame), *image))

@@ -27,21 +27,19 @@ from typing_extensions import Self
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import F64, BoolGrid, hand_over
 from pc2grid.io.atomic import replace_file
-from pc2grid.io.messages.types import EDGES_M, FARTHEST_M
+from pc2grid.io.messages.types import EDGES_M, FARTHEST_M, HEADER_BYTES
 from pc2grid.io.sensors.depth import MAGIC as PNG_MAGIC, read_header
 from pc2grid.io.source import LFS_HINT, is_lfs_pointer
 from pc2grid.model import FREE, FREE_BELOW, OCCUPIED, OCCUPIED_FROM, UNKNOWN, MapOf, OccupancyGrid
 
 MapMode = Literal["trinary", "scale", "raw"]
 
-_MAX_YAML_BYTES = 65_536
 # Defaults of nav2_map_server for a written map. 0.196 and not 0.25: an unknown pixel, grey 205, has the
 # occupancy 0.196078, which a free_thresh of 0.25 would read as free.
 _OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
 _FREE_GREY, _UNKNOWN_GREY, _OCCUPIED_GREY = 254, 205, 0
 # Two roundings, of a cell's edge and of the product, are at most so many units in the last place.
 _DIGITS, _ROUNDED = 12, 2
-_LEAST_YAW_RAD = 1e-9
 _ROUNDED_CELLS = 1e-6  # a corner of a rotated map so near to a corner of a cell is there
 # Half a corridor is wider than this, half a wall is not. In eight real maps a tenth of the floor is .8 m and
 # more from all else, and nine tenths of the walls, up to .4 m thick, are .4 m and less from it.
@@ -92,7 +90,7 @@ def load_map(yaml_path: str | Path, warn: Callable[[str], object] = _log.warning
         warn(f"{yaml_path}: {sentence}")
     x_m, y_m, yaw_rad = keys.origin
     grid = OccupancyGrid(cells=hand_over(cells), resolution_m=keys.resolution, origin_m=(x_m, y_m))
-    if abs(yaw_rad) <= _LEAST_YAW_RAD:
+    if abs(yaw_rad) * max(cells.shape) <= _ROUNDED_CELLS:
         return grid
     warn(
         f"{yaml_path}: the origin is rotated by {yaw_rad:g} rad, which nav2's costmap ignores: the map is "
@@ -340,13 +338,13 @@ class _Keys(BaseModel):
 def _read_yaml(path: Path) -> _Keys:
     try:
         with path.open("rb") as file:
-            text = file.read(_MAX_YAML_BYTES + 1)
+            text = file.read(HEADER_BYTES + 1)
     except OSError as error:
         raise MapFileError(f"{path}: {error.strerror}") from error
     if is_lfs_pointer(text):
         raise MapFileError(f"{path}: a Git LFS pointer to a map.yaml", hint=LFS_HINT)
-    if len(text) > _MAX_YAML_BYTES:
-        raise MapFileError(f"{path}: larger than {_MAX_YAML_BYTES} bytes: not a map.yaml")
+    if len(text) > HEADER_BYTES:
+        raise MapFileError(f"{path}: larger than {HEADER_BYTES} bytes: not a map.yaml")
     try:
         return _Keys.model_validate(yaml.safe_load(text))
     except ValidationError as error:

@@ -33,7 +33,7 @@ from pc2grid.io.robots import (
 from pc2grid.io.sensors.decode import ScanDecoder
 from pc2grid.io.sensors.depth import holds_depths
 from pc2grid.io.source import GAP_NS, Choice, MessageSource, TopicInfo
-from pc2grid.io.topics import FIRST, First, FirstMessages, delay_ns
+from pc2grid.io.topics import First, FirstMessages, delay_ns
 from pc2grid.model import SENSOR_MODELS, SensorKind
 from pc2grid.settings import ReadConfig
 
@@ -132,10 +132,6 @@ def published_once(topic: TopicInfo) -> bool:
 
 # --- the sensors --------------------------------------------------------------------------------------
 
-FIRST_SCANS = 20
-"""So many scans of a topic are looked at, so that each of several sensors on it is among them; nor are there
-more sensors beside the first one, against hostile files. By hand."""
-
 
 class Sensor(NamedTuple):
     """The scans of one topic and frame.
@@ -222,9 +218,9 @@ def find_sensors(config: ReadConfig, first: FirstMessages) -> FoundSensors:
     frames = [str(s.frame) for s in sensors if s.topic == lead.topic and not s.silent]
     if len(frames) > 1:
         reason += f", of {len(frames)} sensors by their frames: {', '.join(frames)}"
-    left_out = {(t, scan.frame) for t in found for scan in first.of(t, FIRST_SCANS)} - used
-    scans = [s for s in first.of(lead.topic, FIRST_SCANS) if s.frame == lead.frame]
-    return FoundSensors(tuple(sensors), frozenset(left_out), tuple(scans[:FIRST]), reason)
+    left_out = {(t, scan.frame) for t in found for scan in first.of(t)} - used
+    scans = [s for s in first.of(lead.topic) if s.frame == lead.frame]
+    return FoundSensors(tuple(sensors), frozenset(left_out), tuple(scans), reason)
 
 
 # --- the topics -------------------------------------------------------------------------------------------
@@ -317,7 +313,7 @@ def _of_frames(sensor: Sensor, config: ReadConfig, first: FirstMessages) -> list
 
     sensor : that of the topic, as long as its frame is not known.
     """
-    scans = first.of(sensor.topic, FIRST_SCANS)
+    scans = first.of(sensor.topic)
     names = list(dict.fromkeys(scan.frame for scan in scans))
     if len(names) < 2:
         return [sensor._replace(frame=name) for name in names] or [sensor]
@@ -347,7 +343,7 @@ def _shown(sensor: Sensor, config: ReadConfig, name: str, scans: Sequence[First]
 
 def _calibration(sensor: Sensor, frame: str, first: FirstMessages) -> CameraInfo | None:
     """Return the first calibration in the frame of the images, else the first one."""
-    infos = [] if sensor.camera is None else first.of(sensor.camera, FIRST_SCANS)
+    infos = [] if sensor.camera is None else first.of(sensor.camera)
     return next((info.content for info in infos if info.frame == frame), sensor.calibration)
 
 

@@ -24,6 +24,7 @@ from pc2grid.io.frames import FrameTree
 from pc2grid.io.map_pose import BelievedPose, MapPose, last_map_pose
 from pc2grid.io.plan import Plan, make_plan
 from pc2grid.io.source import (
+    GAP_NS,
     LFS_HINT,
     SQLITE,
     Choice,
@@ -39,9 +40,6 @@ from pc2grid.io.source import (
 from pc2grid.io.stream import LogPart, Stream, StreamParameters
 from pc2grid.model import ReadReport, Scan
 from pc2grid.settings import ReadConfig
-
-_STEP_NS = 1_000_000_000
-"""The last message is searched for in steps that begin with this; chosen by hand: a scanner is faster."""
 
 
 def open_log(path: str | Path, config: ReadConfig | None = None, *, recover: bool = False) -> Log:
@@ -253,13 +251,13 @@ def _last_ns(source: MessageSource, names: Collection[str], first_ns: int) -> in
     """Return the last log time of messages of these topics, searched from the end without reading all of
     them."""
     low_ns, high_ns = first_ns, source.info.end_ns + 1  # the last one is not before low, and before high
-    step_ns = _STEP_NS
-    while high_ns - low_ns > _STEP_NS:
+    step_ns = GAP_NS
+    while high_ns - low_ns > GAP_NS:
         middle_ns = max(high_ns - step_ns, low_ns)
         if next(iter(source.messages(names, middle_ns, high_ns)), None) is None:
             high_ns, step_ns = middle_ns, 2 * step_ns
         else:
-            low_ns, step_ns = middle_ns, _STEP_NS
+            low_ns, step_ns = middle_ns, GAP_NS
     times_ns = (message.log_time_ns for message in source.messages(names, low_ns, high_ns))
     return max(times_ns, default=first_ns)
 

@@ -29,11 +29,11 @@ from pc2grid.errors import (
 from pc2grid.geometry import F32, F64, invert_pose
 from pc2grid.io.frames import PARAMETERS as FRAMES, Attitude, FrameTree, PoseTrack
 from pc2grid.io.messages.types import CameraInfo, Imu, Odometry, ScanMessage, Transform
-from pc2grid.io.plan import FIRST_SCANS, Plan, Sensor, registered
+from pc2grid.io.plan import Plan, Sensor, registered
 from pc2grid.io.sensors.decode import MOST_TURNS, ScanDecoder
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
 from pc2grid.io.source import GAP_NS, LIDAR_PERIOD_NS, MessageSource, RawMessage, Tally, TopicInfo
-from pc2grid.io.topics import decoder_for, tolerant
+from pc2grid.io.topics import FIRST, decoder_for, tolerant
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ReadConfig
 
@@ -51,7 +51,7 @@ class StreamParameters:
 
     wait_ns: int = 500_000_000
     max_waiting: int = 256
-    max_waiting_bytes: int = 128_000_000
+    max_waiting_bytes: int = 256_000_000
     patience: int = 10
     max_bad_share: float = 0.1
     eager: bool = False
@@ -202,8 +202,8 @@ class Stream:
         """Keep a scan for the first sensor's; if that has none for long, this sensor takes its place."""
         sensor = scan.sensor
         if sensor not in self._further:
-            if len(self._further) >= FIRST_SCANS:
-                raise PointCloudError(f"scans in more than {FIRST_SCANS + 1} frames")
+            if len(self._further) >= FIRST:  # against hostile files
+                raise PointCloudError(f"scans in more than {FIRST + 1} frames")
             name = self._add(sensor).name
             if sensor not in ((s.topic, s.frame) for s in self._plan.sensors):
                 self._source.tally.warn(f"{name}: scans that began later are of a further sensor")

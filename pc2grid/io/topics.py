@@ -246,8 +246,9 @@ def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
     return ros.decoder_for(channel)
 
 
-FIRST = 5
-"""So many messages of a topic are looked at: a few may have a stray time, or be unreadable. By hand."""
+FIRST = 20
+"""So many messages of a topic are looked at: a few may have a stray time, or be unreadable, and each of
+several sensors on it must be among them. By hand."""
 
 
 class First(NamedTuple):
@@ -271,19 +272,19 @@ class FirstMessages:
     def __init__(self, source: MessageSource) -> None:
         self.topics, self.tally = source.info.topics, source.tally
         self._source = source
-        self._read: dict[tuple[TopicInfo, int], list[First]] = {}
+        self._read: dict[TopicInfo, list[First]] = {}
 
-    def of(self, topic: TopicInfo, count: int = FIRST) -> list[First]:
+    def of(self, topic: TopicInfo) -> list[First]:
         """Return the first messages of a topic, without those that cannot be decoded.
 
         Raises UnsupportedSchema.
         """
-        if (topic, count) not in self._read:
+        if topic not in self._read:
             decode = decoder_for(topic)
             of_topic = (m for m in self._source.messages({topic.topic}) if m.channel == topic)
-            read = (First(m.log_time_ns, tolerant(decode, m.data)) for m in itertools.islice(of_topic, count))
-            self._read[topic, count] = [message for message in read if message.content is not None]
-        return self._read[topic, count]
+            read = (First(m.log_time_ns, tolerant(decode, m.data)) for m in itertools.islice(of_topic, FIRST))
+            self._read[topic] = [message for message in read if message.content is not None]
+        return self._read[topic]
 
     def if_known(self, topic: TopicInfo) -> list[First]:
         """Return the first messages of a topic; none if they are of a type that cannot be decoded."""

@@ -22,9 +22,6 @@ from pc2grid_cli import console, options, output
 if TYPE_CHECKING:
     from pc2grid.mapping.drawn import DrawnMap
 
-_TRIED_SCANS = 10
-"""So many scans are read, to say what convert would say of them."""
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ChosenTopics(Choice):
@@ -119,6 +116,7 @@ def describe(
     Raises LogError if the file cannot be opened.
     """
     from pc2grid.io.recording import open_log
+    from pc2grid.io.stream import PARAMETERS
 
     config = options.Reading(topic=topic, assignments=assignments).settings()
     with open_log(path, config.read, recover=recover) as log:
@@ -126,7 +124,7 @@ def describe(
         problem: str | None = None
         try:
             choice = _chosen(log.choose(), log.info)
-            for _ in itertools.islice(log.scans(), _TRIED_SCANS):
+            for _ in itertools.islice(log.scans(), PARAMETERS.patience):  # what convert would say of them
                 pass
         except Pc2GridError as error:
             choice, problem = None, error.in_short

@@ -22,7 +22,6 @@ import socket
 import sys
 import tempfile
 import threading
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -38,7 +37,7 @@ from pc2grid.errors import ConfigError, LogTruncated, OutputError, Pc2GridError
 from pc2grid.geometry import SE2
 from pc2grid.io.live.live_log import open_live
 from pc2grid.model import Health, RegisteredScan
-from pc2grid.observer import Observer
+from pc2grid.observer import Observer, seldom
 from pc2grid_cli import console, known_pose, options
 from pc2grid_cli.console import json_text
 from pc2grid_cli.watch import feed
@@ -169,13 +168,11 @@ class _Shares(Observer):
     """Publishes the share of the recording that is done."""
 
     def __init__(self, events: Events) -> None:
-        self._events, self._told_s = events, 0.0
+        self._publish = seldom(lambda share: events.publish("share", {"share": round(share, 4)}))
 
     def on_progress(self, share: float) -> None:
         """See `Observer.on_progress`."""
-        if time.monotonic() - self._told_s >= _SENT_EVERY_S:
-            self._told_s = time.monotonic()
-            self._events.publish("share", {"share": round(share, 4)})
+        self._publish(share)
 
 
 def live_page(database: SubmapDatabase, **answer: Any) -> bytes:
@@ -215,8 +212,6 @@ _MOST_WAITING = 1000
 """Events that wait for a page that does not read them; older ones are dropped."""
 _MOST_SCANS = 4000
 """Scans of the path so far, for pages that come later; of a longer path every second one is left out."""
-_SENT_EVERY_S = 0.1
-"""Scans are sent together, and shares of the work, so often; more could not be seen."""
 
 
 class Events:
@@ -302,8 +297,10 @@ class Progress:
 
     events: Events
     _waiting: list[list[float]] = field(default_factory=list)
-    _sent_s: float = 0.0
     _base: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        self._send = seldom(lambda share: self.flush())
 
     def add(self, registered: RegisteredScan | None) -> None:
         """Add the next scan; None: what follows does not go on from what was before."""
@@ -312,8 +309,7 @@ class Progress:
             return
         self._base = _planar(SE2.from_matrix(registered.T_session_base))
         self._waiting.append([*self._base, int(registered.health is Health.LOST)])
-        if time.monotonic() - self._sent_s >= _SENT_EVERY_S:
-            self.flush()
+        self._send(0.0)
 
     def tell(self, answer: Answer) -> None:
         """Publish an answer; if it is not located, with the best place all the same."""
@@ -335,7 +331,7 @@ class Progress:
         """Send the scans that wait."""
         if self._waiting:
             self.events.publish("scans", self._waiting)
-        self._waiting, self._sent_s = [], time.monotonic()
+        self._waiting = []
 
 
 def _planar(base: SE2) -> tuple[float, float, float]:

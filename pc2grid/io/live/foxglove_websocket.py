@@ -37,16 +37,14 @@ _SENT_HEAD = struct.Struct("<BI")  # kind, channel
 class ConnectionParameters:
     """How a connection is made and kept; chosen by hand.
 
-    open_s : time for one attempt. first_s : time in which the first connection must succeed.
-    least_pause_s, most_pause_s : between two attempts; the pause doubles each time.
+    open_s : time for one attempt, in which the first connection must succeed, and longest pause between two.
+    least_pause_s : between two attempts; the pause doubles each time.
     ping_s : a connection on which nothing answers for so long is made again.
     most_message_bytes : a larger message ends the connection.
     """
 
     open_s: float = 5.0
-    first_s: float = 5.0
     least_pause_s: float = 0.1
-    most_pause_s: float = 5.0
     ping_s: float = 10.0
     most_message_bytes: int = 256 << 20
 
@@ -96,7 +94,7 @@ class _Link:
         self._thread.join(timeout=self._parameters.open_s)
 
     def _connect_first(self) -> ClientConnection:
-        end_s = time.monotonic() + self._parameters.first_s
+        end_s = time.monotonic() + self._parameters.open_s
         while True:
             try:
                 return self._connect()
@@ -143,7 +141,7 @@ class _Link:
                     connection = self._connection = self._connect()
                 except LiveError:
                     self._closing.wait(pause_s)
-                    pause_s = min(2 * pause_s, self._parameters.most_pause_s)
+                    pause_s = min(2 * pause_s, self._parameters.open_s)
                     continue
                 self._changed(True)
             pause_s = self._parameters.least_pause_s

@@ -23,8 +23,8 @@ from pc2grid.io.frames import PARAMETERS as FRAMES, FrameTree
 from pc2grid.io.map_pose import BelievedPose
 from pc2grid.io.plan import Plan, published_once
 from pc2grid.io.recording import ScanSource, open_log
-from pc2grid.io.source import LogInfo, RawMessage, Tally, TopicInfo, guarded_stream
-from pc2grid.io.stream import Poses, Stream, StreamParameters
+from pc2grid.io.source import GAP_NS, LogInfo, RawMessage, Tally, TopicInfo, guarded_stream
+from pc2grid.io.stream import PARAMETERS, Poses, Stream, StreamParameters
 from pc2grid.libraries import require
 from pc2grid.model import Scan
 from pc2grid.settings import ReadConfig
@@ -51,16 +51,14 @@ class LiveParameters:
     catch_up_s : time for what waited during the preparations to be used up, before scans are dropped.
     most_bytes, most_messages : of all messages that wait; beyond, the oldest are dropped.
     poll_s : longest wait for a message. silent_s : time after which a topic without messages is named.
-    clock_scans : so many scans in a row with stamps that go back or jump mean that the clock was set.
     """
 
     most_lag_s: float = 0.1
     catch_up_s: float = 10.0
-    most_bytes: int = 256_000_000
+    most_bytes: int = PARAMETERS.max_waiting_bytes
     most_messages: int = 100_000
     poll_s: float = 0.2
-    silent_s: float = 5.0
-    clock_scans: int = 5
+    silent_s: float = GAP_NS * 1e-9
 
 
 LIVE = LiveParameters()
@@ -435,7 +433,7 @@ class LiveLog(ScanSource):
                 last_scan_ns = message.log_time_ns
                 self._newest = max(self._newest, (message.log_time_ns, arrived.arrived_s))
             yield from self._used(stream, stream.take(message))
-            if stream.stamps.out_of_time >= self._parameters.clock_scans:
+            if stream.stamps.out_of_time >= STREAM.patience:  # of scans in a row
                 self.tally.tell("the clock of the scans was set; the search starts again", again=True)
                 self._frames.forget_moving()
                 break

@@ -31,7 +31,7 @@ import numpy as np
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
 from pc2grid.geometry import F64, quat_xyzw_from_pose
-from pc2grid.io.messages.types import Bytes, Header, Odometry, PointCloud2
+from pc2grid.io.messages.types import HEADER_BYTES, Bytes, Header, Odometry, PointCloud2
 from pc2grid.io.source import TopicInfo
 
 SENSOR_FRAME, ODOMETRY_FRAME = "sensor", "odom"
@@ -70,8 +70,6 @@ def _decode_pose(data: Any) -> Odometry:
 Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count
 Columns = list[tuple[str, int, int]]  # name, datatype, count
 
-HEADER_BYTES = 1 << 16
-"""No header of a cloud is longer."""
 _SIZES = (0, 1, 1, 2, 2, 4, 4, 4, 8, 8, 8)  # bytes of the datatypes of sensor_msgs/PointField; 0: a list
 _PCD_TYPES = {"I1": 1, "U1": 2, "I2": 3, "U2": 4, "I4": 5, "U4": 6, "F4": 7, "F8": 8, "I8": 9, "U8": 10}
 _PLY_TYPES = {

@@ -19,7 +19,6 @@ from mcap.records import Schema
 
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
 from pc2grid.io.messages.types import (
-    MOST_BEAMS,
     CameraInfo,
     CompressedImage,
     Header,
@@ -131,9 +130,13 @@ def _size(value: Any) -> int:
     return int(value)
 
 
+def _float(value: Any) -> float:
+    """Return a number as a float. JSON has no NaN; writers use null instead."""
+    return math.nan if value is None else float(value)
+
+
 def _floats(values: Sequence[Any]) -> tuple[float, ...]:
-    """Return numbers as floats. JSON has no NaN; writers use null instead."""
-    return tuple(math.nan if v is None else float(v) for v in values)
+    return tuple(map(_float, values))
 
 
 def _pose(pose: Any) -> Seven | None:
@@ -172,9 +175,7 @@ def _datatype(value: Any) -> int:
 
 
 def _laser_scan(m: Any) -> LaserScan:
-    if len(m.ranges) > MOST_BEAMS:
-        raise LimitExceeded(f"a scan of {len(m.ranges)} beams; the limit is {MOST_BEAMS}")
-    ranges = np.array(_floats(m.ranges))
+    ranges = np.fromiter(map(_float, m.ranges), np.float64, len(m.ranges))
     start, end = float(m.start_angle), float(m.end_angle)
     step = (end - start) / (len(ranges) - 1) if len(ranges) > 1 else 0.0
     pose = _pose(getattr(m, "pose", None))

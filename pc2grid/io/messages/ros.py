@@ -23,6 +23,7 @@ from rosbags.typesys.store import Typestore
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
 from pc2grid.io.messages.types import (
+    HEADER_BYTES,
     Bytes,
     CameraInfo,
     CompressedImage,
@@ -40,10 +41,8 @@ from pc2grid.io.messages.types import (
 from pc2grid.io.source import TopicInfo
 
 _MOST_FIELDS = 1000
-"""Fields of a message and of a cloud that no real message reaches. The known types flatten to some tens of
-fields; the limit bounds the time for a crafted text to half a second."""
-_MOST_DISTORTION = 100
-"""Numbers of distortion that no real camera reaches."""
+"""Fields of a message and of a cloud, and numbers of distortion, that no real message reaches. The known
+types flatten to some tens of fields; the limit bounds the time for a crafted text to half a second."""
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
@@ -137,7 +136,7 @@ def _compressed_image(m: Any) -> CompressedImage:
 
 
 def _camera_info(m: Any) -> CameraInfo:
-    if len(m.d) > _MOST_DISTORTION:
+    if len(m.d) > _MOST_FIELDS:
         raise PointCloudError(f"a CameraInfo with {len(m.d)} numbers of distortion")
     d, k, p = (tuple(values.tolist()) for values in (m.d, m.k, m.p))
     return CameraInfo(_header(m.header), m.height, m.width, m.distortion_model, d, k, p)
@@ -228,8 +227,6 @@ _TF = (
 )  # rosbags knows it of ROS 2 only
 
 
-# The published definitions of the known types, with all comments, have up to 15,000 characters.
-_MOST_CHARACTERS = 1 << 16
 _NAME = re.compile(r"[A-Za-z]\w*", re.ASCII)
 
 
@@ -260,7 +257,7 @@ def _of_ros(encoding: str) -> Typesdict:
 def _parsed(name: str, encoding: str, text: str) -> Typesdict:
     """Parse the types in a definition in the .msg language, of which `name` is the first. Raises
     ValueError."""
-    if len(text) > _MOST_CHARACTERS:
+    if len(text) > HEADER_BYTES:
         raise ValueError(f"{name}: a definition of {len(text)} characters")
     try:
         ruled = re.sub(r"^=+[ \t]*$", "=" * 80, text, flags=re.MULTILINE)

@@ -11,13 +11,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-# No laser has so many beams in one scan; a message that claims more is refused before memory is allocated.
-MOST_BEAMS = 1_000_000
-
 Bytes = memoryview | bytes
 Seven = tuple[float, float, float, float, float, float, float]
 """A pose as messages hold it: x y z in metres, then the quaternion x y z w."""
 
+HEADER_BYTES = 1 << 16
+"""No text that describes data is longer: the header of a cloud, a map.yaml, the definition of a message (of
+those known up to 15,000 characters, with all comments)."""
 # Coordinates beyond this are a mistake: it is twice the circumference of the earth, and floats are far from
 # overflowing.
 FARTHEST_M = 1e8

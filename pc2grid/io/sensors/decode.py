@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
 from pc2grid.geometry import F32, F64, I64, pose_from_xyz_quat
-from pc2grid.io.messages.types import MOST_BEAMS, CameraInfo, LaserScan, ScanMessage, valid_pose
+from pc2grid.io.messages.types import CameraInfo, LaserScan, ScanMessage, valid_pose
 from pc2grid.io.sensors import depth, pointcloud2
 from pc2grid.io.sensors.depth import FloorDepth
 from pc2grid.io.sensors.pointcloud2 import FARTHEST_HALF_M, LONGEST_SWEEP_S, NO_RETURN, Points, check_metres
@@ -160,7 +160,6 @@ def _to_base(xyz: F32 | F64, T_base_sensor: F64) -> F32:
 # Drivers round the angles: so many ranges more or less than the angles make are accepted. Chosen by hand.
 _EXTRA_BEAMS, _EXTRA_SHARE = 2.0, 0.02
 MOST_TURNS = 1.1  # that one scan covers, or lasts: stamps jitter
-_LEAST_INCREMENT_S = 1e-9  # a smaller time_increment is one that was not set
 
 
 def decode(scan: LaserScan, *, max_points: int = 20_000_000, longest_s: float = LONGEST_SWEEP_S) -> Points:
@@ -174,7 +173,7 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000, longest_s: float = 
     Raises PointCloudError for angles that no laser has.
     """
     count = len(scan.ranges)
-    notes = _check_beams(scan, min(max_points, MOST_BEAMS))
+    notes = _check_beams(scan, max_points)
     ranges = scan.ranges.astype(np.float32)
     returned = np.isfinite(ranges) & (ranges > 0)
     largest = _largest(ranges[returned])
@@ -187,7 +186,7 @@ def decode(scan: LaserScan, *, max_points: int = 20_000_000, longest_s: float = 
     points = np.zeros((len(kept), 3), dtype=np.float32)
     points[:, :2] = kept[:, None] * _directions(count, scan.angle_min, scan.angle_increment)[keep]
     offsets = None
-    if math.isfinite(scan.time_increment) and abs(scan.time_increment) > _LEAST_INCREMENT_S:
+    if math.isfinite(scan.time_increment) and scan.time_increment:
         if count * abs(scan.time_increment) <= longest_s:
             offsets = (np.flatnonzero(keep) * scan.time_increment).astype(np.float32)
         else:

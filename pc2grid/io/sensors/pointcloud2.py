@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pc2grid.errors import LimitExceeded, PointCloudError
 from pc2grid.geometry import F32, F64
 from pc2grid.io.messages.types import PointCloud2
+from pc2grid.io.source import GAP_NS
 
 # sensor_msgs/PointField; 9 to 11 are PCL's, absent from the definition (ros2/common_interfaces#300).
 _DATATYPES = {
@@ -39,7 +40,7 @@ LONGEST_SWEEP_S = 2.0
 _SWEEP_S = (2e-3, LONGEST_SWEEP_S)
 FARTHEST_HALF_M = 100.0  # half of the returns of a scan in a building are nearer; chosen by hand
 NO_RETURN = "nothing came back (0, NaN or inf)"
-_NEAR_STAMP_S = 10.0  # times this near to zero are relative to the stamp, those near to the stamp absolute
+_NEAR_STAMP_S = GAP_NS * 1e-9  # times this near to zero are relative to the stamp, those near it absolute
 # Half of the times of a scan lie together. Those farther away than so many times their span are no times of
 # the scan. That needs many points, of which some are looked at. Chosen by hand.
 _FARTHEST_SPANS, _LEAST_TIMES, _SAMPLED_TIMES = 20.0, 50, 1000

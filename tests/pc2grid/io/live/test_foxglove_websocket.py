@@ -28,7 +28,7 @@ from tests.helpers.recordings import STEP, T0, laser_drive, ros, write_mcap
 from tests.helpers.robot import LONG_S, SUBPROTOCOLS, Channel, Frame, Proxy, Recorded, Robot
 
 PATIENT = LiveParameters(most_lag_s=1e6)
-QUICK = ConnectionParameters(first_s=0.3, least_pause_s=0.001, most_pause_s=0.01)
+QUICK = ConnectionParameters(least_pause_s=0.001)
 
 
 @pytest.fixture(scope="module")
@@ -287,7 +287,7 @@ def test_nobody_there_is_said_at_once() -> None:
         unused.bind(("127.0.0.1", 0))
         url = f"ws://127.0.0.1:{unused.getsockname()[1]}"
     with pytest.raises(LiveError, match="no connection") as error:
-        FoxgloveWebsocket(url, ReadConfig(), QUICK)
+        FoxgloveWebsocket(url, ReadConfig(), ConnectionParameters(open_s=0.3))
     assert error.value.hint is not None
     assert "foxglove_bridge" in error.value.hint
 
