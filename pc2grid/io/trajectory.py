@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from pc2grid.io.atomic import replace_file
 from pc2grid.model import Trajectory
 
 _MAX_BYTES = 128 << 20  # some million poses
-TrajectoryFormat = Literal["tum", "kitti"]
 
 
 def stamp_ns_from_text(text: str) -> int:
@@ -107,16 +105,15 @@ def write_kitti(path: str | Path, trajectory: Trajectory) -> None:
             out.write(" ".join(f"{v:.9e}" for v in T_session_base[:3].ravel()) + "\n")
 
 
-def write_trajectory(path: str | Path, trajectory: Trajectory, kind: TrajectoryFormat | None = None) -> None:
-    """Write a file of the given kind; without one KITTI for the suffix `.kitti`, else TUM, which has times.
+def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
+    """Write KITTI for the suffix `.kitti`, else TUM, which has times.
 
     >>> write_trajectory("way.kitti", read_tum("tuesday.tum"))
     >>> len(lines_of("way.kitti")[0].split())
     12
     """
-    if kind is None:
-        kind = "kitti" if Path(path).suffix.lower() == ".kitti" else "tum"
-    (write_kitti if kind == "kitti" else write_tum)(path, trajectory)
+    write = write_kitti if Path(path).suffix.lower() == ".kitti" else write_tum
+    write(path, trajectory)
 
 
 def lines_of(path: str | Path) -> list[str]:

@@ -91,9 +91,8 @@ def _check(outputs: Mapping[str, Path], given: options.Export) -> None:
             hint="name one of --map, --trajectory, --cloud, --graph, --g2o, --mcap, --plot, --report",
         )
     for option, named in outputs.items():
-        any_suffix = option == "trajectory" and given.format is not None
         for path in output.written_files({option: named}):
-            output.check_file(option, path, given.force, any_suffix=any_suffix)
+            output.check_file(option, path, given.force)
 
 
 def _only_session(database: SubmapDatabase, of_one: Sequence[str], *, joined: bool) -> str:
@@ -144,9 +143,7 @@ def _write(
             draw_session(path, database, name)
 
     writers: dict[str, Callable[[Path], object]] = {
-        "trajectory": lambda path: write_trajectory(
-            path, _in_building(poses, frames.get(name)), given.format
-        ),
+        "trajectory": lambda path: write_trajectory(path, _in_building(poses, frames.get(name))),
         "cloud": lambda path: _write_cloud(path, database, names, placed, terminal),
         "graph": lambda path: write_graph(path, database.graph(name)),
         "g2o": lambda path: write_g2o(path, poses, database.loops(name)),

@@ -95,8 +95,8 @@ class Settings:
 
         base = Config.paper() if preset == "paper" else None
         config = load_settings(Config, self.config, self.assignments or (), preset=base)
-        given = {name: getattr(self, name, None) for name in ("topic", "odometry", "imu", "assume_identity")}
-        read = {name: value for name, value in given.items() if value not in (None, False)}
+        given = {name: getattr(self, name, None) for name in ("topic", "odometry", "imu")}
+        read = {name: value for name, value in given.items() if value is not None}
         sections = {
             "read": config.read.model_copy(update=read),
             "projection": config.projection.model_copy(update={} if points else {"points_voxel_m": None}),
@@ -114,9 +114,6 @@ class Reading(Settings):
         str | None,
         typer.Option(help='IMU of a sensor in the hand without odometry; "none": do not use any'),
     ] = None
-    assume_identity: Annotated[
-        bool, typer.Option("--assume-identity", help="a sensor frame that tf does not connect is the base")
-    ] = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -390,12 +387,8 @@ class Export(SearchedInFrames, Written):
             " is unknown; raw: percent, which nav2 takes for free below 100",
         ),
     ] = None
-    trajectory: Annotated[Path | None, typer.Option(metavar="OUT.tum", help="poses of the base, for evo")] = (
-        None
-    )
-    format: Annotated[
-        Literal["tum", "kitti"] | None,
-        typer.Option(help="of the trajectory; default: kitti for OUT.kitti, else tum"),
+    trajectory: Annotated[
+        Path | None, typer.Option(metavar="OUT.tum|.kitti", help="poses of the base, for evo")
     ] = None
     cloud: Annotated[
         Path | None,

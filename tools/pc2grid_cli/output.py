@@ -33,19 +33,17 @@ _OF_OTHERS = {suffix for known in SUFFIXES.values() for suffix in known} | {".ba
 """Suffixes of formats that a database or the stem of a map must not be named after."""
 
 
-def check_file(option: str, path: Path | None, force: bool, *, any_suffix: bool = False) -> None:
+def check_file(option: str, path: Path | None, force: bool) -> None:
     """Refuse a file that the option `--{option}` cannot write; None is no file.
 
-    A name without a suffix is taken, unless the suffix selects the format. any_suffix : the format is given
-    by another option.
+    A name without a suffix is taken, unless the suffix selects the format.
 
     Raises OutputError for a suffix of another format, and as `require_writable`.
     """
     if path is None:
         return
     known, suffix = SUFFIXES[option], path.suffix.lower()
-    unnamed = any_suffix or (not suffix and option != "cloud")
-    if suffix not in known and not unnamed:
+    if suffix not in known and (suffix or option == "cloud"):
         raise OutputError(
             f"{path}: --{option} does not write the format {suffix or '(no suffix)'}",
             hint=f"end its name in {' or '.join(known)}",
