@@ -21,7 +21,7 @@ from pc2grid.geometry import F64, SE2, pose_from_xyz_quat
 from pc2grid.io import export, topics
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.frames import FrameTree
-from pc2grid.io.messages.types import Odometry, PoseStamped, valid_pose
+from pc2grid.io.messages.types import StampedPose, valid_pose
 from pc2grid.io.robots import Namespaces
 from pc2grid.io.source import MessageSource, RawMessage, TopicInfo
 from pc2grid.io.topics import decoder_for, tolerant
@@ -66,7 +66,7 @@ class BelievedPose:
         self.problem: FrameError | None = None
         self._topic, self._base_frame, self._is_tf = topic, "", False
         self._decoders: dict[tuple[str, str], Callable[[Any], Any]] = {}
-        self._last: tuple[Odometry | PoseStamped, int] | None = None
+        self._last: tuple[StampedPose, int] | None = None
         self._tree = FrameTree()
         self._newest_ns: dict[str, int] = {}
 
@@ -123,11 +123,10 @@ class BelievedPose:
                 f"{self._topic}: its poses are in frame {found.header.frame}, not in a map",
                 hint="name a topic of localization, such as /amcl_pose or /tf",
             )
-        values = found.covariance if isinstance(found, PoseStamped) else None
         return MapPose(
             stamp_ns=found.header.stamp_ns or log_time_ns,
             T_map_base=SE2.from_matrix(pose_from_xyz_quat(found.pose[:3], found.pose[3:])),
-            covariance=None if values is None else np.reshape(values, (6, 6))[_PLANAR],
+            covariance=None if found.covariance is None else np.reshape(found.covariance, (6, 6))[_PLANAR],
         )
 
     def _in_tf(self, now_ns: int) -> MapPose:

@@ -118,6 +118,7 @@ class ScanSource(ABC):
     def _begin(self, plan: Plan, part: LogPart | None = None) -> Stream:
         read = self._source, self._config, self._frames, plan, part, self._stream_parameters
         self._stream = guarded(self._path, lambda: Stream(*read))
+        self._stream.believed = self._believed
         return self._stream
 
     @abstractmethod
@@ -127,6 +128,8 @@ class ScanSource(ABC):
     @abstractmethod
     def listen_to_pose(self, topic: str) -> BelievedPose:
         """Return the pose in the map by the robot's own localization, which `parts` keeps up to date.
+
+        It is called before the scans are read, of a robot before `choose`.
 
         topic : of a pose, an odometry or tf. Raises TopicError for one that a recording does not have.
         """
@@ -198,26 +201,15 @@ class Log(ScanSource):
 
     def parts(self) -> Iterator[Iterator[Scan]]:
         """Yield the scans of the whole recording."""
-        yield self.scans() if self._believed is None else self._with_pose(self._believed)
+        yield self.scans()
+        if self._believed is not None and self._believed.problem is not None:
+            self.tally.tell(str(self._believed.problem))
 
     def listen_to_pose(self, topic: str) -> BelievedPose:
         """See `ScanSource`."""
         self._believed = BelievedPose(topic)
         self._believed.find(self._source.info.topics, self.choose().base_frame)
         return self._believed
-
-    def _with_pose(self, believed: BelievedPose) -> Iterator[Scan]:
-        """Yield the scans, each after the poses that were recorded before it."""
-        heard = self.messages(believed.topics)
-        message = next(heard, None)
-        for scan in self.scans():
-            assert self._stream is not None
-            while message is not None and message.log_time_ns <= self._stream.stamps.last_log_ns:
-                believed.take(message)
-                message = next(heard, None)
-            yield scan
-        if believed.problem is not None:
-            self.tally.tell(str(believed.problem))
 
     def _part(self, start_s: float, duration_s: float | None) -> LogPart:
         if not start_s and duration_s is None:

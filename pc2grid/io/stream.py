@@ -28,7 +28,8 @@ from pc2grid.errors import (
 )
 from pc2grid.geometry import F32, F64, invert_pose
 from pc2grid.io.frames import PARAMETERS as FRAMES, Attitude, FrameTree, PoseTrack
-from pc2grid.io.messages.types import CameraInfo, Imu, Odometry, ScanMessage, Transform
+from pc2grid.io.map_pose import BelievedPose
+from pc2grid.io.messages.types import CameraInfo, Imu, ScanMessage, StampedPose, Transform
 from pc2grid.io.plan import Plan, Sensor, registered
 from pc2grid.io.sensors.decode import MOST_TURNS, ScanDecoder
 from pc2grid.io.sensors.depth import T_BODY_OPTICAL
@@ -70,8 +71,11 @@ _EMPTY_HINT = (
 class Stream:
     """One pass, to be run once; it counts in the source's tally what is read and what is lost.
 
-    poses : by what has been read so far. stamps : of the scans that were yielded.
+    poses : by what has been read so far. stamps : of the scans that were yielded. believed : gets all
+    messages that are read, among them those of its topics, if there is one.
     """
+
+    believed: BelievedPose | None = None
 
     def __init__(
         self,
@@ -121,7 +125,8 @@ class Stream:
     @property
     def topics(self) -> frozenset[str]:
         """Return the topics whose messages are used."""
-        return frozenset(topic.topic for topic in self._handlers)
+        used = {topic.topic for topic in self._handlers}
+        return frozenset(used if self.believed is None else used | self.believed.topics)
 
     def run(self) -> Iterator[Scan]:
         """Yield the scans of the source. Raises as `Log.scans` says."""
@@ -140,6 +145,8 @@ class Stream:
         take = self._handlers.get(message.channel)
         if take is not None:
             take(message.data, message.log_time_ns)
+        if self.believed is not None:
+            self.believed.take(message)
         while self._waiting and self._is_due(self._waiting[0], message.log_time_ns):
             yield from self._release()
 
@@ -481,7 +488,7 @@ class Poses:
         self._imu_frame = ""
         self.frame = plan.odometry_frame
 
-    def take_odometry(self, found: Odometry | None, log_time_ns: int) -> None:
+    def take_odometry(self, found: StampedPose | None, log_time_ns: int) -> None:
         """Add a message of the topic of the odometry; None: it cannot be decoded."""
         if found is None or not self._track.add(found.header.stamp_ns or log_time_ns, found.pose):
             self._tally.warn("some odometry messages are unreadable or not finite, and were ignored")

@@ -23,7 +23,7 @@ from pc2grid.io.frames import PARAMETERS as FRAMES, FrameTree
 from pc2grid.io.map_pose import BelievedPose
 from pc2grid.io.plan import Plan, published_once
 from pc2grid.io.recording import ScanSource, open_log
-from pc2grid.io.source import GAP_NS, LogInfo, RawMessage, Tally, TopicInfo, guarded_stream
+from pc2grid.io.source import GAP_NS, LIDAR_PERIOD_NS, LogInfo, RawMessage, Tally, TopicInfo, guarded_stream
 from pc2grid.io.stream import PARAMETERS, Poses, Stream, StreamParameters
 from pc2grid.libraries import require
 from pc2grid.model import Scan
@@ -53,7 +53,7 @@ class LiveParameters:
     poll_s : longest wait for a message. silent_s : time after which a topic without messages is named.
     """
 
-    most_lag_s: float = 0.1
+    most_lag_s: float = LIDAR_PERIOD_NS * 1e-9
     catch_up_s: float = 10.0
     most_bytes: int = PARAMETERS.max_waiting_bytes
     most_messages: int = 100_000
@@ -421,7 +421,7 @@ class LiveLog(ScanSource):
             if self._stopped or (arrived is None and self.ended):
                 yield from self._used(stream, stream.release_all())
                 return
-            self._hear_pose(stream, arrived)
+            self._find_pose(stream)
             if arrived is None:
                 continue
             message = arrived.message
@@ -478,17 +478,15 @@ class LiveLog(ScanSource):
         self._believed = BelievedPose(topic)
         return self._believed
 
-    def _hear_pose(self, stream: Stream, arrived: Arrived | None) -> None:
-        """Update the pose with the next message. Report what is missing: topic or tf may begin later."""
-        believed = self._believed
+    def _find_pose(self, stream: Stream) -> None:
+        """Ask for the topic of the pose. Report what is missing: topic or tf may begin later."""
+        believed = stream.believed
         if believed is None:
             return
         try:
             if not believed.topics:
                 believed.find(self.feed.topics(), self.choose().base_frame)
-                self.feed.want(stream.topics | believed.topics)
-            if arrived is not None:
-                believed.take(arrived.message)
+                self.feed.want(stream.topics)
             if believed.problem is not None:
                 raise believed.problem
         except (TopicError, FrameError) as error:

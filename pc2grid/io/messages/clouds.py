@@ -31,7 +31,7 @@ import numpy as np
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
 from pc2grid.geometry import F64, quat_xyzw_from_pose
-from pc2grid.io.messages.types import HEADER_BYTES, Bytes, Header, Odometry, PointCloud2
+from pc2grid.io.messages.types import HEADER_BYTES, Bytes, Header, PointCloud2, StampedPose
 from pc2grid.io.source import TopicInfo
 
 SENSOR_FRAME, ODOMETRY_FRAME = "sensor", "odom"
@@ -50,7 +50,7 @@ def pack_pose(stamp_ns: int, T_odom_sensor: F64) -> bytes:
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
-    """Return a function from such a message to a PointCloud2 or an Odometry, by the channel's encoding."""
+    """Return a function from such a message to a PointCloud2 or a StampedPose, by the channel's encoding."""
     if channel.encoding == "pose":
         return _decode_pose
     parse = parser(channel.encoding)
@@ -62,9 +62,9 @@ def decoder_for(channel: TopicInfo) -> Callable[[Any], Any]:
     return decode
 
 
-def _decode_pose(data: Any) -> Odometry:
+def _decode_pose(data: Any) -> StampedPose:
     stamp_ns, x, y, z, qx, qy, qz, qw = _POSE.unpack(data)
-    return Odometry(Header(stamp_ns, ODOMETRY_FRAME), SENSOR_FRAME, (x, y, z, qx, qy, qz, qw))
+    return StampedPose(Header(stamp_ns, ODOMETRY_FRAME), (x, y, z, qx, qy, qz, qw), SENSOR_FRAME)
 
 
 Fields = tuple[tuple[str, int, int, int], ...]  # name, offset, datatype, count

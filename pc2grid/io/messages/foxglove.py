@@ -24,9 +24,9 @@ from pc2grid.io.messages.types import (
     Header,
     Image,
     LaserScan,
-    Odometry,
     PointCloud2,
     Seven,
+    StampedPose,
     Transform,
 )
 from pc2grid.io.source import TopicInfo
@@ -200,14 +200,10 @@ def _camera_info(m: Any) -> CameraInfo:
     return CameraInfo(_header(m), *size, str(m.distortion_model), d, k, p if len(p) == 12 else (0.0,) * 12)
 
 
-def _pose_in_frame(m: Any) -> Odometry:
-    """Convert a pose; the message does not name the child frame, which is taken to be the base."""
-    return Odometry(_header(m), "", _seven(m.pose.position, m.pose.orientation))
-
-
-def _odometry(m: Any) -> Odometry:
-    child = m.body_frame_id if hasattr(m, "body_frame_id") else m.child_frame_id
-    return Odometry(_header(m), str(child).lstrip("/"), _seven(m.pose.position, m.pose.orientation))
+def _stamped_pose(m: Any) -> StampedPose:
+    """Convert odometry, or a pose that names no child frame, which is then taken to be the base."""
+    child = getattr(m, "body_frame_id", getattr(m, "child_frame_id", ""))
+    return StampedPose(_header(m), _seven(m.pose.position, m.pose.orientation), str(child).lstrip("/"))
 
 
 def _transform(m: Any) -> tuple[Transform, ...]:
@@ -227,8 +223,8 @@ _CONVERTERS: dict[str, Callable[[Any], Any]] = {
     "foxglove.RawImage": _raw_image,
     "foxglove.CompressedImage": _compressed_image,
     "foxglove.CameraCalibration": _camera_info,
-    "foxglove.PoseInFrame": _pose_in_frame,
-    "foxglove.Odometry": _odometry,
+    "foxglove.PoseInFrame": _stamped_pose,
+    "foxglove.Odometry": _stamped_pose,
     "foxglove.FrameTransform": _transform,
     "foxglove.FrameTransforms": _transforms,
 }

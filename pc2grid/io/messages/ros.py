@@ -31,10 +31,9 @@ from pc2grid.io.messages.types import (
     Image,
     Imu,
     LaserScan,
-    Odometry,
     PointCloud2,
-    PoseStamped,
     Seven,
+    StampedPose,
     Transform,
     valid_pose,
 )
@@ -142,9 +141,10 @@ def _camera_info(m: Any) -> CameraInfo:
     return CameraInfo(_header(m.header), m.height, m.width, m.distortion_model, d, k, p)
 
 
-def _odometry(m: Any) -> Odometry:
+def _odometry(m: Any) -> StampedPose:
     pose = m.pose.pose
-    return Odometry(_header(m.header), m.child_frame_id.lstrip("/"), _seven(pose.position, pose.orientation))
+    child = m.child_frame_id.lstrip("/")
+    return StampedPose(_header(m.header), _seven(pose.position, pose.orientation), child)
 
 
 def _imu(m: Any) -> Imu:
@@ -166,15 +166,13 @@ def _measured(covariance: Any) -> bool:
     return bool(covariance[0] != -1.0)
 
 
-def _pose_stamped(m: Any) -> PoseStamped:
-    return PoseStamped(_header(m.header), _seven(m.pose.position, m.pose.orientation))
+def _pose_stamped(m: Any) -> StampedPose:
+    return StampedPose(_header(m.header), _seven(m.pose.position, m.pose.orientation))
 
 
-def _pose_with_covariance(m: Any) -> PoseStamped:
-    pose = m.pose.pose
-    return PoseStamped(
-        _header(m.header), _seven(pose.position, pose.orientation), tuple(m.pose.covariance.tolist())
-    )
+def _pose_with_covariance(m: Any) -> StampedPose:
+    pose, covariance = m.pose.pose, tuple(m.pose.covariance.tolist())
+    return StampedPose(_header(m.header), _seven(pose.position, pose.orientation), covariance=covariance)
 
 
 def _transforms(m: Any) -> tuple[Transform, ...]:

@@ -128,12 +128,17 @@ class Transform:
 
 
 @dataclass(frozen=True, slots=True)
-class Odometry:
-    """nav_msgs/Odometry without covariance and twist: the pose of `child` in `header.frame`."""
+class StampedPose:
+    """nav_msgs/Odometry without twist, geometry_msgs/PoseStamped or PoseWithCovarianceStamped.
+
+    child : the frame whose pose in `header.frame` it is; empty if the type names none. covariance : 36
+    numbers, row-major over x, y, z, roll, pitch, yaw; None: unknown.
+    """
 
     header: Header
-    child: str
     pose: Seven
+    child: str = ""
+    covariance: tuple[float, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,15 +153,3 @@ class Imu:
     orientation: tuple[float, float, float, float] | None
     turn_rate_rps: tuple[float, float, float] | None
     acceleration_mps2: tuple[float, float, float] | None
-
-
-@dataclass(frozen=True, slots=True)
-class PoseStamped:
-    """geometry_msgs/PoseStamped or PoseWithCovarianceStamped: a pose in `header.frame`.
-
-    covariance : 36 numbers, row-major over x, y, z, roll, pitch, yaw; None if the type has none.
-    """
-
-    header: Header
-    pose: Seven
-    covariance: tuple[float, ...] | None = None

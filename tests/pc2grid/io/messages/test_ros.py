@@ -7,7 +7,7 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from pc2grid.errors import PointCloudError, UnsupportedSchema
 from pc2grid.io.messages.ros import store_of
-from pc2grid.io.messages.types import Header, Odometry
+from pc2grid.io.messages.types import Header, StampedPose
 from pc2grid.io.source import TopicInfo
 from pc2grid.io.topics import decoder_for
 
@@ -135,7 +135,7 @@ def test_odometry_with_a_field_and_an_order_of_its_own() -> None:
     data += struct.pack("<I10sxx", 10, b"base_link\0")
     data += bytes(-(len(data) - 4) % 8) + struct.pack("<7d", 1, 2, 3, 1, 0, 0, 0) + bytes(8 * (36 + 6 + 36))
     found = decoder_for(odometry_of(ODOMETRY))(data)
-    assert found == Odometry(Header(3_000_000_005, "odom"), "base_link", (1, 2, 3, 0, 0, 0, 1))
+    assert found == StampedPose(Header(3_000_000_005, "odom"), (1, 2, 3, 0, 0, 0, 1), "base_link")
     with pytest.raises(PointCloudError, match="no whole nav_msgs/Odometry"):
         decoder_for(odometry_of(ODOMETRY))(data[:-20])
 
