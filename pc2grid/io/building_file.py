@@ -23,7 +23,7 @@ from pc2grid.errors import LogError, MapFileError
 from pc2grid.geometry import F64, I64
 from pc2grid.io.messages.clouds import parser
 from pc2grid.io.messages.types import HEADER_BYTES, Header
-from pc2grid.io.sensors.pointcloud2 import decode
+from pc2grid.io.sensors.decode import decode_cloud
 from pc2grid.io.source import LFS_HINT, is_lfs_pointer
 from pc2grid.settings import ReadConfig
 
@@ -242,7 +242,7 @@ def _cloud_blocks(path: Path) -> Iterator[F64]:
         count = min(_BLOCK_POINTS, cloud.width - first)
         part = data[first * step : (first + count) * step]
         block = replace(cloud, width=count, row_step=count * step, data=part)
-        yield decode(block, unit="none").xyz_m.astype(np.float64)
+        yield decode_cloud(block, unit="none").xyz_m.astype(np.float64)
 
 
 def sampled(vertices: F64, triangles: I64) -> Iterator[F64]:

@@ -2,7 +2,7 @@
 
 A cloud is its stamp (int64, nanoseconds) and the bytes of its file; a pose is its stamp, the position (m) and
 the quaternion (x, y, z, w), as float64. The bytes of a PCD, PLY or KITTI .bin file become a PointCloud2. Only
-the header is interpreted here. The points stay the bytes of the file; `pc2grid.io.sensors.pointcloud2` finds
+the header is interpreted here. The points stay the bytes of the file; `pc2grid.io.sensors.decode` finds
 coordinates and times in them, as in every other cloud.
 
 PCD: https://pointclouds.org/documentation/tutorials/pcd_file_format.html, version 0.7.

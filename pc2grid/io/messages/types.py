@@ -1,4 +1,5 @@
-"""The message types that every encoding is decoded to: ROS 2, ROS 1, Foxglove, and files of clouds.
+"""The message types that every encoding is decoded to: ROS 2, ROS 1, Foxglove, and files of clouds; and the
+points that are made of them.
 
 Large arrays stay views of the log's bytes. Lengths are in metres, angles in radians, times in seconds.
 """
@@ -10,6 +11,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from numpy.typing import NDArray
+
+from pc2grid.geometry import F32, F64
 
 Bytes = memoryview | bytes
 Seven = tuple[float, float, float, float, float, float, float]
@@ -153,3 +156,23 @@ class Imu:
     orientation: tuple[float, float, float, float] | None
     turn_rate_rps: tuple[float, float, float] | None
     acceleration_mps2: tuple[float, float, float] | None
+
+
+NO_RETURN = "nothing came back (0, NaN or inf)"
+
+
+@dataclass(frozen=True, slots=True)
+class Points:
+    """Returns of one scan in the sensor's frame.
+
+    xyz_m : (N, 3) finite. offsets_s : (N,) relative to the stamp, or None. dropped : returns left out.
+    notes : sentences for the user on how the message was interpreted. empty : why there is no point at all,
+    if there is none. unit_m : of the numbers in the message.
+    """
+
+    xyz_m: F32 | F64
+    offsets_s: F32 | None
+    dropped: int
+    notes: tuple[str, ...] = ()
+    empty: str = NO_RETURN
+    unit_m: float = 1.0

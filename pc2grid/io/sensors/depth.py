@@ -22,8 +22,7 @@ from numpy.typing import NDArray
 
 from pc2grid.errors import LimitExceeded, PointCloudError, UnsupportedSchema
 from pc2grid.geometry import F32, F64
-from pc2grid.io.messages.types import Bytes, CameraInfo, CompressedImage, Image
-from pc2grid.io.sensors.pointcloud2 import Points
+from pc2grid.io.messages.types import Bytes, CameraInfo, CompressedImage, Image, Points
 
 # REP-103: body x forward, y left, z up from optical z forward, x right, y down.
 T_BODY_OPTICAL: F64 = np.array(

@@ -33,7 +33,7 @@ from pc2grid.io.messages import clouds, foxglove
 from pc2grid.io.messages.ros import decoder_for
 from pc2grid.io.messages.types import Header, LaserScan, PointCloud2
 from pc2grid.io.recording import open_log
-from pc2grid.io.sensors import decode, pointcloud2
+from pc2grid.io.sensors.decode import decode_cloud, decode_laser
 from pc2grid.io.sensors.depth import MAGIC
 from pc2grid.io.source import TopicInfo
 from pc2grid.io.trajectory import read_tum
@@ -285,7 +285,7 @@ XYZ = [(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]
 def points(*fields: tuple[str, int, int, int], data: bytes = bytes(32), step: int = 16) -> Act:
     """A cloud of two points of these fields."""
     cloud = PointCloud2(Header(T0, ""), 1, 2, fields, False, step, 2 * step, data)
-    return lambda _: pointcloud2.decode(cloud)
+    return lambda _: decode_cloud(cloud)
 
 
 for _fields, _words in (
@@ -373,7 +373,7 @@ def laser(start: float = -0.2, step: float = 0.1, count: int = 5) -> Act:
         Header(T0, "laser"), angle_min=start, angle_max=start + (count - 1) * step, angle_increment=step,
         time_increment=0.0, scan_time=0.1, range_min=0.1, range_max=30.0, ranges=np.ones(count, np.float32),
     )  # fmt: skip
-    return lambda _: decode.decode(scan, max_points=100)
+    return lambda _: decode_laser(scan, max_points=100)
 
 
 refused(25, PointCloudError, "angles that are not finite", laser(start=math.nan))

@@ -13,8 +13,7 @@ from hypothesis import given, settings, strategies as st
 from pc2grid.errors import LimitExceeded, NoScans, Pc2GridError, PointCloudError
 from pc2grid.io.messages.clouds import parser
 from pc2grid.io.messages.types import Header, LaserScan, PointCloud2
-from pc2grid.io.sensors import decode as laserscan
-from pc2grid.io.sensors.pointcloud2 import decode
+from pc2grid.io.sensors.decode import decode_cloud, decode_laser
 from pc2grid.model import ReadReport, Scan
 from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import STEP, T0, Message, read, ros, write_mcap
@@ -72,7 +71,7 @@ def clouds(draw: st.DrawFn) -> tuple[PointCloud2, list[list[float]]]:
 def test_round_trip_against_the_oracle(case: tuple[PointCloud2, list[list[float]]]) -> None:
     message, points = case
     good = [p for p in points if all(map(math.isfinite, p[:3])) and any(p[:3])]
-    found = decode(message, unit="s")
+    found = decode_cloud(message, unit="s")
     assert found.dropped == len(points) - len(good)
     np.testing.assert_array_equal(found.xyz_m, np.array([p[:3] for p in good]).reshape(-1, 3))
     times = [p[3] for p in good]
@@ -102,13 +101,13 @@ def test_round_trip_against_the_oracle(case: tuple[PointCloud2, list[list[float]
     "name", ["t", "time", "timestamp", "timestamps", "offset_time", "Time", "time_stamp"]
 )
 def test_per_point_times_in_every_spelling(kind: int, values: list[float], name: str) -> None:
-    found = decode(timed(kind, values, name))
+    found = decode_cloud(timed(kind, values, name))
     assert found.offsets_s is not None
     np.testing.assert_allclose(found.offsets_s, [0, 0.05, 0.1], atol=2e-6)
 
 
 def test_times_that_decrease_or_end_at_the_stamp_keep_their_signs() -> None:
-    found = decode(timed(5, (0, -50_000_000, -100_000_000)))
+    found = decode_cloud(timed(5, (0, -50_000_000, -100_000_000)))
     assert found.offsets_s is not None
     np.testing.assert_allclose(found.offsets_s, [0, -0.05, -0.1], atol=1e-7)
 
@@ -116,7 +115,7 @@ def test_times_that_decrease_or_end_at_the_stamp_keep_their_signs() -> None:
 def test_times_stay_with_their_points_where_rows_are_dropped() -> None:
     rows = [(1, 0, 0, 0.0), (math.nan, 0, 0, 0.03), (2, 0, 0, 0.05), (3, 0, 0, math.nan), (4, 0, 0, 0.1)]
     data = b"".join(struct.pack("<4f", *row) for row in rows)
-    found = decode(PointCloud2(Header(STAMP, ""), 1, 5, (*XYZ, ("t", 12, 7, 1)), False, 16, 80, data))
+    found = decode_cloud(PointCloud2(Header(STAMP, ""), 1, 5, (*XYZ, ("t", 12, 7, 1)), False, 16, 80, data))
     assert found.offsets_s is not None
     np.testing.assert_allclose(found.xyz_m[:, 0], [1, 2, 4])
     np.testing.assert_allclose(found.offsets_s, [0, 0.05, 0.1])
@@ -133,7 +132,7 @@ def test_wild_times_decide_no_unit(wild: float, share: float, scale: float, begi
     odd = np.random.default_rng(3).random(2000) < share
     points["t"][odd] = wild
     fields, data = (*XYZ, ("t", 12, 8, 1)), points.tobytes()
-    found = decode(PointCloud2(Header(STAMP, ""), 1, 2000, fields, False, 20, len(data), data))
+    found = decode_cloud(PointCloud2(Header(STAMP, ""), 1, 2000, fields, False, 20, len(data), data))
     assert found.offsets_s is not None
     expected = seconds + (begin_s if begin_s < 0 else 0.0)
     if wild == 0.0 and begin_s < 0.0:  # a time of the scan, as far as one can tell
@@ -147,15 +146,15 @@ def test_wild_times_decide_no_unit(wild: float, share: float, scale: float, begi
 @pytest.mark.fault(31)
 def test_no_times_or_all_the_same_is_no_offsets() -> None:
     cloud = timed(7, [0.5] * 3)
-    same = decode(cloud)
+    same = decode_cloud(cloud)
     assert same.offsets_s is None
     assert "all the same" in same.notes[0]
-    assert decode(dataclasses.replace(cloud, fields=XYZ)).offsets_s is None
+    assert decode_cloud(dataclasses.replace(cloud, fields=XYZ)).offsets_s is None
 
 
 def test_an_absurd_size_is_refused_before_anything_is_allocated() -> None:
     with pytest.raises(LimitExceeded, match="max_points"):
-        decode(PointCloud2(Header(STAMP, ""), 2**31, 2**31, XYZ, False, 12, 12, b""))
+        decode_cloud(PointCloud2(Header(STAMP, ""), 2**31, 2**31, XYZ, False, 12, 12, b""))
 
 
 @pytest.mark.parametrize(
@@ -174,9 +173,9 @@ def test_times_of_a_known_unit_that_no_scan_can_span(unit: str, kind: int, value
     """One flipped bit, or another unit than declared: seconds become years."""
     message = timed(kind, values)
     with pytest.raises(PointCloudError, match=rf"field t: times that span .* s, read as {unit}") as caught:
-        decode(message, unit=unit)
+        decode_cloud(message, unit=unit)
     assert "read.point_time=" in str(caught.value.hint)
-    assert decode(message, unit="none").offsets_s is None
+    assert decode_cloud(message, unit="none").offsets_s is None
 
 
 # --- Laser scans whose numbers no laser has, through a whole log ---
@@ -275,29 +274,29 @@ def beams(count: int = 5, **changes: float) -> LaserScan:
 
 def test_laser_whose_beams_would_take_years_is_taken_at_one_time() -> None:
     for wrong in (0.5, -0.5, 1e30):
-        found = laserscan.decode(beams(time_increment=wrong))
+        found = decode_laser(beams(time_increment=wrong))
         assert found.offsets_s is None
         assert found.notes == ("time_increment makes a scan longer than 2 s: it is ignored",)
-    assert laserscan.decode(beams(time_increment=0.4)).notes == ()
+    assert decode_laser(beams(time_increment=0.4)).notes == ()
 
 
 def test_beams_and_their_times() -> None:
-    found = laserscan.decode(beams(time_increment=0.01, range_min=2.0, range_max=5.0))
+    found = decode_laser(beams(time_increment=0.01, range_min=2.0, range_max=5.0))
     assert found.dropped == 2  # 1 m is too near, 5 m is the reach itself
     angles = np.array([-0.1, 0.0, 0.1])
     expected = np.array([2, 3, 4])[:, None] * np.column_stack((np.cos(angles), np.sin(angles), 0 * angles))
     np.testing.assert_allclose(found.xyz_m, expected, atol=1e-6)
     np.testing.assert_allclose(found.offsets_s, [0.01, 0.02, 0.03])
-    unlimited = laserscan.decode(beams(range_max=0.0, range_min=0.0))
+    unlimited = decode_laser(beams(range_max=0.0, range_min=0.0))
     assert len(unlimited.xyz_m) == 5
     assert unlimited.offsets_s is None
-    assert len(laserscan.decode(beams(range_max=math.inf)).xyz_m) == 5
-    assert len(laserscan.decode(beams(1, angle_increment=0.0)).xyz_m) == 1
+    assert len(decode_laser(beams(range_max=math.inf)).xyz_m) == 5
+    assert len(decode_laser(beams(1, angle_increment=0.0)).xyz_m) == 1
 
 
 def test_a_range_of_zero_is_no_return() -> None:
     ranges = np.array([0.0, 1.0, -1.0, np.inf, np.nan], np.float32)
-    found = laserscan.decode(dataclasses.replace(beams(range_min=0.0), ranges=ranges))
+    found = decode_laser(dataclasses.replace(beams(range_min=0.0), ranges=ranges))
     np.testing.assert_allclose(np.linalg.norm(found.xyz_m, axis=1), [1.0], rtol=1e-6)
 
 
@@ -309,9 +308,9 @@ def test_angles_may_be_off_by_two_beams_or_two_percent(count: int, slack: int) -
         return beams(count, angle_increment=0.001, angle_max=-0.2 + 0.001 * (count - 1 + beams_more))
 
     for fine in (-slack + 0.01, slack - 0.01):
-        assert laserscan.decode(declared(fine), max_points=10_000).notes == ()
+        assert decode_laser(declared(fine), max_points=10_000).notes == ()
     for wrong in (-slack - 0.5, slack + 0.5):
-        (note,) = laserscan.decode(declared(wrong), max_points=10_000).notes
+        (note,) = decode_laser(declared(wrong), max_points=10_000).notes
         assert "angle_max is ignored" in note
 
 
