@@ -14,7 +14,6 @@ from __future__ import annotations
 import bisect
 import difflib
 import itertools
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,10 +28,8 @@ from pc2grid.geometry import (
     pose_from_xyz_quat,
     quat_xyzw_from_pose,
 )
-from pc2grid.io import topics
 from pc2grid.io.messages.types import Imu, Seven, Transform, valid_pose
-from pc2grid.io.source import LIDAR_PERIOD_NS, MessageSource, TopicInfo
-from pc2grid.io.topics import FIRST, First, decoder_for, tolerant
+from pc2grid.io.source import LIDAR_PERIOD_NS
 
 
 @dataclass(frozen=True, slots=True)
@@ -310,52 +307,6 @@ class FrameTree:
     def _warn(self, sentence: str) -> None:
         if sentence not in self.warnings:
             self.warnings.append(sentence)
-
-
-class Transforms:
-    """Fills a tree of frames from the tf topics of a robot: all static transforms, and the moving ones on
-    demand.
-
-    frames : the tree. moving : the topics of moving transforms. edges : those of them that were read.
-    """
-
-    def __init__(
-        self, source: MessageSource, tf: Sequence[TopicInfo], frames: FrameTree, end_ns: int
-    ) -> None:
-        """Read the static transforms of some topics. end_ns : up to which moving ones are read."""
-        self._source, self.frames = source, frames
-        self.moving = [t for t in tf if not topics.is_static(t)]
-        self.edges: list[First] = []
-        for _ in self._read([t for t in tf if topics.is_static(t)], None):
-            pass
-        self._later = self._read(self.moving, end_ns)
-
-    def read_on(self) -> bool:
-        """Read the next message of moving transforms; returns whether there is one."""
-        found = next(self._later, None)
-        self.edges += found or ()
-        return found is not None
-
-    def read_odometry(self, base: str) -> str | None:
-        """Return the frame above the base that is its odometry frame in tf, after reading enough to know its
-        clock."""
-        while (len(self.edges) < FIRST or self.odometry_frame(base) is None) and self.read_on():
-            pass
-        return self.odometry_frame(base)
-
-    def odometry_frame(self, base: str) -> str | None:
-        """Return the frame above the base that is its odometry frame in tf, as far as tf was read."""
-        above = self.frames.chain(base)[1:]
-        return next((f for f in above if f == "odom" or f.endswith(("/odom", "_odom"))), None)
-
-    def _read(self, tf: Sequence[TopicInfo], end_ns: int | None) -> Iterator[list[First]]:
-        """Read the transforms of some topics into the tree; yield those of each message."""
-        decoders = {t: decoder_for(t) for t in tf}
-        for message in self._source.messages({t.topic for t in tf}, end_ns=end_ns):
-            if message.channel in decoders:
-                at_ns, edges = message.log_time_ns, tolerant(decoders[message.channel], message.data)
-                self.frames.add_all(edges, static=topics.is_static(message.channel), log_time_ns=at_ns)
-                yield [First(at_ns, edge) for edge in edges or ()]
 
 
 # --- the attitude of an IMU ---------------------------------------------------------------------------

@@ -22,9 +22,8 @@ from pc2grid.io import export, topics
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.frames import FrameTree
 from pc2grid.io.messages.types import StampedPose, valid_pose
-from pc2grid.io.robots import Namespaces
 from pc2grid.io.source import MessageSource, RawMessage, TopicInfo
-from pc2grid.io.topics import decoder_for, tolerant
+from pc2grid.io.topics import Namespaces, decoder_for, tolerant
 
 _PLANAR = np.ix_((0, 1, 5), (0, 1, 5))
 """x, y and yaw among x, y, z, roll, pitch, yaw."""

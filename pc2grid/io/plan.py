@@ -12,28 +12,33 @@ import functools
 import itertools
 import statistics
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from pc2grid.errors import FrameError, NoScans, TopicError, UnsupportedSchema
 from pc2grid.io import topics
-from pc2grid.io.frames import FrameTree, Transforms
+from pc2grid.io.frames import FrameTree
 from pc2grid.io.messages.types import CameraInfo
-from pc2grid.io.robots import (
-    BASE_FRAMES,
-    Namespaces,
-    Robot,
-    camera_info_topic,
-    diverge,
-    prefix,
-    shared_parts,
-    two_robots,
-)
 from pc2grid.io.sensors.decode import ScanDecoder
 from pc2grid.io.sensors.depth import holds_depths
 from pc2grid.io.source import GAP_NS, Choice, MessageSource, TopicInfo
-from pc2grid.io.topics import First, FirstMessages, delay_ns
+from pc2grid.io.topics import (
+    BASE_FRAMES,
+    FIRST,
+    First,
+    FirstMessages,
+    Namespaces,
+    Robot,
+    camera_info_topic,
+    decoder_for,
+    delay_ns,
+    diverge,
+    prefix,
+    shared_parts,
+    tolerant,
+    two_robots,
+)
 from pc2grid.model import SENSOR_MODELS, SensorKind
 from pc2grid.settings import ReadConfig
 
@@ -88,6 +93,7 @@ def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> P
     motion = motions.odometry(candidates)
     imu, gravity = motions.imu(motion)
     needs_tf = motion.frame is not None or bases.sensor_moves(base)
+    stamps_ns = [scan.content.header.stamp_ns for scan in found.first_scans]
     return Plan(
         choice=Choice(
             topic=found.topic.topic,
@@ -106,9 +112,9 @@ def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> P
         imu=imu,
         moving_tf=tuple(tf.moving) if needs_tf else (),
         sensor_is_base=base is None,
-        stampless=found.stampless,
+        stampless=bool(stamps_ns) and not any(stamps_ns),
         mounted=bases.mounted(base),
-        period_ns=found.period_ns,
+        period_ns=max((b - a for a, b in itertools.pairwise(stamps_ns)), default=0),
         depth_unit_m=config.depth_unit_m or _recorded_depth_unit_m(source),
     )
 
@@ -123,11 +129,6 @@ def _recorded_depth_unit_m(source: MessageSource) -> float | None:
         return None
     source.tally.warn(f"depths are in units of {value:.3g} m, as {unit.topic} says")
     return float(value)
-
-
-def published_once(topic: TopicInfo) -> bool:
-    """Return whether the messages of a topic may be published only once, when the robot starts."""
-    return topic.type in topics.CAMERA_INFOS or (topic.type in topics.TF and topics.is_static(topic))
 
 
 # --- the sensors --------------------------------------------------------------------------------------
@@ -181,20 +182,6 @@ class FoundSensors:
     def frame(self) -> str:
         """Return the frame of the first sensor; empty if no scan can be decoded (the stream counts them)."""
         return self.sensors[0].frame or ""
-
-    @property
-    def stampless(self) -> bool:
-        """Return whether there are first scans, and all of their stamps are zero."""
-        return bool(self.first_scans) and not any(self._stamps_ns)
-
-    @property
-    def period_ns(self) -> int:
-        """Return the longest time between two of the first scans; 0 if there is only one."""
-        return max((b - a for a, b in itertools.pairwise(self._stamps_ns)), default=0)
-
-    @property
-    def _stamps_ns(self) -> list[int]:
-        return [scan.content.header.stamp_ns for scan in self.first_scans]
 
     @property
     def seen(self) -> list[Sensor]:
@@ -345,6 +332,55 @@ def _calibration(sensor: Sensor, frame: str, first: FirstMessages) -> CameraInfo
     """Return the first calibration in the frame of the images, else the first one."""
     infos = [] if sensor.camera is None else first.of(sensor.camera)
     return next((info.content for info in infos if info.frame == frame), sensor.calibration)
+
+
+# --- tf -----------------------------------------------------------------------------------------------
+
+
+class Transforms:
+    """Fills a tree of frames from the tf topics of a robot: all static transforms, and the moving ones on
+    demand.
+
+    frames : the tree. moving : the topics of moving transforms. edges : those of them that were read.
+    """
+
+    def __init__(
+        self, source: MessageSource, tf: Sequence[TopicInfo], frames: FrameTree, end_ns: int
+    ) -> None:
+        """Read the static transforms of some topics. end_ns : up to which moving ones are read."""
+        self._source, self.frames = source, frames
+        self.moving = [t for t in tf if not topics.is_static(t)]
+        self.edges: list[First] = []
+        for _ in self._read([t for t in tf if topics.is_static(t)], None):
+            pass
+        self._later = self._read(self.moving, end_ns)
+
+    def read_on(self) -> bool:
+        """Read the next message of moving transforms; returns whether there is one."""
+        found = next(self._later, None)
+        self.edges += found or ()
+        return found is not None
+
+    def read_odometry(self, base: str) -> str | None:
+        """Return the frame above the base that is its odometry frame in tf, after reading enough to know its
+        clock."""
+        while (len(self.edges) < FIRST or self.odometry_frame(base) is None) and self.read_on():
+            pass
+        return self.odometry_frame(base)
+
+    def odometry_frame(self, base: str) -> str | None:
+        """Return the frame above the base that is its odometry frame in tf, as far as tf was read."""
+        above = self.frames.chain(base)[1:]
+        return next((f for f in above if f == "odom" or f.endswith(("/odom", "_odom"))), None)
+
+    def _read(self, tf: Sequence[TopicInfo], end_ns: int | None) -> Iterator[list[First]]:
+        """Read the transforms of some topics into the tree; yield those of each message."""
+        decoders = {t: decoder_for(t) for t in tf}
+        for message in self._source.messages({t.topic for t in tf}, end_ns=end_ns):
+            if message.channel in decoders:
+                at_ns, edges = message.log_time_ns, tolerant(decoders[message.channel], message.data)
+                self.frames.add_all(edges, static=topics.is_static(message.channel), log_time_ns=at_ns)
+                yield [First(at_ns, edge) for edge in edges or ()]
 
 
 # --- the base of the robot ----------------------------------------------------------------------------

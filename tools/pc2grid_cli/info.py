@@ -136,7 +136,7 @@ def describe(
 
 def _chosen(choice: Choice, log: LogInfo) -> ChosenTopics:
     """Return what would be used, with the topic of the camera's calibration if depth images are."""
-    from pc2grid.io.robots import camera_info_topic
+    from pc2grid.io.topics import camera_info_topic
 
     images = [
         topic for topic in log.topics if topic.topic == choice.topic and SENSOR_MODELS[choice.sensor].image
@@ -155,7 +155,7 @@ def _show(info: Info) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from pc2grid.io.robots import Namespaces
+    from pc2grid.io.topics import Namespaces
 
     def escape(text: str) -> str:
         # Names come from the log, and may hold control sequences for a terminal.

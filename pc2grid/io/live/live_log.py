@@ -21,7 +21,7 @@ from pc2grid.errors import FrameError, LogNotFound, NoScans, TopicError
 from pc2grid.io import topics
 from pc2grid.io.frames import PARAMETERS as FRAMES, FrameTree
 from pc2grid.io.map_pose import BelievedPose
-from pc2grid.io.plan import Plan, published_once
+from pc2grid.io.plan import Plan
 from pc2grid.io.recording import ScanSource, open_log
 from pc2grid.io.source import GAP_NS, LIDAR_PERIOD_NS, LogInfo, RawMessage, Tally, TopicInfo, guarded_stream
 from pc2grid.io.stream import PARAMETERS, Poses, Stream, StreamParameters
@@ -207,8 +207,9 @@ class Feed:
 
     def hold(self, arrived: Arrived) -> None:
         """Hold a message back."""
-        if published_once(arrived.message.channel):
-            self._once.append(arrived)
+        topic = arrived.message.channel
+        if topic.type in topics.CAMERA_INFOS or (topic.type in topics.TF and topics.is_static(topic)):
+            self._once.append(arrived)  # it may be published only once, when the robot starts
             return
         self._recent.append(arrived)
         while self._recent[0].arrived_s < arrived.arrived_s - 2 * _MOST_S:
