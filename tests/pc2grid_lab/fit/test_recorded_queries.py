@@ -37,6 +37,6 @@ def test_each_question_says_what_tells_for_its_places() -> None:
     assert all(error_m == math.inf for error_m, _ in elsewhere["errors"])
     assert all(error_m > 0.5 for error_m, _ in blanked["errors"])
     known = {one.kind: one for one in known_of([inside, elsewhere])}
-    assert known["in its own building"].first == 0
-    assert known["in another building"].first is None
+    assert known["in its own building"].right == {0}
+    assert not known["in another building"].right
     assert known["in another building"].buildings == {"wean", "fr079"}
