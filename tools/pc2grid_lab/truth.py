@@ -13,30 +13,21 @@
   the truth, if at least three agree and no other transform has half as many. Neither map nor trajectory is
   rigid over a whole building, so what agrees may differ by a share of the distance between the two places,
   and an answer is judged by the others around it, never by itself.
-- The transform of two recordings of one room by their clouds, in which no answer has a part. Each recording
-  is one cloud along its own trajectory. The clouds are level, and stand on one floor, so that only a heading
-  and a shift in the plane are searched for; the best few are refined in space by Open3D's point-to-plane ICP.
-  The best is the truth if no other place has nearly as many points on surfaces.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from itertools import product
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from pc2grid.clouds.cloud import VoxelCloud, random_subset
 from pc2grid.errors import TrajectoryFileError
-from pc2grid.geometry import F64, I64, SE2, interpolate_pose, invert_pose, transform_points, wrap_angle
-from pc2grid.io.recording import Log
-from pc2grid.model import SENSOR_MODELS, Health, Trajectory
-from pc2grid.open3d_core import o3d
+from pc2grid.geometry import F64, I64, SE2, interpolate_pose, wrap_angle
+from pc2grid.model import Health, Trajectory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,21 +104,11 @@ MAX_GAP_S = 1.0
 """The truth is interpolated between two poses that differ by no more than this in time; chosen by hand."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrajectoryError:
-    """The errors of a trajectory; poses of lost scans are left out.
+def trajectory_errors(estimated: Trajectory, truth: Trajectory) -> F64:
+    """Return the distances (N,) of the poses of a trajectory from the truth, which is interpolated at their
+    stamps, after the best rigid alignment. Poses of lost scans are left out.
 
-    ate_m : RMS distance from the truth after the best rigid alignment. poses : how many were compared.
-    """
-
-    ate_m: float
-    poses: int
-
-
-def trajectory_error(estimated: Trajectory, truth: Trajectory) -> TrajectoryError | None:
-    """Return the error of a trajectory with respect to the truth, which is interpolated at its stamps.
-
-    None if fewer than three poses have a true pose.
+    Empty if fewer than three poses have a true pose.
     """
     found = [
         (estimated.T_session_base[k, :3, 3], true[:3, 3])
@@ -136,102 +117,54 @@ def trajectory_error(estimated: Trajectory, truth: Trajectory) -> TrajectoryErro
         and (true := pose_at_stamp(truth, stamp_ns, same_ns=0.0, gap_ns=MAX_GAP_S * 1e9)) is not None
     ]
     if len(found) < 3:
-        return None
+        return np.empty(0)
     a, b = (points - points.mean(axis=0) for points in np.swapaxes(found, 0, 1))
     # The rotation nearest to the covariance of the two (Umeyama 1991).
     U, _, Vt = np.linalg.svd(np.einsum("ni,nj->ij", b, a))
     R = U @ np.diag((1.0, 1.0, np.sign(np.linalg.det(U @ Vt)))) @ Vt
-    apart_m = np.linalg.norm(a @ R.T - b, axis=1)
-    return TrajectoryError(ate_m=float(np.sqrt(np.mean(apart_m**2))), poses=len(found))
+    return np.asarray(np.linalg.norm(a @ R.T - b, axis=1))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Relations:
-    """R verified relative poses.
-
-    first_ns, second_ns : (R,) int64, the two times of each relation. T_first_second : (R, 3) x, y, yaw.
-    """
-
-    first_ns: I64
-    second_ns: I64
-    T_first_second: F64
+def rms(errors_m: F64) -> float:
+    """Return the root of the mean square of errors, for distances from the truth the ATE."""
+    return float(np.sqrt(np.mean(np.square(errors_m))))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RelationError:
-    """Mean absolute errors over the relations, metres and degrees; NaN without any.
-
-    used : number of relations, of `total`, for which the trajectory has poses at both times.
-    """
-
-    translation_m: float
-    rotation_deg: float
-    used: int
-    total: int
+Relation = tuple[int, int, SE2]
+"""Two stamps, nanoseconds, and the verified pose at the second one in the frame of that at the first one."""
 
 
-def read_relations(path: Path) -> Relations:
+def read_relations(path: Path) -> list[Relation]:
     """Read a `*.relations` file: `t1 t2 x y z roll pitch yaw` in each line, in seconds, metres, radians.
 
     Raises TrajectoryFileError if a line has another form.
     """
-    firsts, seconds, poses = [], [], []
-    for number, line in enumerate(path.read_text().splitlines(), start=1):
-        if not line.strip() or line.startswith("#"):
-            continue
-        try:
-            t1, t2, x, y, _, _, _, yaw = (float(word) for word in line.split())
-        except ValueError:
-            raise TrajectoryFileError(
-                f"{path}, line {number}: expected 't1 t2 x y z roll pitch yaw'"
-            ) from None
-        firsts.append(round(t1 * 1e9))
-        seconds.append(round(t2 * 1e9))
-        poses.append((x, y, yaw))
-    return Relations(
-        first_ns=np.array(firsts, dtype=np.int64),
-        second_ns=np.array(seconds, dtype=np.int64),
-        T_first_second=np.array(poses, dtype=np.float64).reshape(-1, 3),
-    )
+    try:
+        rows = np.loadtxt(path, usecols=(0, 1, 2, 3, 7), ndmin=2).tolist()
+    except ValueError as error:
+        raise TrajectoryFileError(f"{path}: expected 't1 t2 x y z roll pitch yaw'; {error}") from None
+    return [(round(t1_s * 1e9), round(t2_s * 1e9), SE2(x, y, yaw)) for t1_s, t2_s, x, y, yaw in rows]
 
 
-def relation_error(
-    trajectory: Trajectory,
-    relations: Relations,
-    *,
-    base_to_reference_m: tuple[float, float] = (0.0, 0.0),
-) -> RelationError:
-    """Return the errors of a trajectory with respect to the relations.
+def relation_errors(
+    trajectory: Trajectory, relations: Sequence[Relation], T_base_reference: SE2 | None = None
+) -> F64:
+    """Return by how much a trajectory differs from relations, (R, 2) metres and radians, of those at whose
+    times it has poses.
 
-    base_to_reference_m : position on the base of the point that the relations describe (the benchmark's poses
-        are those of the laser, not of the base).
-
-    A relation is left out if there is no pose at one of its times.
+    T_base_reference : whose poses the relations describe (the benchmark's are those of the laser, not of the
+        base); only where it is counts.
     """
-    poses = trajectory.planar()
-    c, s = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    dx, dy = base_to_reference_m
-    poses[:, 0] += c * dx - s * dy
-    poses[:, 1] += s * dx + c * dy
-    i, j = (
-        nearest(trajectory.stamps_ns, wanted_ns) for wanted_ns in (relations.first_ns, relations.second_ns)
-    )
-    used = (i >= 0) & (j >= 0)
-    error = _relative(relations.T_first_second[used], _relative(poses[i[used]], poses[j[used]]))
-    off_m, off_deg = np.hypot(error[:, 0], error[:, 1]), np.degrees(np.abs(wrap_angle(error[:, 2])))
-    return RelationError(
-        translation_m=float(off_m.mean()) if len(error) else math.nan,
-        rotation_deg=float(off_deg.mean()) if len(error) else math.nan,
-        used=len(error),
-        total=len(used),
-    )
-
-
-def _relative(a: F64, b: F64) -> F64:
-    """Return t_a_b (N, 3) of poses (N, 3) in one frame."""
-    c, s = np.cos(a[:, 2]), np.sin(a[:, 2])
-    dx, dy = b[:, 0] - a[:, 0], b[:, 1] - a[:, 1]
-    return np.column_stack((c * dx + s * dy, -s * dx + c * dy, b[:, 2] - a[:, 2]))
+    mounted = SE2() if T_base_reference is None else replace(T_base_reference, yaw=0.0)
+    poses = [pose @ mounted for pose in trajectory.poses()]
+    wanted_ns = np.array([(first_ns, second_ns) for first_ns, second_ns, _ in relations], np.int64)
+    numbers = nearest(trajectory.stamps_ns, wanted_ns.ravel()).reshape(-1, 2).tolist()
+    errors = [
+        apart(expected, poses[i].inverse() @ poses[j])
+        for (i, j), (_, _, expected) in zip(numbers, relations, strict=True)
+        if min(i, j) >= 0
+    ]
+    return np.reshape(errors, (-1, 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -358,120 +291,3 @@ def _places(clues: Sequence[Clue]) -> int:
 
 def _apart_m(a: SE2, b: SE2) -> float:
     return math.hypot(a.x - b.x, a.y - b.y)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RegisteredCloudsParameters:
-    """How two clouds are registered. Chosen by hand for single rooms.
-
-    voxel_m : points are thinned to one a voxel. every : scan of a recording that is used. noise_m : points
-        whose deviation is larger are left out.
-    step_m, step_rad, near_m : grid of the search, and how near to a surface a point counts. points : of the
-        search. starts : that are refined.
-    rounds_m : reach of ICP, one after the other.
-    Places nearer than a step are one. rival : another place has less than this share of the
-        points on surfaces of the best one.
-    """
-
-    voxel_m: float = 0.05
-    every: int = 6
-    noise_m: float = 0.02
-    step_m: float = 0.5
-    step_rad: float = math.radians(10.0)
-    near_m: float = 0.3
-    points: int = 250
-    starts: int = 12
-    rounds_m: tuple[float, ...] = (0.4, 0.2, 0.1)
-    rival: float = 0.9
-
-
-REGISTERED_CLOUDS = RegisteredCloudsParameters()
-
-
-def cloud_along(log: Log, trajectory: Trajectory, p: RegisteredCloudsParameters = REGISTERED_CLOUDS) -> F64:
-    """Return the points (N, 3) of a recording, thinned, in the frame of its trajectory."""
-    cloud = VoxelCloud(p.voxel_m)
-    for number, scan in enumerate(log.scans()):
-        k = int(np.searchsorted(trajectory.stamps_ns, scan.stamp_ns))
-        if number % p.every or k == len(trajectory) or trajectory.stamps_ns[k] != scan.stamp_ns:
-            continue
-        away_m = np.linalg.norm(scan.points_m - scan.T_base_sensor[:3, 3], axis=1)
-        near = away_m < SENSOR_MODELS[scan.sensor].range_of_noise_m(p.noise_m)
-        cloud.add(transform_points(trajectory.T_session_base[k], scan.points_m[near]))
-    return cloud.points_m()
-
-
-def registered_clouds(
-    source: F64, target: F64, p: RegisteredCloudsParameters = REGISTERED_CLOUDS
-) -> SE2 | None:
-    """Return t_target_source of two clouds (N, 3) and (M, 3) of one room, z up; None if it is not clear.
-
-    Neither cloud is preferred: each is registered to the other one, as one of the two ways may end beside the
-    place, and a place counts by the points on surfaces of both (geometric mean).
-    """
-    placed = [*_refined(source, target, p), *map(invert_pose, _refined(target, source, p))]
-    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
-    found: list[tuple[float, SE2]] = []
-    for T in placed:
-        there, back = (
-            o3d.pipelines.registration.evaluate_registration(*pair, p.rounds_m[-1], pose).fitness
-            for pair, pose in ((clouds, T), (clouds[::-1], invert_pose(T)))
-        )
-        found.append((math.sqrt(there * back), SE2.from_matrix(T)))
-    share, best = max(found, key=lambda one: one[0])
-    rivals = [other for other, pose in found if not _same(pose, best, p)]
-    return best if max(rivals, default=0.0) < p.rival * share else None
-
-
-def _refined(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F64]:
-    """Refine the poses (4, 4) at which a search ends."""
-    steps = o3d.pipelines.registration
-    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)) for points in (source, target)]
-    clouds[1].estimate_normals()
-    poses = []
-    for T in _starts(source, target, p):
-        for reach_m in p.rounds_m:
-            loss = steps.TransformationEstimationPointToPlane(steps.TukeyLoss(k=0.5 * reach_m))
-            T = steps.registration_icp(*clouds, reach_m, T, loss).transformation
-        poses.append(np.asarray(T, np.float64))
-    return poses
-
-
-def _starts(source: F64, target: F64, p: RegisteredCloudsParameters) -> list[F64]:
-    """Return the poses (4, 4) of a grid at which most points of the source are near the target, best
-    first."""
-    tree = cKDTree(target)
-    few = source[random_subset(len(source), p.points)]
-    (x0, y0), (x1, y1) = (_middle(points) for points in (source, target))
-    floors_m = [float(np.percentile(points[:, 2], 2.0)) for points in (source, target)]
-    half_m = 0.5 * np.ptp(target[:, :2], axis=0)
-    shifts = [np.arange(-half, half + p.step_m, p.step_m) for half in half_m.tolist()]
-    tried: list[tuple[float, SE2]] = []
-    for yaw, x, y in product(np.arange(-math.pi, math.pi, p.step_rad).tolist(), *shifts):
-        pose = SE2(x1 + x, y1 + y, yaw) @ SE2(-x0, -y0, 0.0)
-        placed = transform_points(_lifted(pose, floors_m), few)
-        away_m, _ = tree.query(placed, distance_upper_bound=p.near_m)
-        tried.append((float(np.mean(away_m < p.near_m)), pose))
-    kept: list[SE2] = []
-    for _, pose in sorted(tried, key=lambda one: -one[0]):
-        if len(kept) < p.starts and not any(_same(pose, other, p) for other in kept):
-            kept.append(pose)
-    return [_lifted(pose, floors_m) for pose in kept]
-
-
-def _middle(points: F64) -> tuple[float, float]:
-    """Return the middle of the ground that points (N, 3) lie on."""
-    x, y = (0.5 * (points[:, :2].min(axis=0) + points[:, :2].max(axis=0))).tolist()
-    return x, y
-
-
-def _lifted(pose: SE2, floors_m: list[float]) -> F64:
-    """Return a planar pose in space, that brings one floor onto the other."""
-    T = pose.lift()
-    T[2, 3] = floors_m[1] - floors_m[0]
-    return T
-
-
-def _same(a: SE2, b: SE2, p: RegisteredCloudsParameters) -> bool:
-    apart_m, apart_rad = apart(a, b)
-    return apart_m < p.step_m and apart_rad < p.step_rad

@@ -13,7 +13,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.observer import TimeSpan
 from pc2grid_lab.recordings import judging
-from pc2grid_lab.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
+from pc2grid_lab.recordings.catalogue import Catalogue, Pair, Placed, Recording
 from pc2grid_lab.recordings.judging import Judge, LocatedWindow, RecordedDrive, known_share, levelled
 from pc2grid_lab.recordings.run import Folder
 from pc2grid_lab.recordings.table import JoinRow
@@ -134,8 +134,8 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> Trajectory:
 def test_one_pose_found_by_hand_judges_a_drive() -> None:
     """Within what the drawn map allows; the third answer is as near, but turned."""
     known = T_PLAN_A @ pose(1)
-    by_hand = PlacedByHand(at_s=1.1, x_m=known.x, y_m=known.y, yaw_deg=math.degrees(known.yaw), within_m=1.0)
-    pair = replace(A_IN_PLAN, windows=4, by_hand=by_hand)
+    placed = Placed(at_s=1.1, x_m=known.x, y_m=known.y, yaw_deg=math.degrees(known.yaw), within_m=1.0)
+    pair = replace(A_IN_PLAN, windows=4, placed=placed)
     offs = (SE2(0.8, 0.0, 0.0), SE2(1.4, 0.0, 0.0), SE2(0.0, 0.0, 0.2), SE2(-26.0, 0.0, 0.0))
     row = Known({pair: [located("a", k, T_PLAN_A @ pose(k) @ off) for k, off in enumerate(offs)]}).row(pair)
     assert row.truth == "hand" and [query.right for query in row.queries] == [True, False, False, False]

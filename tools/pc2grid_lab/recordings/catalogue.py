@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from functools import cache
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -55,6 +55,11 @@ class SimulatedDrive:
     sensor: SensorKind
     length_m: float
     seed: int
+
+
+MAP_DRIVE = SimulatedDrive(sensor="lidar", length_m=150.0, seed=1000)
+"""The drive that makes a map of a 3D scan. Map sessions and query sessions never share a seed: other clutter,
+start, direction and noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,12 +104,13 @@ class Recording:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PlacedByHand:
-    """Where the base of a recording is in a map, if neither true poses nor answers that agree tell it. It was
-    found by hand, once: the recording's own map was laid over the other one.
+class Placed:
+    """Where the base of a recording is in a map, if neither true poses nor answers that agree tell it.
 
     at_s : seconds after its first scan. x_m, y_m, yaw_deg : in the map. within_m : how far off a right answer
-        may be there, as the map is drawn no better.
+        may be there.
+    by : how it was found, once: by hand, the recording's own map laid over the other one; or by the clouds of
+        both, each registered in space to the other one.
     """
 
     at_s: float
@@ -112,6 +118,7 @@ class PlacedByHand:
     y_m: float
     yaw_deg: float
     within_m: float
+    by: Literal["hand", "clouds"] = "hand"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,7 +128,7 @@ class Pair:
     query, map : names of recordings. until_s : only so many seconds of `map` become the map; None: all of it.
     window_s : length of a window. windows : how many, evenly spread over the recording, in the map of its own
         beginning over what comes after it. within_s : seconds of the recording over which they are spread.
-    by_hand : judges the answers, by the recording's own trajectory from there.
+    placed : judges the answers, by the recording's own trajectory from there.
     """
 
     query: str
@@ -131,7 +138,7 @@ class Pair:
     windows: int
     until_s: float | None = None
     within_s: tuple[float, float] | None = None
-    by_hand: PlacedByHand | None = None
+    placed: Placed | None = None
     quick: bool = False
 
     @property
@@ -145,9 +152,9 @@ def beginning_of(name: str, until_s: float | None) -> str:
     return name if until_s is None else f"{name} 0..{until_s:g} s"
 
 
-def _laser(name: str, building: str, *, file: str | None = None, **known: object) -> Recording:
+def _laser(name: str, building: str, *, file: str | None = None, **known: Any) -> Recording:
     path = file or f"laser/{name}.mcap"
-    return Recording(name=name, file=path, building=building, sensor="laser", **known)  # type: ignore[arg-type]
+    return Recording(name=name, file=path, building=building, sensor="laser", **known)
 
 
 def _map(name: str, file: str, building: str, *, quick: bool = False) -> Recording:
@@ -162,93 +169,27 @@ def _corrected(name: str, building: str, *, relations: bool = True, quick: bool 
     )
 
 
-def _sparse(name: str) -> Recording:
-    poses = f"laser/sparse/{name}.tum"
-    return _laser(name, name, file=f"laser/sparse/{name}.mcap", truth=poses, poses=poses)
-
-
-def _jarvis(lasers: str, *, late_s: float = 0.0, quick: bool = False) -> Recording:
-    poses = "laser/jarvis/circular_path_fast.tum"
-    return _laser(
-        f"jarvis {lasers}",
-        "jarvis",
-        file="laser/jarvis/circular_path_fast.mcap",
-        options=("--topic", f"/{lasers}_scan"),
-        truth=poses,
-        poses=poses,
-        late_s=late_s,
-        of_base=True,
-        quick=quick,
-    )
-
-
-def _phone(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
-    poses = f"depth/room/{name}.tum"
+def _posed(name: str, file: str, building: str, sensor: Source = "lidar", **known: Any) -> Recording:
+    """Return a recording with the true poses of its sensor beside it."""
+    poses = str(Path(file).with_suffix(".tum"))
     return Recording(
-        name=name + ("" if odometry else " without odometry"),
-        file=f"depth/room/{name}.mcap",
-        building="room",
-        sensor="depth",
-        options=() if odometry else ("--odometry", "none"),
-        truth=poses,
-        poses=poses,
-        of_base=True,
-        quick=quick,
+        name=name, file=file, building=building, sensor=sensor, truth=poses, poses=poses, **known
     )
 
 
-def _kidnap(name: str, file: str, *, quick: bool = False) -> Recording:
-    return _laser(name, "kidnap", file=f"laser/kidnap/{file}", quick=quick)
+def _jarvis(lasers: str, **known: Any) -> Recording:
+    file, options = "laser/jarvis/circular_path_fast.mcap", ("--topic", f"/{lasers}_scan")
+    return _posed(f"jarvis {lasers}", file, "jarvis", "laser", options=options, of_base=True, **known)
 
 
-def _corridor(name: str, *, odometry: bool = True, quick: bool = False) -> Recording:
-    poses = "depth/corridor_phone/corridor.tum"
-    return Recording(
-        name=name,
-        file="depth/corridor_phone/corridor.mcap",
-        building="corridor",
-        sensor="depth",
-        options=() if odometry else ("--odometry", "none"),
-        truth=poses,
-        poses=poses,
-        of_base=True,
-        quick=quick,
-    )
+def _phone(name: str, folder: str, building: str, *, quick: bool = False) -> Recording:
+    """Return a recording of a phone, which has its own visual-inertial odometry."""
+    return _posed(name, f"depth/{folder}/{name}.mcap", building, "depth", of_base=True, quick=quick)
 
 
-def _small_room(name: str, file: str) -> Recording:
-    return _laser(name, "small room", file=f"laser/small_room/{file}", same_place=(0, 326, 649))
-
-
-_SCAN = "lidar/fr079_floor.ply"
-
-
-def _driven(name: str, sensor: SensorKind, length_m: float, seed: int, *, mapped: bool = True) -> Recording:
-    """Return a drive through the 3D scan of fr079's floor."""
-    return Recording(
-        name=name,
-        file=_SCAN,
-        building="fr079",
-        sensor=sensor,
-        drive=SimulatedDrive(sensor=sensor, length_m=length_m, seed=seed),
-        mapped=mapped,
-        truth=_SCAN,
-        poses=_SCAN,
-        of_base=True,
-    )
-
-
-def _hall(every: int, name: str, *, quick: bool = False) -> Recording:
-    return Recording(
-        name=name,
-        file="lidar/hall.mcap",
-        building="hall",
-        sensor="lidar",
-        every=every,
-        truth="lidar/hall.tum",
-        poses="lidar/hall.tum",
-        quick=quick,
-    )
+def _without_odometry(recording: Recording, *, quick: bool = False) -> Recording:
+    name, options = f"{recording.name} without odometry", ("--odometry", "none")
+    return replace(recording, name=name, options=options, quick=quick)
 
 
 def _with_control(recording: Recording) -> tuple[Recording, Recording]:
@@ -258,51 +199,63 @@ def _with_control(recording: Recording) -> tuple[Recording, Recording]:
     return recording, replace(recording, name=name, options=recording.options + without, quick=False)
 
 
-_E1R = Recording(
-    name="e1r_office_a",
-    file="lidar/e1r_office_a.mcap",
-    building="e1r office",
-    sensor="lidar",
-    truth="lidar/e1r_office_a.tum",
-    poses="lidar/e1r_office_a.tum",
-)
+def _kidnap(name: str, file: str, *, quick: bool = False) -> Recording:
+    return _laser(name, "kidnap", file=f"laser/kidnap/{file}", quick=quick)
+
+
+def _small_room(name: str, file: str) -> Recording:
+    return _laser(name, "small room", file=f"laser/small_room/{file}", same_place=(0, 326, 649))
+
+
+_SCAN = "lidar/fr079_floor.ply"
+
+
+def _driven(name: str, drive: SimulatedDrive, *, mapped: bool = True) -> Recording:
+    """Return a drive through the 3D scan of fr079's floor."""
+    return Recording(
+        name=name,
+        file=_SCAN,
+        building="fr079",
+        sensor=drive.sensor,
+        drive=drive,
+        mapped=mapped,
+        truth=_SCAN,
+        poses=_SCAN,
+        of_base=True,
+    )
+
+
+_HALL = _posed("hall", "lidar/hall.mcap", "hall", quick=True)
+_E1R = _posed("e1r_office_a", "lidar/e1r_office_a.mcap", "e1r office")
+_ROOM_A = _phone("room_a", "room", "room")
+_ROOM_B = _phone("room_b", "room", "room", quick=True)
+_CORRIDOR = _phone("corridor", "corridor_phone", "corridor", quick=True)
+_CSAIL = _corrected("csail", "csail", quick=True)
+
+_AGAIN = SimulatedDrive(sensor="lidar", length_m=70.0, seed=1)
 
 RECORDINGS: tuple[Recording, ...] = (
-    _hall(1, "hall", quick=True),
-    *_with_control(_hall(2, "hall, every 2nd scan", quick=True)),
-    *_with_control(_hall(3, "hall, every 3rd scan", quick=True)),
+    _HALL,
+    *_with_control(replace(_HALL, name="hall, every 2nd scan", every=2)),
+    *_with_control(replace(_HALL, name="hall, every 3rd scan", every=3)),
     _E1R,
     *_with_control(replace(_E1R, name="e1r_office_a, every 4th scan", every=4)),
-    _phone("room_a"),
-    _phone("room_a", odometry=False),
-    _phone("room_b", quick=True),
-    _phone("room_b", odometry=False, quick=True),
-    Recording(
-        name="kitchen",
-        file="depth/kitchen.mcap",
-        building="kitchen",
-        sensor="depth",
-        truth="depth/kitchen.tum",
-        poses="depth/kitchen.tum",
-    ),
-    _corridor("corridor", quick=True),
-    _corridor("corridor without odometry", odometry=False),
+    _ROOM_A,
+    _without_odometry(_ROOM_A),
+    _ROOM_B,
+    _without_odometry(_ROOM_B, quick=True),
+    _posed("kitchen", "depth/kitchen.mcap", "kitchen", "depth"),
+    _CORRIDOR,
+    _without_odometry(_CORRIDOR),
     _corrected("fr079", "fr079"),
     _corrected("intel", "intel"),
-    _corrected("csail", "csail", quick=True),
+    _CSAIL,
     _corrected("killian", "killian", relations=False),
-    _laser(
-        "csail without odometry",
-        "csail",
-        file="laser/csail.mcap",
-        options=("--odometry", "none"),
-        truth="laser/csail.relations",
-        poses="laser/csail_corrected.tum",
-    ),
+    _without_odometry(_CSAIL),
     _laser("aces", "aces", file="laser/aces_ros1.bag"),
-    _sparse("acapulco"),
-    _sparse("belgioioso"),
-    _sparse("orebro"),
+    _posed("acapulco", "laser/sparse/acapulco.mcap", "acapulco", "laser"),
+    _posed("belgioioso", "laser/sparse/belgioioso.mcap", "belgioioso", "laser"),
+    _posed("orebro", "laser/sparse/orebro.mcap", "orebro", "laser"),
     _laser("workshop_1", "workshop", file="laser/workshop/workshop_1.mcap"),
     _laser("workshop_1_changed", "workshop", file="laser/workshop/workshop_1_changed.mcap"),
     _laser("wean 1", "wean", file="laser/wean/robotdata1.mcap", quick=True),
@@ -321,10 +274,10 @@ RECORDINGS: tuple[Recording, ...] = (
     # One turn takes 0.125 s. Its headings fit the true ones best 0.12 s before its stamps.
     _jarvis("nav", late_s=0.12, quick=True),
     _jarvis("safety", quick=True),
-    _driven("fr079 lidar", "lidar", 150.0, 1000),
-    _driven("fr079 depth", "depth", 150.0, 1000),
-    _driven("fr079 lidar again", "lidar", 70.0, 1, mapped=False),
-    _driven("fr079 depth again", "depth", 70.0, 1, mapped=False),
+    _driven("fr079 lidar", MAP_DRIVE),
+    _driven("fr079 depth", replace(MAP_DRIVE, sensor="depth")),
+    _driven("fr079 lidar again", _AGAIN, mapped=False),
+    _driven("fr079 depth again", replace(_AGAIN, sensor="depth"), mapped=False),
     _map("fr079_floor.ply", _SCAN, "fr079"),
     _map("fr079.yaml", "maps/fr079.yaml", "fr079"),
     _map("intel.yaml", "maps/intel.yaml", "intel"),
@@ -370,15 +323,20 @@ def _in_corridor(query: str, *, quick: bool = False) -> Pair:
     return replace(_pair("same recording", query, "corridor", 8.0, 8, quick=quick), within_s=within_s)
 
 
+def _in_other_room(x_m: float, y_m: float, yaw_deg: float) -> Placed:
+    """Return where one of two walks through a room begins in the map of the other one."""
+    return Placed(at_s=0.0, x_m=x_m, y_m=y_m, yaw_deg=yaw_deg, within_m=0.3, by="clouds")
+
+
 def _under_nav(query: str, window_s: float) -> Pair:
     """Return a pair of a laser whose height is not known, or is that of a robot, with the map of another
     building's at 2.0 m."""
     return _pair("elsewhere", query, "jarvis nav", window_s, 4)
 
 
-def _in_wean_yaml(query: str, by_hand: PlacedByHand, *, quick: bool = False) -> Pair:
+def _in_wean_yaml(query: str, placed: Placed, *, quick: bool = False) -> Pair:
     """Return a pair with a drawn map in which no three answers agree."""
-    return replace(_pair("published map", query, "wean.yaml", 20.0, 8, quick=quick), by_hand=by_hand)
+    return replace(_pair("published map", query, "wean.yaml", 20.0, 8, quick=quick), placed=placed)
 
 
 PAIRS: tuple[Pair, ...] = (
@@ -406,8 +364,11 @@ PAIRS: tuple[Pair, ...] = (
     _pair("other day", "workshop_1_changed", "workshop_1", 4.0, 8),
     _pair("other day", "hallway", "hallway2", 8.0, 8),
     _pair("other day", "hallway2", "hallway", 6.0, 6),
-    _pair("other day", "room_b", "room_a", 5.0, 4, quick=True),
-    _pair("other day", "room_a", "room_b", 5.0, 8),
+    replace(
+        _pair("other day", "room_b", "room_a", 5.0, 4, quick=True),
+        placed=_in_other_room(-0.0734, -0.0081, 0.518),
+    ),
+    replace(_pair("other day", "room_a", "room_b", 5.0, 8), placed=_in_other_room(0.0736, 0.0076, -0.590)),
     _pair("other sensor", "jarvis safety", "jarvis nav", 6.0, 6, quick=True),
     _pair("other sensor", "jarvis nav", "jarvis safety", 6.0, 6, quick=True),
     # Lidar and depth camera are driven through the real 3D scan of the floor; the laser and its log are real.
@@ -421,10 +382,8 @@ PAIRS: tuple[Pair, ...] = (
     _across("fr079 depth again", "fr079 lidar"),
     _across("fr079 depth again", "fr079_floor.ply"),
     # Along the hall, from a room's door to the end, wean.yaml is some 0.8 m longer than both drives.
-    _in_wean_yaml(
-        "wean 1", PlacedByHand(at_s=30.0, x_m=46.4, y_m=9.2, yaw_deg=-3.6, within_m=1.0), quick=True
-    ),
-    _in_wean_yaml("wean 3", PlacedByHand(at_s=30.0, x_m=43.5, y_m=9.4, yaw_deg=-3.8, within_m=1.0)),
+    _in_wean_yaml("wean 1", Placed(at_s=30.0, x_m=46.4, y_m=9.2, yaw_deg=-3.6, within_m=1.0), quick=True),
+    _in_wean_yaml("wean 3", Placed(at_s=30.0, x_m=43.5, y_m=9.4, yaw_deg=-3.8, within_m=1.0)),
     _pair("published map", "birmingham", "lgfloor.yaml", 15.0, 10),
     _pair("published map", "workshop_1", "workshop_1.yaml", 3.0, 10, quick=True),
     _pair("published map", "workshop_1_changed", "workshop_1.yaml", 3.0, 10),
@@ -582,6 +541,11 @@ _MAPPED_S, _WINDOW_S, _WINDOWS = 600.0, 20.0, 10
 """The beginning, and windows: at most so long, and so many. As in the catalogue."""
 
 
+def beginning_s(length_s: float) -> float:
+    """Return how much of a recording becomes the map in which the rest is located."""
+    return round(min(_MAPPED_S, length_s / 2), 1)
+
+
 def own_recordings(data: Path, *, without: Path, of_base: bool) -> tuple[list[Recording], list[Pair]]:
     """Return the recordings of a folder that the catalogue does not name, and which are asked in which maps.
 
@@ -602,7 +566,7 @@ def own_recordings(data: Path, *, without: Path, of_base: bool) -> tuple[list[Re
     for query, length_s in lengths_s.items():
         if length_s is None:
             continue
-        until_s = round(min(_MAPPED_S, length_s / 2), 1)
+        until_s = beginning_s(length_s)
         later = _asked("later part", query, query, length_s - until_s)
         pairs += [replace(later, until_s=until_s)]
         pairs += [

@@ -1,4 +1,4 @@
-"""The one judge: maps by the truth of their trajectories, answers by true poses, by clouds, or by each other.
+"""The one judge: maps by the truth of their trajectories, answers by true poses, or by each other.
 
 A recording that is followed as it is, too, says how it lies in the map: its surest looks agree on that. So a
 place after a kidnap is judged by what the robot said there when nobody had carried it away.
@@ -6,14 +6,12 @@ place after a kidnap is judged by what the robot said there when nobody had carr
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -27,7 +25,7 @@ from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.observer import TimeSpan
 from pc2grid.pipeline import follow
 from pc2grid_cli.options import Reading
-from pc2grid_lab.recordings.catalogue import Catalogue, Pair, PlacedByHand, Recording
+from pc2grid_lab.recordings.catalogue import Catalogue, Pair, Placed, Recording
 from pc2grid_lab.recordings.run import Folder, Followed
 from pc2grid_lab.recordings.table import (
     MISSING,
@@ -50,17 +48,16 @@ from pc2grid_lab.truth import (
     SAME_NS,
     Clue,
     Frame,
-    Relations,
+    Relation,
     agreed_frame,
-    cloud_along,
     fit_frame,
     is_right,
     nearest,
     pose_at_stamp,
     read_relations,
-    registered_clouds,
-    relation_error,
-    trajectory_error,
+    relation_errors,
+    rms,
+    trajectory_errors,
 )
 from signature.config import Config
 from signature.database import open_database
@@ -239,7 +236,7 @@ def map_row(recording: Recording, folder: Folder) -> MapRow:
     }
     if folder.missing(recording):
         return MapRow(**row, problem=MISSING)
-    done = kept_result(folder.result(recording.name))
+    done = kept_result(folder.kept("maps", recording.name))
     if done is None:
         return MapRow(**row, problem=NOT_RUN)
     if done.failed:
@@ -260,7 +257,7 @@ def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, 
     reports = [session["report"] for session in stored]
     read = sum(report["scans_read"] for report in reports)
     skipped = sum(sum(report["scans_skipped"].values()) for report in reports)
-    bare = kept_result(folder.bare(recording.name))
+    bare = kept_result(folder.kept("bare", recording.name))
     bare_of: dict[str, Any] = {} if bare is None or bare.failed else bare.document
     error = _error(recording, folder)
     texts = itertools.chain.from_iterable(report["warnings"] for report in reports)
@@ -283,51 +280,36 @@ def _error(recording: Recording, folder: Folder) -> dict[str, Any]:
     itself."""
     parts, truth = list(sessions(folder, recording.name).values()), folder.true(recording, recording.truth)
     if recording.same_place:
-        return {"truth": "loops", **_relation_error(parts, _loops(recording, folder), SE2())}
+        return {"truth": "loops", **_relation_error(parts, _loops(recording, folder))}
     if truth is None:
         return {}
     if truth.suffix == ".relations":
         T_base_sensor = SE2.from_matrix(mount(folder, recording))
         return {"truth": "relations", **_relation_error(parts, read_relations(truth), T_base_sensor)}
-    return {"truth": "poses", **_pose_error(parts, truth)}
+    true = read_tum(truth)
+    errors_m = np.concatenate([trajectory_errors(part, true) for part in parts])
+    compared = len(errors_m) / max(sum(len(part) for part in parts), 1)
+    return {"truth": "poses", "compared": compared} | ({"error_m": rms(errors_m)} if len(errors_m) else {})
 
 
-def _loops(recording: Recording, folder: Folder) -> Relations:
+def _loops(recording: Recording, folder: Folder) -> list[Relation]:
     """Return relations: from each scan of `Recording.same_place` to the next one the sensor has not moved."""
     with open_log(folder.source(recording), config_of(recording).read) as log:
-        stamps = {number: scan.stamp_ns for number, scan in enumerate(log.scans())}
-    there = np.array([stamps[number] for number in recording.same_place])
-    return Relations(first_ns=there[:-1], second_ns=there[1:], T_first_second=np.zeros((len(there) - 1, 3)))
+        stamps = [scan.stamp_ns for scan in log.scans()]
+    there = [stamps[number] for number in recording.same_place]
+    return [(first_ns, second_ns, SE2()) for first_ns, second_ns in itertools.pairwise(there)]
 
 
 def _relation_error(
-    parts: Sequence[Trajectory], relations: Relations, T_base_sensor: SE2
+    parts: Sequence[Trajectory], relations: Sequence[Relation], T_base_sensor: SE2 | None = None
 ) -> dict[str, float]:
     """Return mean errors over the relations that lie in one part."""
-    offset_m = (T_base_sensor.x, T_base_sensor.y)
-    found = [relation_error(part, relations, base_to_reference_m=offset_m) for part in parts]
-    found = [error for error in found if error.used]
-    if not found:
+    errors = np.concatenate([relation_errors(part, relations, T_base_sensor) for part in parts])
+    if not len(errors):
         return {"compared": 0.0}
-    used = [error.used for error in found]
-    return {
-        "error_m": float(np.average([error.translation_m for error in found], weights=used)),
-        "error_deg": float(np.average([error.rotation_deg for error in found], weights=used)),
-        "compared": sum(used) / found[0].total,
-    }
-
-
-def _pose_error(parts: Sequence[Trajectory], truth: Path) -> dict[str, float]:
-    """Return the RMS distance from the true poses, each part aligned by itself."""
-    true = read_tum(truth)
-    found = [error for part in parts if (error := trajectory_error(part, true)) is not None]
-    if not found:
-        return {"compared": 0.0}
-    poses = [error.poses for error in found]
-    return {
-        "error_m": float(np.sqrt(np.average([error.ate_m**2 for error in found], weights=poses))),
-        "compared": sum(poses) / max(sum(len(part) for part in parts), 1),
-    }
+    error_m, error_rad = errors.mean(axis=0).tolist()
+    compared = len(errors) / len(relations)
+    return {"error_m": error_m, "error_deg": math.degrees(error_rad), "compared": compared}
 
 
 def warned(texts: Iterable[str], *, error_m: float | None) -> tuple[Warned, ...]:
@@ -433,7 +415,6 @@ class Judge:
         self._windows: dict[Pair, list[LocatedWindow]] = {}
         self._followed: dict[Followed, Frame | None] = {}
         self._lie: dict[str, nx.Graph] = {}
-        self._by_clouds = functools.cache(self._registered)
 
     def row(self, pair: Pair) -> PairRow:
         """Return the row of a pair; what cannot be judged is a row that says why."""
@@ -457,45 +438,43 @@ class Judge:
         Of a pair with another building, every window, and no place.
         """
         query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
-        if pair.kind == "elsewhere":
-            yield from ((one.span, {}, False) for one in self._located_windows(pair))
-            return
         _, windows, frames = self._frames(pair, query, map_)
-        known = grids(self._folder, pair.map_name)
         for one in windows:
             expected = _expected(one, frames)
-            if expected:
+            if expected or pair.kind == "elsewhere":
                 poses = {session: pose for session, (pose, _) in expected.items()}
-                yield one.span, poses, _covered(one, expected, known)
+                yield one.span, poses, self._covered(pair, one, expected)
 
     def _judged(self, pair: Pair, query: Recording, map_: Recording, row: dict[str, Any]) -> PairRow:
         problem = self._problem(pair)
         if problem:
             return PairRow(**row, problem=problem)
-        if pair.kind == "elsewhere":
-            queries = tuple(
-                QueryRow(**_answered(one), right=None if one.answer is None else False, covered=False)
-                for one in self._located_windows(pair)
-            )
-            return PairRow(**row, truth="elsewhere", queries=queries)
         truth, windows, frames = self._frames(pair, query, map_)
-        known = grids(self._folder, pair.map_name)
         return PairRow(
             **row,
             truth=truth,
             agreeing=sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None,
-            queries=tuple(self._row_of(pair, one, frames, known) for one in windows),
+            queries=tuple(self._row_of(pair, query, one, frames) for one in windows),
         )
 
-    def _row_of(
-        self, pair: Pair, one: LocatedWindow, frames: Frames, known: Mapping[str, OccupancyGrid]
-    ) -> QueryRow:
-        """Return the row of a window; where it is missed, with what `--check` says of its true pose."""
-        row = _judged(one, frames, known)
-        if not row.missed:
+    def _row_of(self, pair: Pair, query: Recording, one: LocatedWindow, frames: Frames) -> QueryRow:
+        """Judge an answer by where the query is in the sessions of the map; where it is missed, with what
+        `--check` says of its true pose."""
+        row, expected = _answered(one), _expected(one, frames)
+        if one.answer is not None and pair.kind == "elsewhere":
+            return replace(row, right=False, covered=False)
+        if one.answer is None or not expected:
             return row
-        query = self._catalogue.recordings[pair.query]
-        return replace(row, fine=self._fine(pair, query, one, _expected(one, frames)))
+        row = replace(row, covered=self._covered(pair, one, expected), **_best(one.places, expected))
+        return replace(row, fine=self._fine(pair, query, one, expected)) if row.missed else row
+
+    def _covered(self, pair: Pair, one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]]) -> bool:
+        """Return whether a map knows the ground that a window has last seen."""
+        known = grids(self._folder, pair.map_name)
+        return any(
+            known_share(known[session], T_map_base.apply(one.hits_m)) >= JUDGEMENT.mapped
+            for session, (T_map_base, _) in expected.items()
+        )
 
     def _fine(
         self, pair: Pair, query: Recording, one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]]
@@ -517,7 +496,7 @@ class Judge:
         """Return the row of a recording that was followed; where there is no result, one that says why."""
         building = self._catalogue.recordings[one.map].building
         row = FollowedRow(before=one.before, after=one.after, map=one.map_name, building=building)
-        done = kept_result(self._folder.followed(one))
+        done = kept_result(self._folder.kept("followed", one.asked))
         if done is None or done.failed:
             return replace(row, problem=NOT_RUN if done is None else done.error or MISSING)
         if one.after is not None:
@@ -563,7 +542,7 @@ class Judge:
         drive = drive_of(self._catalogue.recordings[name], self._folder)
         alone = replace(one, before=name, after=None)
         if alone not in self._followed:
-            done = kept_result(self._folder.followed(alone))
+            done = kept_result(self._folder.kept("followed", alone.asked))
             looks = [] if done is None or done.failed else done.document["looks"]
             clues = [
                 Clue(own[1], _pose(said), (name, number), said["confidence"])
@@ -578,7 +557,7 @@ class Judge:
         """Return the row of two maps that were compared; where there is no result, one that says why."""
         building, other = (self._catalogue.recordings[name].building for name in (target, source))
         row = JoinRow(target=target, source=source, same=building == other)
-        done = kept_result(self._folder.join(target, source))
+        done = kept_result(self._folder.kept("joins", f"{source}.in.{target}"))
         if done is None or done.failed:
             return replace(row, problem=NOT_RUN if done is None else done.error)
         found, right, error_m = done.document, None if row.same else False, None
@@ -640,7 +619,7 @@ class Judge:
     def _problem(self, pair: Pair) -> str:
         if gaps := self._folder.gaps(self._catalogue, pair):
             return f"{gaps[0]}: {MISSING}"
-        done = kept_result(self._folder.result(pair.map_name))
+        done = kept_result(self._folder.kept("maps", pair.map_name))
         if done is None:
             return f"{pair.map_name}: {NOT_RUN}"
         return f"no map: {done.error}" if done.failed else ""
@@ -658,30 +637,24 @@ class Judge:
         if one.answer is None or pair.kind == "elsewhere":
             return one
         stamp_ns = int(one.answer["query"]["stamp_ns"])
-        where = drive_of(query, self._folder).where(stamp_ns)
+        drive = drive_of(query, self._folder)
+        where = drive.where(stamp_ns) if pair.placed is None else drive.own_pose(stamp_ns)
         return replace(one, where=where, hits_m=hits_at(self._folder, query, stamp_ns))
 
     def _frames(
         self, pair: Pair, query: Recording, map_: Recording
     ) -> tuple[Truth | None, list[LocatedWindow], Frames]:
         """Return the windows, and how the parts of the drive lie in the sessions of the map: by true poses,
-        by the trajectory of the whole recording, by hand, by the clouds of both, or else by the answers."""
+        by the trajectory of the whole recording, by a pose that was found once, or else by the answers."""
         windows = self._located_windows(pair)
+        if pair.kind == "elsewhere":
+            return "elsewhere", windows, {}
         if query.poses is not None and query.poses == map_.poses:
             return "poses", windows, self._by_scans(pair, map_)
         if pair.query == pair.map:
             return "trajectory", windows, self._by_scans(pair, map_)
-        if pair.by_hand is not None:
-            return "hand", windows, self._by_hand(query, pair.by_hand)
-        if pair.until_s is None and (by_clouds := self._by_clouds(query, map_)) is not None:
-            drive = drive_of(query, self._folder)
-            own = [
-                replace(
-                    one, where=drive.own_pose(int(one.answer["query"]["stamp_ns"])) if one.answer else None
-                )
-                for one in windows
-            ]
-            return "clouds", own, {(0, _SESSION): by_clouds}
+        if pair.placed is not None:
+            return pair.placed.by, windows, self._placed(query, pair.placed)
         shared = self._shared(pair) if map_.sensor == "map" else None
         windows, frames = shared or (windows, _agreed([*_said(windows), *self._said_back(pair)]))
         return ("agreement" if frames else None), windows, frames
@@ -706,22 +679,6 @@ class Judge:
         for (number, session), clue in _said(self._located_windows(back)):
             turned = Clue(clue.T_map_base, clue.T_drive_base, clue.query, clue.weight)
             yield (parts.index(session), names[number]), turned
-
-    def _registered(self, query: Recording, map_: Recording) -> Frame | None:
-        """Return the frame of a recording in the map of another one, by the clouds of both; None if they have
-        none, or are not clear."""
-        parts = [drive_of(one, self._folder).parts for one in (query, map_)]
-        if any(r.sensor not in ("lidar", "depth") for r in (query, map_)) or not all(parts):
-            return None
-        drives, clouds = [of_one[0] for of_one in parts], []
-        for recording, drive in zip((query, map_), drives, strict=True):
-            with open_log(self._folder.source(recording), config_of(recording).read) as log:
-                clouds.append(cloud_along(log, drive))
-        T_map_query = registered_clouds(clouds[0], clouds[1])
-        if T_map_query is None:
-            return None
-        ways = [SE2.from_matrix(drives[0].T_session_base[k]) for k in _steps(drives[0])]
-        return Frame(tuple(Clue(pose, T_map_query @ pose) for pose in ways))
 
     def _shared(self, pair: Pair) -> tuple[list[LocatedWindow], Frames] | None:
         """Return the windows and frames of several drives in one map, whose answers judge each other: those
@@ -769,7 +726,7 @@ class Judge:
                     clues.setdefault((where[0], session), []).append(clue)
         return {key: Frame(tuple(found)) for key, found in clues.items() if len(found) >= 2}
 
-    def _by_hand(self, query: Recording, known: PlacedByHand) -> Frames:
+    def _placed(self, query: Recording, known: Placed) -> Frames:
         """Return the frame of the recording's first part in the map, by one pose."""
         drive = drive_of(query, self._folder).parts[0]
         at_ns = drive.stamps_ns[0] + round(known.at_s * 1e9)
@@ -803,33 +760,22 @@ def _agreed(said: Iterable[tuple[tuple[int, str], Clue]]) -> Frames:
     return {key: frame for key, frame in found if frame is not None}
 
 
-def _answered(one: LocatedWindow) -> dict[str, Any]:
+def _answered(one: LocatedWindow) -> QueryRow:
     """Return what a row holds of an answer before it is judged."""
-    row: dict[str, Any] = {"window": one.window, "start_s": one.span.start_s}
+    row = QueryRow(window=one.window, start_s=one.span.start_s)
     if one.done is None:
-        return {**row, "problem": NOT_RUN}
+        return replace(row, problem=NOT_RUN)
+    row = replace(row, cpu_s=one.done.cpu_s)
     if one.answer is None:
-        return {**row, "problem": one.done.error, "cpu_s": one.done.cpu_s}
+        return replace(row, problem=one.done.error)
     space = one.answer.get("in_space")
-    return {
-        **row,
-        "status": one.answer["status"],
-        "confidence": one.answer["confidence"],
-        "travel_m": one.answer["query"]["path_m"],
-        "in_space": None if space is None else space["status"],
-        "cpu_s": one.done.cpu_s,
-    }
-
-
-def _judged(one: LocatedWindow, frames: Frames, grids: Mapping[str, OccupancyGrid]) -> QueryRow:
-    """Judge an answer by where the query is in the sessions of the map."""
-    row = _answered(one)
-    if one.answer is None or one.where is None:
-        return QueryRow(**row)
-    expected = _expected(one, frames)
-    if not expected:
-        return QueryRow(**row)
-    return QueryRow(**row, covered=_covered(one, expected, grids), **_best(one.places, expected))
+    return replace(
+        row,
+        status=one.answer["status"],
+        confidence=one.answer["confidence"],
+        travel_m=one.answer["query"]["path_m"],
+        in_space=None if space is None else space["status"],
+    )
 
 
 def _expected(one: LocatedWindow, frames: Frames) -> dict[str, tuple[SE2, float]]:
@@ -843,15 +789,6 @@ def _expected(one: LocatedWindow, frames: Frames) -> dict[str, tuple[SE2, float]
         for (of_part, session), frame in frames.items()
         if of_part == part
     }
-
-
-def _covered(
-    one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]], grids: Mapping[str, OccupancyGrid]
-) -> bool:
-    return any(
-        known_share(grids[session], T_map_base.apply(one.hits_m)) >= JUDGEMENT.mapped
-        for session, (T_map_base, _) in expected.items()
-    )
 
 
 def _best(

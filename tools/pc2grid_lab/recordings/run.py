@@ -47,13 +47,14 @@ from pc2grid_lab.recordings.catalogue import (
     write_drive,
 )
 from pc2grid_lab.runner import Finished, Task, in_processes, kept_result, pc2grid, run, run_tasks
-from pc2grid_lab.truth import trajectory_error
+from pc2grid_lab.truth import rms, trajectory_errors
 from signature.database import open_database
 from signature.localization.joining.join import JoinableMap, join_maps
 from signature.localization.map_index import MapIndex
 
-_RESULTS = ("maps", "bare", "answers", "followed", "joins")
-"""Folders of results."""
+RESULTS = ("maps", "bare", "answers", "followed", "joins")
+"""Folders of the results: of `convert`, of bare KISS-ICP, of `relocalize` for each window, of `watch`, and of
+comparing two maps."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,35 +87,19 @@ class Folder:
             return None
         return self.data / file if recording.drive is None else self.source(recording).with_suffix(".tum")
 
+    def kept(self, kind: str, name: str) -> Path:
+        """Return the result of a command. kind : one of `RESULTS`. name : of the map, the pair of maps, or
+        the row and its map."""
+        return self.work / kind / f"{as_file_name(name)}.json"
+
     def map(self, name: str) -> Path:
         """Return the database of a map, beside the result of `convert`."""
-        return self.work / "maps" / f"{as_file_name(name)}.submaps"
-
-    def result(self, name: str) -> Path:
-        """Return the result of `convert` for a map."""
-        return self.map(name).with_suffix(".json")
-
-    def bare(self, name: str) -> Path:
-        """Return the result of bare KISS-ICP."""
-        return self.work / "bare" / f"{as_file_name(name)}.json"
-
-    def has_bare(self, recording: Recording) -> bool:
-        """Return whether bare KISS-ICP runs on it: it knows lidars, and real ones are there to be
-        compared."""
-        return recording.sensor == "lidar" and recording.drive is None and not self.missing(recording)
+        return self.kept("maps", name).with_suffix(".submaps")
 
     def answer(self, pair: Pair, window: TimeSpan) -> Path:
         """Return the result of `relocalize` for a window."""
-        named = f"{as_file_name(pair.query)}.in.{as_file_name(pair.map_name)}"
-        return self.work / "answers" / f"{named}.{window.start_s:.2f}s.{window.duration_s:g}s.json"
-
-    def followed(self, one: Followed) -> Path:
-        """Return the result of `watch` for a row."""
-        return self.work / "followed" / f"{as_file_name(one.name)}.in.{as_file_name(one.map_name)}.json"
-
-    def join(self, target: str, source: str) -> Path:
-        """Return the result of comparing two maps."""
-        return self.work / "joins" / f"{as_file_name(source)}.in.{as_file_name(target)}.json"
+        asked = f"{pair.query}.in.{pair.map_name}.{window.start_s:.2f}s.{window.duration_s:g}s"
+        return self.kept("answers", asked)
 
     def missing(self, recording: Recording) -> bool:
         """Return whether the data folder lacks the recording, so that it is a gap of the page."""
@@ -127,7 +112,7 @@ class Folder:
 
     def cpu_s(self) -> float:
         """Return the processor time of all commands whose result is here."""
-        results = (kept_result(file) for kind in _RESULTS for file in (self.work / kind).glob("*.json"))
+        results = (kept_result(file) for kind in RESULTS for file in (self.work / kind).glob("*.json"))
         return sum(done.cpu_s for done in results if done is not None)
 
     def length_s(self, recording: Recording) -> float:
@@ -168,6 +153,11 @@ class Followed:
     def map_name(self) -> str:
         """Return the map, with the part of the recording that it is made from."""
         return beginning_of(self.map, self.until_s)
+
+    @property
+    def asked(self) -> str:
+        """Return the name of the result."""
+        return f"{self.name}.in.{self.map_name}"
 
 
 def _in(map_: str, *others: str) -> Iterator[Followed]:
@@ -246,7 +236,7 @@ def _watched(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
         document = {"looks": looks, "put_down_ns": put_down_ns, "shift_ns": shift_ns}
         return done if done.failed else replace(done, document=document)
 
-    return Task(folder.followed(one), do)
+    return Task(folder.kept("followed", one.asked), do)
 
 
 def run_all(
@@ -272,7 +262,9 @@ def run_all(
     waiting = [(folder, one) for one in read.values() if not folder.source(one).exists()]
     in_processes(_make, waiting, jobs=jobs, advance=lambda share: None)
     tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
-    tasks += [_bare(folder, one) for one in catalogue.mapped if folder.has_bare(one)]
+    # Bare KISS-ICP knows lidars, and the real ones are there to be compared.
+    real = [r for r in catalogue.mapped if r.drive is None and not folder.missing(r)]
+    tasks += [_bare(folder, one) for one in real if one.sensor == "lidar"]
     joins = [_joined(folder, *pair) for pair in catalogue.joins]
     count = len(tasks) + sum(pair.windows for pair in pairs) + len(further) + len(joins)
     run_tasks(tasks, jobs, lambda done: advance(done / count))
@@ -341,14 +333,14 @@ def _convert(folder: Folder, name: str, recording: Recording, until_s: float | N
         return pc2grid("-q", "convert", source, *options)
 
     size = source.stat().st_size if source.exists() else 0
-    return Task(folder.result(name), do, float(size))
+    return Task(folder.kept("maps", name), do, float(size))
 
 
 def _bare(folder: Folder, recording: Recording) -> Task:
     truth = folder.true(recording, recording.truth)
     poses = () if truth is None or truth.suffix != ".tum" else (truth,)
     command = (sys.executable, "-m", "pc2grid_lab.recordings.run", folder.source(recording), *poses)
-    return Task(folder.bare(recording.name), lambda: run(*command, limit_s=1800.0))
+    return Task(folder.kept("bare", recording.name), lambda: run(*command, limit_s=1800.0))
 
 
 def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) -> Task:
@@ -369,7 +361,7 @@ _JOIN = "from pc2grid_lab.recordings.run import print_join; print_join()"
 def _joined(folder: Folder, target: str, source: str) -> Task:
     """Return the task that compares two maps."""
     command = (sys.executable, "-c", _JOIN, folder.map(target), folder.map(source))
-    return Task(folder.join(target, source), lambda: run(*command, limit_s=1800.0))
+    return Task(folder.kept("joins", f"{source}.in.{target}"), lambda: run(*command, limit_s=1800.0))
 
 
 def print_join() -> None:
@@ -599,8 +591,8 @@ def main() -> None:
     ate_m = None
     if truth is not None:
         trajectory = Trajectory(stamps_ns=np.array(stamps, np.int64), T_session_base=np.array(poses))
-        error = trajectory_error(trajectory, read_tum(Path(truth)))
-        ate_m = None if error is None else error.ate_m
+        errors_m = trajectory_errors(trajectory, read_tum(Path(truth)))
+        ate_m = rms(errors_m) if len(errors_m) else None
     print(json.dumps({"scans": len(stamps), "cpu_s": cpu_s, "ate_m": ate_m}))
 
 

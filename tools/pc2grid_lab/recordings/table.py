@@ -30,7 +30,7 @@ walls; by hand."""
 WarningVerdict = Literal["right", "false", "unknown"]
 Truth = Literal["poses", "trajectory", "hand", "clouds", "agreement", "elsewhere"]
 """How answers are judged: by true poses of query and map, by the trajectory of the recording whose beginning
-is the map, by a pose found by hand, by clouds, by each other, or as nothing can be right."""
+is the map, by a pose found by hand or by clouds, by each other, or as nothing can be right."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
