@@ -14,6 +14,7 @@ from typer.testing import CliRunner
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.io.maps import save_map
+from pc2grid.model import Health, Trajectory
 from pc2grid_cli.main import app
 from pc2grid_lab import sensors
 from pc2grid_lab.recordings.table import QueryRow
@@ -97,9 +98,7 @@ def driven(lost_at: int | None, jump: SE2) -> RegisteredSession:
     T_odom_base = [SE2(0.1 * k, 0.0, 0.0) for k in range(20)]
     registered = [jump @ T if lost_at is not None and k >= lost_at else T for k, T in enumerate(T_odom_base)]
     truth = [T_WORLD_ODOM @ T for T in T_odom_base]
-    lost = np.zeros(20, bool)
-    if lost_at is not None:
-        lost[lost_at] = True
+    health = tuple(Health.LOST if k == lost_at else Health.FINE for k in range(20))
     nothing = {
         "hits_m": np.empty((0, 2), np.float32),
         "origin_m": np.zeros(2),
@@ -110,8 +109,9 @@ def driven(lost_at: int | None, jump: SE2) -> RegisteredSession:
         planar_scans=tuple(
             PlanarScan(stamp_ns=k, normal_rad=np.empty(0, np.float32), **nothing) for k in range(20)
         ),
-        T_odom_base=np.array([(T.x, T.y, T.yaw) for T in registered]),
-        lost=lost,
+        trajectory=Trajectory(
+            stamps_ns=np.arange(20), T_session_base=np.array([T.lift() for T in registered]), health=health
+        ),
         T_world_base=np.array([(T.x, T.y, T.yaw) for T in truth]),
     )
 

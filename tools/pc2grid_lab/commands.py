@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pc2grid_cli.options import OUTPUT_FOLDER
+from pc2grid_cli.options import OUTPUT_FOLDER, Simulate
 
 OutputFolder = Annotated[
     Path, typer.Option(*OUTPUT_FOLDER, metavar="FOLDER", help="for results; run again to go on")
@@ -73,7 +73,9 @@ class CompareSensors(RandomQueries):
     out: OutputFolder = Path("sensor-matrix")
     queries: Queries = 10
     map_length: Annotated[float, typer.Option(help="metres driven to make a map")] = 200.0
-    clutter: Annotated[int, typer.Option(help="things in the way, different in each session")] = 30
+    clutter: Annotated[int, typer.Option(help="things in the way, different in each session")] = (
+        Simulate.clutter
+    )
     rate: Annotated[float, typer.Option(help="scans a second, of every sensor")] = 10.0
     travel: Travel = 15.0
 
@@ -101,7 +103,7 @@ class ComparePeers:
     travel: Travel = 10.0
     mapped: Annotated[
         list[str] | None,
-        typer.Option(metavar="NAME=S", help="seconds of a recording that become the map [55 %]"),
+        typer.Option(metavar="NAME=S", help="seconds of a recording that become the map [half, 600 at most]"),
     ] = None
     of_base: OfBase = False
 

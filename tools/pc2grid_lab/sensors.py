@@ -15,7 +15,7 @@ import pickle
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from itertools import product
 from pathlib import Path
@@ -28,7 +28,7 @@ from pc2grid.errors import ConfigError
 from pc2grid.geometry import F64, SE2
 from pc2grid.io.maps import load_map
 from pc2grid.matching.score import score_fit
-from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SensorKind
+from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
 from pc2grid.pipeline import follow, map_scans
 from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.drive import Drive
@@ -37,6 +37,7 @@ from pc2grid_cli.console import Console, json_text
 from pc2grid_cli.output import make_folder
 from pc2grid_lab.commands import CompareSensors
 from pc2grid_lab.pages import Cell, print_cells
+from pc2grid_lab.recordings.catalogue import MAP_DRIVE
 from pc2grid_lab.recordings.table import Counts, QueryRow
 from pc2grid_lab.runner import in_processes, once, write_text
 from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, apart, fit_frame, is_right
@@ -53,66 +54,52 @@ RECALL_AT = (1, 5, 20)
 """Numbers of retrieved places for which the recall is given."""
 RETRIEVED_M = 1.0
 """A retrieved place is right within this of the true position of the view that retrieved it; by hand."""
-MAP_SEED = 1000
-"""Map sessions and query sessions never share a seed: other clutter, start, direction and noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RegisteredSession:
     """N scans of one session.
 
-    planar_scans : one for each scan, with its stamp.
-    T_odom_base : (N, 3) registered x, y, yaw, in the frame of the session.
-    lost : (N,) whether registration was lost.
+    planar_scans : one for each scan. trajectory : as registered, in the plane; a scan is fine or lost.
     T_world_base : (N, 3) true x, y, yaw, in the frame of the floor plan or of the ground truth; NaN where the
     truth is not known.
     """
 
     sensor: SensorKind
     planar_scans: tuple[PlanarScan, ...]
-    T_odom_base: F64
-    lost: NDArray[np.bool_]
+    trajectory: Trajectory
     T_world_base: F64
 
-    def __len__(self) -> int:
-        return len(self.planar_scans)
+    @property
+    def lost(self) -> NDArray[np.bool_]:
+        """Return (N,) whether registration was lost."""
+        return np.array([health is Health.LOST for health in self.trajectory.health], bool)
 
-    def path_m(self) -> F64:
-        """Return (N,) metres travelled up to each scan, by the registered poses."""
-        steps = np.hypot(*np.diff(self.T_odom_base[:, :2], axis=0).T)
-        return np.concatenate(([0.0], np.cumsum(steps)))[: len(self)]
-
-    def T_world_odom(self) -> SE2:
-        """Return the true pose of the session's frame, by the end of the session.
+    def T_world_odom(self, count: int | None = None) -> SE2:
+        """Return the true pose of the session's frame, by the end of the session, or of its first scans.
 
         It is fitted over the scans of the last `AHEAD_M` whose true pose is known, because the heading of a
         single scan, taken while the robot turns, may be wrong by some degrees. Scans from before registration
         was lost are left out: the motion since is not known. (Unless no other pose is known.)
         """
-        path_m = self.path_m()
-        known = np.flatnonzero(~np.isnan(self.T_world_base[:, 0]))
-        lost = np.flatnonzero(self.lost)
-        first = min(lost[-1] + 1, len(self) - 1) if len(lost) else 0  # a lost last scan is a query of its own
+        path_m, poses = self.trajectory.path_m(), list(self.trajectory.poses())[:count]
+        known = np.flatnonzero(~np.isnan(self.T_world_base[:count, 0]))
+        lost = np.flatnonzero(self.lost[:count])
+        first = (
+            min(lost[-1] + 1, len(poses) - 1) if len(lost) else 0
+        )  # a lost last scan is a query of its own
         if known[-1] >= first:
             known = known[known >= first]
         known = known[path_m[known] >= path_m[known[-1]] - AHEAD_M]
-        pairs = [(SE2(*self.T_odom_base[k].tolist()), SE2(*self.T_world_base[k].tolist())) for k in known]
-        return fit_frame(pairs, AHEAD_M)
-
-    def first(self, count: int) -> RegisteredSession:
-        """Return the session until so many scans were taken."""
-        names = ("planar_scans", "T_odom_base", "lost", "T_world_base")
-        return replace(self, **{name: getattr(self, name)[:count] for name in names})
+        return fit_frame([(poses[k], SE2(*self.T_world_base[k].tolist())) for k in known], AHEAD_M)
 
     def scans(self) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
         """Yield each scan (without its points) and its planar scan, in order of time."""
-        no_points = np.empty((0, 3), np.float32)
-        for planar_scan, pose, lost in zip(self.planar_scans, self.T_odom_base, self.lost, strict=True):
+        no_points, own = np.empty((0, 3), np.float32), self.trajectory
+        for planar_scan, T, health in zip(self.planar_scans, own.T_session_base, own.health, strict=True):
             scan = Scan(
                 stamp_ns=planar_scan.stamp_ns, points_m=no_points, T_base_sensor=np.eye(4), sensor=self.sensor
             )
-            health = Health.LOST if lost else Health.FINE
-            T = SE2(*pose.tolist()).lift()
             yield RegisteredScan(scan=scan, T_session_base=T, health=health), planar_scan
 
     @staticmethod
@@ -142,22 +129,28 @@ def register(
             truths.append((truth.x, truth.y, truth.yaw) if truth else (math.nan,) * 3)
             yield scan
 
-    found: list[tuple[PlanarScan, SE2, bool]] = []
+    planar_scans: list[PlanarScan] = []
+    poses: list[SE2] = []
+    health: list[Health] = []
     travel_m = 0.0
     for registered, planar_scan in follow(without_truth(), config):
-        pose = SE2.from_matrix(registered.T_session_base)
-        if found:
-            travel_m += apart(found[-1][1], pose)[0]
+        planar_scans.append(planar_scan)
+        poses.append(SE2.from_matrix(registered.T_session_base))
+        health.append(Health.LOST if registered.health is Health.LOST else Health.FINE)
         see(registered)
-        found.append((planar_scan, pose, registered.health is Health.LOST))
+        travel_m += apart(*poses[-2:])[0] if len(poses) > 1 else 0.0
         if travel_m >= until_m:
             break
+    trajectory = Trajectory(
+        stamps_ns=np.array([planar_scan.stamp_ns for planar_scan in planar_scans], np.int64),
+        T_session_base=np.array([pose.lift() for pose in poses]).reshape(-1, 4, 4),
+        health=tuple(health),
+    )
     return RegisteredSession(
         sensor=sensor,
-        planar_scans=tuple(planar_scan for planar_scan, _, _ in found),
-        T_odom_base=np.array([(pose.x, pose.y, pose.yaw) for _, pose, _ in found]).reshape(-1, 3),
-        lost=np.array([lost for _, _, lost in found], bool),
-        T_world_base=np.array(truths[: len(found)], np.float64).reshape(-1, 3),
+        planar_scans=tuple(planar_scans),
+        trajectory=trajectory,
+        T_world_base=np.array(truths[: len(poses)], np.float64).reshape(-1, 3),
     )
 
 
@@ -203,7 +196,7 @@ class PlanDrives:
     @property
     def mapping(self) -> SimulationConfig:
         """Return the configuration of the drive that makes a map."""
-        return self.simulation(self.map_length, MAP_SEED)
+        return self.simulation(self.map_length, MAP_DRIVE.seed)
 
     def map(self, plan: Path, sensor: SensorKind) -> PlanMap:
         """Return the map of a plan by one sensor."""
@@ -226,7 +219,7 @@ class PlanDrives:
 
 def start_on(way: Drive, seed: int) -> tuple[float, float]:
     """Return a random place on a drive, x and y in metres."""
-    at_s = np.random.default_rng([seed, MAP_SEED]).uniform(0.0, way.duration_s)
+    at_s = np.random.default_rng([seed, MAP_DRIVE.seed]).uniform(0.0, way.duration_s)
     x, y, _ = way.at(np.array([at_s]))[0].tolist()
     return x, y
 
@@ -292,7 +285,7 @@ def located_rows(
 ) -> Iterator[QueryRow]:
     """Locate a session after each of `TRAVELS_M` that it has travelled, in another plan after the last one,
     and judge the answers. own : whether the map is of its plan; if not, no answer is right."""
-    path_m = session.path_m()
+    path_m = session.trajectory.path_m()
     travels_m = [d for d in TRAVELS_M if d <= path_m[-1]]
     # The number of scans after which each distance is reached, made distinct.
     after = np.searchsorted(path_m, travels_m) + 1 - np.arange(len(travels_m))

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from pc2grid.geometry import SE2
 from pc2grid.io.maps import save_map
-from pc2grid.model import Scan
+from pc2grid.model import Health, Scan, Trajectory
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from pc2grid_lab.peers import programs
@@ -58,13 +58,17 @@ def judged(
 def session(scans: int = 30) -> RegisteredSession:
     """A short drive through the office; its odometry is the truth."""
     driven = [row for _, row in zip(range(scans), drive(office(), [(2.0, 7.0), (14.0, 7.0)]), strict=False)]
-    poses = np.array([(T.x, T.y, T.yaw) for _, _, T in driven])
+    planar_scans = tuple(planar_scan for _, planar_scan, _ in driven)
+    trajectory = Trajectory(
+        stamps_ns=np.array([planar_scan.stamp_ns for planar_scan in planar_scans]),
+        T_session_base=np.array([T.lift() for _, _, T in driven]),
+        health=(Health.FINE,) * len(driven),
+    )
     return RegisteredSession(
         sensor="laser",
-        planar_scans=tuple(planar_scan for _, planar_scan, _ in driven),
-        T_odom_base=poses,
-        lost=np.zeros(len(driven), bool),
-        T_world_base=poses,
+        planar_scans=planar_scans,
+        trajectory=trajectory,
+        T_world_base=trajectory.planar(),
     )
 
 
@@ -103,13 +107,13 @@ def test_beams_lie_where_the_laser_measured_them(tmp_path: Path, first_deg: floa
 
 def test_the_carmen_log_has_a_line_for_each_step_of_motion() -> None:
     driven = session()
-    ranges_m = np.full((len(driven), 5), np.inf, np.float32)
+    ranges_m = np.full((len(driven.planar_scans), 5), np.inf, np.float32)
     ranges_m[:, 2] = 1.5
     lines = carmen_log(driven, ranges_m, math.radians(180.0), SE2(0.3, 0.0, 0.0)).splitlines()
-    assert 3 < len(lines) < len(driven)
+    assert 3 < len(lines) < len(ranges_m)
     words = lines[-1].split()
     assert words[0] == "ROBOTLASER1" and words[8] == "5" and float(words[11]) == 1.5
-    x, y, yaw = driven.T_odom_base[-1]
+    x, y, yaw = driven.trajectory.planar()[-1]
     assert [float(w) for w in words[18:21]] == pytest.approx([x, y, yaw], abs=1e-4)
     middle = SE2(x, y, yaw) @ SE2(0.3, 0.0, 0.0)
     assert [float(w) for w in words[15:18]] == pytest.approx([middle.x, middle.y, middle.yaw], abs=1e-4)
@@ -177,7 +181,7 @@ def test_the_particle_filter_is_told_the_map_and_the_scans(
     save_map(office(), tmp_path / "map")
     driven = session()
     once(tmp_path / "00.pickle", lambda: driven)
-    ranges_m = np.ones((len(driven), 5))
+    ranges_m = np.ones((len(driven.planar_scans), 5))
     np.savez(tmp_path / "00.ranges.npz", ranges_m=ranges_m, fov_rad=3.0, T_base_middle=np.eye(4))
     (answer,) = answers(KINDS["particle-filter"], tmp_path / "map", [tmp_path / "00"], tmp_path / "kept.json")
     assert answer["pose"] == pytest.approx((1.0, 2.0, math.radians(30.0))) and answer["score"] == -0.25

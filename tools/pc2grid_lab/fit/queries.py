@@ -87,15 +87,15 @@ def queries_of(session: RegisteredSession, config: Config) -> Iterator[tuple[Que
 
     Without those whose true pose is not known.
     """
-    query, path_m = Query(config, config.relocalize), session.path_m()
+    query, path_m = Query(config, config.relocalize), session.trajectory.path_m()
     asked_after = np.array([np.argmax(path_m >= d) for d in ASKED_AFTER_M if d <= path_m.max(initial=0.0)])
     for number, scan in enumerate(session.scans()):
         if not session.lost[number]:
             query.add(*scan)
-        so_far = session.first(number + 1)
+        so_far = slice(number + 1)
         for _ in np.flatnonzero(asked_after == number):
-            if not so_far.lost.all() and not np.isnan(so_far.T_world_base).all():
-                yield query.map(), so_far.T_world_odom()
+            if not session.lost[so_far].all() and not np.isnan(session.T_world_base[so_far]).all():
+                yield query.map(), session.T_world_odom(number + 1)
 
 
 MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}

@@ -37,11 +37,12 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from statistics import median
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
 from pc2grid.errors import ConfigError, LogNotFound, Pc2GridError
+from pc2grid.estimation.line_map import TRACKING_PARAMETERS
 from pc2grid.geometry import F32, F64, SE2, transform_points
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.building_file import is_building_file
@@ -49,6 +50,7 @@ from pc2grid.io.maps import load_map, save_map
 from pc2grid.io.recording import Log, open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.mapping.occupancy import GridBuilder
+from pc2grid.matching.icp_in_space import REGISTRATION
 from pc2grid.model import SENSOR_MODELS, RegisteredScan, Scan, SensorKind
 from pc2grid.pipeline import follow
 from pc2grid.simulate import Session, load_building, prepare_session
@@ -57,10 +59,10 @@ from pc2grid_cli.output import make_folder
 from pc2grid_lab.commands import ComparePeers
 from pc2grid_lab.pages import Cell, clopper_pearson, print_cells
 from pc2grid_lab.peers.cloud_matchers import PoseAndScore, serve, thinned
-from pc2grid_lab.recordings.catalogue import drive_config
+from pc2grid_lab.recordings.catalogue import MAP_DRIVE, beginning_s, drive_config
 from pc2grid_lab.recordings.judging import known_share
 from pc2grid_lab.runner import BACK, FRONT, LABORATORY, digest_of_sources, once, run, write_text
-from pc2grid_lab.sensors import MAP_SEED, RegisteredSession, index_of, register, start_on
+from pc2grid_lab.sensors import RegisteredSession, index_of, register, start_on
 from pc2grid_lab.truth import JUDGEMENT, apart, is_right, nearest
 from signature.config import Config
 from signature.localization.localizer import Localizer
@@ -71,24 +73,13 @@ from signature.sessions import digest_of
 class SiteParameters:
     """How maps and queries are cut from recordings. All chosen by hand, before any peer was run.
 
-    mapped : share of a recording that becomes the map, unless its seconds are given.
     query_s : a query lasts at most so long, and at most this share (`query_share`) of what is not mapped.
     gap : seconds between map and first query, as a share of the longest query.
-    keyframe_m, keyframe_rad : a scan of the map is used if the robot has moved or turned so far; of a lidar,
-        which sees all around, after `lidar_keyframe_m`.
-    cloud_voxel_m : edge of the voxels that clouds are thinned to; each matcher thins further as it needs.
-    map_length_m : driven in a 3D scan for a map of it, as by `compare recordings`.
     """
 
-    mapped: float = 0.55
     query_s: float = 60.0
     query_share: float = 0.25
     gap: float = 1.0 / 30.0
-    keyframe_m: float = 0.15
-    lidar_keyframe_m: float = 0.5
-    keyframe_rad: float = 0.1
-    cloud_voxel_m: float = 0.1
-    map_length_m: float = 150.0
 
 
 SITE = SiteParameters()
@@ -165,14 +156,14 @@ def recorded_site(
     """Prepare the site of a recording with true poses beside it. What exists in `folder` is not made again.
 
     queries : how many, evenly spread over what is not mapped; fewer where it has fewer scans.
-    mapped_s : seconds from the start that become the map; None: `SiteParameters.mapped` of all.
+    mapped_s : seconds from the start that become the map; None: as of one's own by `compare recordings`.
     of_base : the true poses are of the base, not of the sensor.
 
     Raises ConfigError if nothing is left to locate, and what `open_log` and `read_tum` do.
     """
     with open_log(log, config.read) as opened:
         end_s = (opened.info.end_ns - opened.info.start_ns) * 1e-9
-        mapped_s = mapped_s if mapped_s is not None else SITE.mapped * end_s
+        mapped_s = beginning_s(end_s) if mapped_s is None else mapped_s
         longest_s = min(SITE.query_s, SITE.query_share * (end_s - mapped_s))
         if longest_s <= 0.0:
             raise ConfigError(
@@ -209,7 +200,7 @@ def simulated_site(
     def posed(session: Session) -> Iterator[PosedScan]:
         return ((scan, truth.lift()) for scan, truth in session.scans())
 
-    mapping = driven(SITE.map_length_m, MAP_SEED)
+    mapping = driven(MAP_DRIVE.length_m, MAP_DRIVE.seed)
     _save_map(site, posed(mapping), config)
     for k in range(queries):
         start_m = start_on(mapping.drive, k + 1)
@@ -229,12 +220,12 @@ def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
         return
     builder = GridBuilder(config.projection)
     path, clouds = [], []
-    for scan, T_world_base in _keyframes(site, scans):
+    for scan, T_world_base in after_motion((scan, T) for scan, T in scans if T is not None):
         ((registered, planar_scan),) = follow([scan], config)
         builder.add(planar_scan, SE2.from_matrix(T_world_base))
         path.append(T_world_base)
         points_m = transform_points(T_world_base, registered.scan.points_m)
-        clouds.append(thinned(points_m, SITE.cloud_voxel_m).astype(np.float32))
+        clouds.append(thinned(points_m, REGISTRATION.voxel_m).astype(np.float32))
     grid = builder.grid()
     site.folder.mkdir(parents=True, exist_ok=True)
     if not site.planar:
@@ -247,17 +238,18 @@ def _save_map(site: Site, scans: Iterable[PosedScan], config: Config) -> None:
     save_map(grid, site.map_stem, image_format="png")  # last: it says that the map is complete
 
 
-def _keyframes(site: Site, scans: Iterable[PosedScan]) -> Iterator[tuple[Scan, F64]]:
-    """Yield the scans with a true pose between which the robot has moved or, with a laser, turned."""
-    step_m, last = SITE.keyframe_m if site.planar else SITE.lidar_keyframe_m, None
-    for scan, T_world_base in scans:
-        if T_world_base is None:
-            continue
-        pose = SE2.from_matrix(T_world_base)
-        metres, radians = (math.inf, math.inf) if last is None else apart(last, pose)
-        if metres >= step_m or (site.planar and radians >= SITE.keyframe_rad):
-            last = pose
-            yield scan, T_world_base
+T = TypeVar("T")
+
+
+def after_motion(posed: Iterable[tuple[T, F64]]) -> Iterator[tuple[T, F64]]:
+    """Yield those with a pose (4, 4) after which the robot has moved or turned as far as a keyframe of the
+    product needs."""
+    p, last = TRACKING_PARAMETERS, None
+    for one, pose in posed:
+        step_m, step_rad = (math.inf, math.inf) if last is None else apart(last, SE2.from_matrix(pose))
+        if step_m >= p.keyframe_travel_m or step_rad >= p.keyframe_turn_rad:
+            last = SE2.from_matrix(pose)
+            yield one, pose
 
 
 def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Config, travel_m: float) -> None:
@@ -271,7 +263,7 @@ def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Con
     session = register(posed, config, sensor=site.sensor, until_m=travel_m, see=seen.append)
     if np.isnan(session.T_world_base[:, 0]).all():
         return
-    truth = session.T_world_odom() @ SE2(*session.T_odom_base[-1].tolist())
+    truth = session.T_world_odom() @ [*session.trajectory.poses()][-1]
     once(stem.with_suffix(".pickle"), lambda: session)
     if site.planar:
         save_beams(stem.with_suffix(".ranges.npz"), [registered.scan for registered in seen])
@@ -280,7 +272,7 @@ def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Con
         cloud = [transform_points(T_query_odom @ r.T_session_base, r.scan.points_m) for r in seen]
         _write_arrays(
             stem.with_suffix(".cloud.npz"),
-            points_m=thinned(np.concatenate(cloud), SITE.cloud_voxel_m).astype(np.float32),
+            points_m=thinned(np.concatenate(cloud), REGISTRATION.voxel_m).astype(np.float32),
         )
     # What registration made of the scans before must not decide which queries count.
     ((_, alone),) = follow([seen[-1].scan], config)
@@ -288,7 +280,7 @@ def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Con
     query = SiteQuery(
         pose=(truth.x, truth.y, truth.yaw),
         covered=known_share(grid, truth.apply(alone.hits_m)) >= JUDGEMENT.mapped,
-        travel_m=float(session.path_m()[-1]),
+        travel_m=session.trajectory.length_m,
     )
     write_text(stem.with_suffix(".json"), json.dumps(asdict(query)))  # last: the query is complete
 
@@ -406,7 +398,6 @@ class ParticleFilterParameters:
 
     per_m2, least : particles at the start for each square metre of free floor, and at least; twice as many at
         most. 27 on 376 m2 found nothing, and 60,000 take 43 s a query.
-    step_m, step_rad : a scan is used after this motion, as particle filters of robots do.
     max_range_m : beams that are as long came back from nothing.
 
     The least noise of the odometry between two scans (`DummyOdometryParams` below) is that of registration.
@@ -414,8 +405,6 @@ class ParticleFilterParameters:
 
     per_m2: float = 80.0
     least: int = 30_000
-    step_m: float = 0.2
-    step_rad: float = 0.2
     max_range_m: float = 40.0
 
 
@@ -526,7 +515,8 @@ def _output_of(*command: str) -> str:
 
 
 def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base_middle: SE2) -> str:
-    """Return the scans after each step of motion as a CARMEN log: a ROBOTLASER1 line each, with the odometry.
+    """Return the first scan, those after each motion, and the last as a CARMEN log: a ROBOTLASER1 line each,
+    with the odometry.
 
     ranges_m (N, B) of all scans; `T_base_middle` looks at the middle of `fov_rad`.
     """
@@ -534,12 +524,12 @@ def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base
     ranges_m = np.where(np.isfinite(ranges_m), np.minimum(ranges_m, p.max_range_m), p.max_range_m)
     beams = ranges_m.shape[1]
     step_rad = fov_rad / (beams - 1)
-    lines = []
-    start_ns = session.planar_scans[0].stamp_ns
-    for k in _after_motion(session.T_odom_base):
-        T_odom_base = SE2(*session.T_odom_base[k].tolist())
+    way, lines = session.trajectory, []
+    last = len(way) - 1
+    for k in dict.fromkeys([*(k for k, _ in after_motion(enumerate(way.T_session_base))), last]):
+        T_odom_base = SE2.from_matrix(way.T_session_base[k])
         T_odom_middle = T_odom_base @ T_base_middle
-        seconds = (session.planar_scans[k].stamp_ns - start_ns) * 1e-9
+        seconds = (way.stamps_ns[k] - way.stamps_ns[0]) * 1e-9
         lines.append(
             f"ROBOTLASER1 0 {-fov_rad / 2:.6f} {fov_rad:.6f} {step_rad:.6f} {p.max_range_m:g} 0.01 0 {beams} "
             + " ".join(f"{r:.3f}" for r in ranges_m[k])
@@ -548,17 +538,6 @@ def carmen_log(session: RegisteredSession, ranges_m: F32, fov_rad: float, T_base
             + f" 0 0 0 0 0 {seconds:.6f} robot {seconds:.6f}"
         )
     return "\n".join(lines) + "\n"
-
-
-def _after_motion(T_odom_base: F64) -> list[int]:
-    """Return the first scan, those after each step of motion, and the last."""
-    poses, p = [SE2(*row) for row in T_odom_base.tolist()], PARTICLE_FILTER
-    kept = [0]
-    for k, pose in enumerate(poses):
-        step_m, step_rad = apart(poses[kept[-1]], pose)
-        if step_m >= p.step_m or step_rad >= p.step_rad or k == len(poses) - 1 > 0:
-            kept.append(k)
-    return kept
 
 
 def own(map_stem: str) -> Callable[[str], PoseAndScore]:
