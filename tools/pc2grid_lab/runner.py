@@ -26,7 +26,7 @@ from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import cv2
 
@@ -89,8 +89,7 @@ def once(path: Path, make: Callable[[], T]) -> T:
         path.parent.mkdir(parents=True, exist_ok=True)
         with replace_file(path) as draft:
             draft.write_bytes(made)
-    found: T = pickle.loads(path.read_bytes())
-    return found
+    return cast(T, pickle.loads(path.read_bytes()))
 
 
 def in_processes(

@@ -273,9 +273,7 @@ def _orientation_shares(
     for at, share in ((low, 1 - (turn - low)), (low + 1, turn - low)):
         np.put_along_axis(shares, (at % _ORIENTATIONS)[None], (weights * share)[None], axis=0)
     found = np.stack([part @ fields for part in shares], axis=-1)
-    histograms = found.reshape(len(directions), _GRID * _GRID * _ORIENTATIONS)
-    lengths = np.linalg.norm(histograms, axis=1, keepdims=True)
-    return np.asarray(histograms / np.where(lengths > 0, lengths, 1.0))
+    return _unit(found.reshape(len(directions), _GRID * _GRID * _ORIENTATIONS))
 
 
 def _nearest(costs: F32, starts: I64) -> I64:
@@ -436,9 +434,7 @@ def describe_points(image: NDArray[np.uint8], points: F64) -> F32:
     along, across = weights * (c * dx + s * dy), weights * (c * dy - s * dx)
     responses = np.stack((along, across, np.abs(along), np.abs(across)), axis=-1)
     fields = responses.reshape(len(points), 4, 5, 4, 5, 4).sum(axis=(2, 4))
-    descriptors = fields.reshape(len(points), 64)
-    lengths = np.linalg.norm(descriptors, axis=1, keepdims=True)
-    return np.asarray(descriptors / np.where(lengths > 0, lengths, 1.0), np.float32)
+    return np.asarray(_unit(fields.reshape(len(points), 64)), np.float32)
 
 
 def orientations(integral: F64, points: F64) -> F64:

@@ -318,30 +318,20 @@ def warned(texts: Iterable[str], *, error_m: float | None) -> tuple[Warned, ...]
 
     error_m : of the trajectory, None if it is not known.
     """
-    return tuple(
-        Warned(about=about, verdict=_verdict(about, error_m), text=text)
-        for text in texts
-        for about in [_about(text)]
-    )
-
-
-def _about(text: str) -> str:
-    """Return what a warning is about; of one that is not known here, its first words."""
-    for about, pattern in _ABOUT.items():
-        if re.search(pattern, text):
-            return about
-    return " ".join(text.split()[:5])
+    found = []
+    for text in texts:
+        known = (about for about, pattern in _ABOUT.items() if re.search(pattern, text))
+        about = next(known, " ".join(text.split()[:5]))  # of one that is not known here, its first words
+        found.append(Warned(about=about, verdict=_verdict(about, error_m), text=text))
+    return tuple(found)
 
 
 def _verdict(about: str, error_m: float | None) -> WarningVerdict:
     if about == "height":  # each of the recordings is of one floor
         return "false"
-    if about in _SHAPE and error_m is not None:
-        if error_m < EXACT_M:
-            return "false"
-        if error_m > WRONG_M:
-            return "right"
-    return "unknown"
+    if about not in _SHAPE or error_m is None or EXACT_M <= error_m <= WRONG_M:
+        return "unknown"
+    return "false" if error_m < EXACT_M else "right"
 
 
 _SESSION = "map"
@@ -865,15 +855,10 @@ def followed_row(row: FollowedRow, looks: Sequence[Look]) -> FollowedRow:
         knew=knew,
     )
     if row.after is None:
-        return _located(row, before)
-    return (
-        _located(replace(row, noticed_s=after[0].since_s, noticed_m=after[0].since_m), after)
-        if knew and after
-        else row
-    )
-
-
-def _located(row: FollowedRow, looks: Iterable[Look]) -> FollowedRow:
-    """Add to a row when the robot was located where it is."""
-    first = next((look for look in looks if look.tells and look.right is not False), None)
+        after = before
+    elif knew and after:
+        row = replace(row, noticed_s=after[0].since_s, noticed_m=after[0].since_m)
+    else:
+        return row
+    first = next((look for look in after if look.tells and look.right is not False), None)
     return row if first is None else replace(row, located_s=first.since_s, located_m=first.since_m)
