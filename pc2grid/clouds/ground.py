@@ -1,4 +1,4 @@
-"""The floor, the ceiling and the vertical: in one scan, and from scan to scan for a sensor in the hand.
+"""The floor and the vertical: in one scan, and from scan to scan for a sensor in the hand.
 
 `find_ground` takes the lowest large, roughly level plane of a scan for the floor (planes by Open3D's RANSAC),
 whether tf gives the height of the sensor or not. `vertical_of` checks it: a slanting plane, such as the back
@@ -25,23 +25,18 @@ from pc2grid.clouds.cloud import random_subset
 from pc2grid.geometry import F64, BoolGrid, skew
 from pc2grid.model import SENSOR_MODELS, Scan
 
-Plane = tuple[F64, float]
-"""Unit normal (3,) that points up, and offset: height = normal . p + offset."""
-
 
 @dataclass(frozen=True, slots=True)
 class Ground:
-    """The floor plane of a scan and the ceiling above it, in the scan's frame.
+    """The floor plane of a scan, in the scan's frame.
 
     normal : (3,) unit vector that points up from the floor.
     offset_m : height of the frame's origin above the floor, so that height = normal . p + offset_m.
-    ceiling_m : height of the ceiling above the floor, or None without one.
     seen : True if the floor was measured, False if it is assumed from the mounting.
     """
 
     normal: F64
     offset_m: float
-    ceiling_m: float | None = None
     seen: bool = True
 
     def heights(self, points_m: NDArray[np.floating]) -> NDArray[np.floating]:
@@ -54,13 +49,12 @@ class Ground:
         """Return the mean of this ground and another one, weighted 1 - `gain` and `gain` (0..1)."""
         normal = (1.0 - gain) * self.normal + gain * other.normal
         offset = (1.0 - gain) * self.offset_m + gain * other.offset_m
-        ceiling = other.ceiling_m if other.ceiling_m is not None else self.ceiling_m
-        return Ground(normal / np.linalg.norm(normal), offset, ceiling, self.seen or other.seen)
+        return Ground(normal / np.linalg.norm(normal), offset, self.seen or other.seen)
 
     def moved(self, T_new_old: F64) -> Ground:
         """Return the same ground in another frame; T_new_old (4, 4) is the old frame's pose in it."""
         normal = T_new_old[:3, :3] @ self.normal
-        return Ground(normal, self.offset_m - float(normal @ T_new_old[:3, 3]), self.ceiling_m, self.seen)
+        return Ground(normal, self.offset_m - float(normal @ T_new_old[:3, 3]), self.seen)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,22 +63,17 @@ class CloudParameters:
 
     Ground plane:
 
-    ground_sample, ground_voxel_m, ground_points : the floor is searched for in a random sample of a scan, of
-        which Open3D keeps one point a voxel, and of these again a sample, each of at most this size.
-    ground_min_points : with fewer points no plane is searched for.
+    sample, voxel_m : floor and vertical are searched for in a random sample of a scan, of which Open3D keeps
+        one point a voxel, so that near surfaces count no more.
     max_tilt_rad : largest angle between a floor's normal and the z axis of the base.
-    plane_tolerance_m : half thickness of a floor, three to four times the range noise of a lidar.
-    search_iterations, search_planes : RANSAC iterations for each plane, and how many planes are taken out
-        of a cloud, the largest first, before the search gives up. 300 draws of three points contain three
-        floor points with a probability of 99 % where a quarter of the points lies on the floor.
-    expected_iterations : the same where the plane is known to 2 * `plane_tolerance_m`, so that nearly all
-        candidates lie on it.
-    min_plane_share : smallest share of a scan that lies on a floor (`min_plane_points`: or this many).
-    beneath_m, max_beneath_share : a floor has at most this share of the points farther than this below it.
-        This separates a floor from a table.
-    min_plane_extent_m : standard deviation of the points of a floor along its shorter side. A narrower
-        strip, such as the foot of a wall, does not determine the tilt.
-    step_tilt_rad, step_height_m : largest change of the floor against what was expected.
+    plane_tolerance_m : half thickness of a floor, three to four times the range noise of a lidar. What is
+        twice as far from a plane does not belong to it.
+    search_iterations : of RANSAC for each plane. 300 draws of three points contain three floor points with a
+        probability of 99 % where a quarter of the points lies on the floor.
+    min_plane_points : with fewer points no plane is searched for.
+    max_beneath_share : a floor has at most this share of the points beneath it. This separates a floor from a
+        table.
+    step_tilt_rad : largest change of the floor against what was expected.
 
     Normals:
 
@@ -100,22 +89,14 @@ class CloudParameters:
     max_gap_bins : bearings without a return between two with one count as free up to this many.
     """
 
-    ground_sample: int = 10_000
-    ground_voxel_m: float = 0.1
-    ground_points: int = 2500
-    ground_min_points: int = 50
+    sample: int = 10_000
+    voxel_m: float = 0.1
     max_tilt_rad: float = math.radians(35.0)
     plane_tolerance_m: float = 0.04
     search_iterations: int = 300
-    search_planes: int = 8
-    expected_iterations: int = 20
-    min_plane_share: float = 0.02
     min_plane_points: int = 30
-    beneath_m: float = 0.12
     max_beneath_share: float = 0.05
-    min_plane_extent_m: float = 0.15
     step_tilt_rad: float = math.radians(3.0)
-    step_height_m: float = 0.06
 
     reach_m: float = 0.08
     reach_per_m: float = 0.02
@@ -139,8 +120,7 @@ def find_ground(
 
     points_m : (N, 3) returns. sensor_m : (3,) position of the sensor, same frame.
     expected : the floor as known so far. Only a plane within a few centimetres and degrees of it is
-        accepted, so that a box or a table is not taken for the floor. Its ceiling is kept if this scan
-        shows none.
+        accepted, so that a box or a table is not taken for the floor.
 
     Without `expected`, Open3D's RANSAC takes planes out of the points below the sensor, the largest first,
     until one is tilted by at most 35 degrees and has next to no points below it. The last condition
@@ -148,26 +128,18 @@ def find_ground(
     """
     p = parameters
     points = _downsample(points_m, p)
-    if len(points) < p.ground_min_points:
-        return None
     if expected is None:
-        plane = _search(points, sensor_m, p)
-    else:
-        slab = np.abs(points @ expected.normal + expected.offset_m) < 2.0 * p.plane_tolerance_m
-        fitted = _largest_plane(points[slab], 2.0 * p.plane_tolerance_m, p.expected_iterations, p)
-        plane = None if fitted is None else _as_floor(points, fitted[0], p)
-    if plane is None:
-        return None
-    normal, offset = plane
-    if expected is not None and (
-        normal @ expected.normal < np.cos(p.step_tilt_rad)
-        or abs(offset - expected.offset_m) > p.step_height_m
+        return _lowest_plane(points, sensor_m, p)
+    far_m = 2.0 * p.plane_tolerance_m
+    found = _largest_plane(points[np.abs(expected.heights(points)) < far_m], p)
+    ground = None if found is None else _as_floor(points, found[0], p)
+    if (
+        ground is None
+        or ground.normal @ expected.normal < np.cos(p.step_tilt_rad)
+        or abs(ground.offset_m - expected.offset_m) > far_m
     ):
         return None
-    ceiling = _find_ceiling(points @ normal + offset)
-    if ceiling is None and expected is not None:
-        ceiling = expected.ceiling_m
-    return Ground(normal, offset, ceiling)
+    return ground
 
 
 def assumed_ground(T_base_sensor: F64) -> Ground:
@@ -176,42 +148,35 @@ def assumed_ground(T_base_sensor: F64) -> Ground:
     It is z = 0 of the base if the sensor is mounted above that, else 1 m below the base's origin.
     """
     mounted = float(T_base_sensor[2, 3]) > 0.05
-    return Ground(np.array([0.0, 0.0, 1.0]), 0.0 if mounted else 1.0, None, seen=False)
+    return Ground(np.array([0.0, 0.0, 1.0]), 0.0 if mounted else 1.0, seen=False)
 
 
 def _downsample(points_m: NDArray[np.floating], p: CloudParameters) -> F64:
-    """Return at most `ground_points` points (N, 3), one a voxel, so that near surfaces count no more."""
+    """Return one point a voxel (N, 3) of a random sample."""
     from pc2grid.open3d_core import o3d
 
-    sample = points_m[random_subset(len(points_m), p.ground_sample)].astype(np.float64)
+    sample = points_m[random_subset(len(points_m), p.sample)].astype(np.float64)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(sample))
-    points: F64 = np.array(cloud.voxel_down_sample(p.ground_voxel_m).points)
-    return points[random_subset(len(points), p.ground_points)]
+    return np.array(cloud.voxel_down_sample(p.voxel_m).points)
 
 
-def _search(points: F64, sensor_m: F64, p: CloudParameters) -> Plane | None:
+def _lowest_plane(points: F64, sensor_m: F64, p: CloudParameters) -> Ground | None:
     """Return the first of the largest planes below the sensor that can be a floor."""
     below = points[points[:, 2] < sensor_m[2] - 0.05]
-    for _ in range(p.search_planes):
-        found = _largest_plane(below, p.plane_tolerance_m, p.search_iterations, p)
-        if found is None:
-            return None
+    while (found := _largest_plane(below, p)) is not None:
         plane, inliers = found
         floor = _as_floor(points, plane, p)
         if floor is not None:
             # A level cut through walls holds no more points than the cut above it.
-            heights = points @ floor[0] + floor[1]
-            at_floor = (np.abs(heights) < p.plane_tolerance_m).sum()
-            above = (np.abs(heights - 3.0 * p.plane_tolerance_m) < p.plane_tolerance_m).sum()
-            if at_floor > 1.5 * above:
+            tolerances = floor.heights(points) / p.plane_tolerance_m
+            above = ((tolerances > 2.0) & (tolerances < 4.0)).sum()
+            if (np.abs(tolerances) < 1.0).sum() > 1.5 * above:
                 return floor
         below = np.delete(below, inliers, axis=0)
     return None
 
 
-def _largest_plane(
-    points: F64, tolerance_m: float, iterations: int, p: CloudParameters
-) -> tuple[Plane, NDArray[np.intp]] | None:
+def _largest_plane(points: F64, p: CloudParameters) -> tuple[Ground, NDArray[np.intp]] | None:
     """Return the plane that holds the most points, least squares of these, and their indices."""
     from pc2grid.open3d_core import o3d
 
@@ -220,44 +185,28 @@ def _largest_plane(
     o3d.utility.random.seed(0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     # With probability 1 every iteration is run, so that the result does not depend on the threads.
-    model, inliers = cloud.segment_plane(tolerance_m, 3, iterations, probability=1.0)
+    model, inliers = cloud.segment_plane(p.plane_tolerance_m, 3, p.search_iterations, probability=1.0)
     if len(inliers) < p.min_plane_points:
         return None
-    up = 1.0 if model[2] >= 0.0 else -1.0
-    length = float(np.linalg.norm(model[:3]))
-    return (up * model[:3] / length, up * float(model[3]) / length), np.asarray(inliers)
+    model = np.copysign(1.0, model[2]) / np.linalg.norm(model[:3]) * model
+    return Ground(model[:3], float(model[3])), np.asarray(inliers)
 
 
-def _as_floor(points: F64, plane: Plane, p: CloudParameters) -> Plane | None:
+def _as_floor(points: F64, plane: Ground, p: CloudParameters) -> Ground | None:
     """Return the plane fitted to all points near it, or None if that cannot be a floor."""
-    normal, offset = plane
-    near = points[np.abs(points @ normal + offset) < p.plane_tolerance_m]
-    if len(near) < max(p.min_plane_points, p.min_plane_share * len(points)):
+    near = points[np.abs(plane.heights(points)) < p.plane_tolerance_m]
+    if len(near) < p.min_plane_points:
         return None
     center = near.mean(axis=0)
     variances, axes = np.linalg.eigh(np.cov((near - center).T))
-    if variances[1] < p.min_plane_extent_m**2 or abs(axes[2, 0]) < np.cos(p.max_tilt_rad):
+    # Within its thickness a narrow strip, such as the foot of a wall, may slant as much as no level surface.
+    narrow = variances[1] * (1.0 - LEVEL.level**2) < p.plane_tolerance_m**2
+    if narrow or abs(axes[2, 0]) < np.cos(p.max_tilt_rad):
         return None
     normal = axes[:, 0] * np.sign(axes[2, 0])
-    offset = -float(normal @ center)
-    beneath = (points @ normal + offset < -p.beneath_m).mean()
-    return (normal, offset) if beneath <= p.max_beneath_share else None
-
-
-def _find_ceiling(heights: F64) -> float | None:
-    """Return the height of the topmost level slab with a few percent of a scan and hardly any above it."""
-    lowest_m, highest_m, step_m = 1.9, 12.0, 0.05
-    high = heights[heights > lowest_m]
-    if len(high) < 0.02 * len(heights):
-        return None
-    counts, edges = np.histogram(high, bins=np.arange(lowest_m, highest_m, step_m))
-    above = len(high) - np.cumsum(counts)
-    slabs = np.flatnonzero((counts > 0.015 * len(heights)) & (above < 0.02 * len(heights)))
-    for slab in slabs:
-        # A slab of a wall holds as many points as those below it, a ceiling at least twice as many.
-        if counts[slab] > 2.0 * counts[max(slab - 6, 0) : max(slab - 2, 1)].mean():
-            return float(edges[slab] + 0.5 * step_m)
-    return None
+    floor = Ground(normal, -float(normal @ center))
+    beneath = (floor.heights(points) < -2.0 * p.plane_tolerance_m).mean()
+    return floor if beneath <= p.max_beneath_share else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -297,44 +246,31 @@ LEVEL = LevelParameters()
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UprightParameters:
-    """Parameters of `vertical_of`. Chosen by hand, on simulated scans of a 16-beam lidar.
+    """Parameters of `vertical_of`. Chosen by hand, on simulated scans of a 16-beam lidar. In two rooms by a
+    phone (`depth/room`) all 14 planes of 269 that are tilted by 14 to 28 degrees are distinguished from the
+    floor by it.
 
-    points, voxel_m, normals : a random sample of the scan, reduced to one point a voxel so that near walls
-        count no more; a normal is estimated for so many of these.
-    neighbours : points for the estimate of a normal. squeeze : factor on heights in the search for
-        neighbours, so that they lie on several rings of a lidar.
+    neighbours : points for the estimate of a normal.
     flatness : largest ratio of the variances across a surface and along its shorter side.
-    breadth_m : least standard deviation along that side: points of a single ring have no normal.
     steepest_rad : normals nearer to the vertical than 90 degrees minus this are not of walls.
     scale : of the robust weight of a normal, sine of its angle with the horizontal.
     rounds : of reweighting.
-    least_normals, least_share : with fewer normals, or with less weight on the second direction of walls,
-        the vertical is not determined.
+    least_share : with less weight on the second direction of walls, the vertical is not determined.
     side_share : weight, as a share of that of all normals, of the vertical being perpendicular to the y axis
         of the base, about which a hand turns a camera most. So one wall ahead, which shows the pitch, is
-        enough.
+        enough. Of cameras only.
     """
 
-    points: int = 12_000
-    voxel_m: float = 0.07
-    normals: int = 700
     neighbours: int = 40
-    squeeze: float = 0.4
     flatness: float = 0.05
-    breadth_m: float = 0.12
     steepest_rad: float = math.radians(37.0)
     scale: float = 0.05
     rounds: int = 8
-    least_normals: int = 30
     least_share: float = 0.05
-    side_share: float = 0.0
+    side_share: float = 0.1
 
 
 UPRIGHT = UprightParameters()
-CAMERA_UPRIGHT = UprightParameters(voxel_m=0.1, squeeze=0.7, side_share=0.1)
-"""Of a depth camera. It measures small patches densely: with the voxels of a lidar, the neighbours of a point
-span less than `breadth_m`. Chosen by hand; in a room by a phone (`depth/room`) 3 planes of 25, tilted by 14
-to 27 degrees, are distinguished from the floor by it."""
 
 
 def level_floor(scan: Scan, points_m: NDArray[np.floating]) -> Ground | None:
@@ -346,50 +282,37 @@ def level_floor(scan: Scan, points_m: NDArray[np.floating]) -> Ground | None:
     ground = find_ground(points_m, scan.T_base_sensor[:3, 3])
     if ground is None:
         return None
-    parameters = CAMERA_UPRIGHT if SENSOR_MODELS[scan.sensor].narrow else UPRIGHT
-    vertical = vertical_of(points_m, ground.normal, parameters)
+    vertical = vertical_of(points_m, ground.normal, narrow=SENSOR_MODELS[scan.sensor].narrow)
     return ground if vertical is None or float(vertical @ ground.normal) > LEVEL.level else None
 
 
-def vertical_of(
-    points_m: NDArray[np.floating], guess: F64, parameters: UprightParameters = UPRIGHT
-) -> F64 | None:
+def vertical_of(points_m: NDArray[np.floating], guess: F64, *, narrow: bool) -> F64 | None:
     """Estimate the vertical (3,), a unit vector that points up, from the walls in a scan; None if they do not
     fix it.
 
     points_m : (N, 3) in the base frame, deskewed. guess : (3,) initial direction. The result is the direction
-    near it that is perpendicular to most normals.
+    near it that is perpendicular to most normals. narrow : True for a camera.
     """
-    p, normals = parameters, _normals(points_m, parameters)
+    p, normals = UPRIGHT, _normals(_downsample(points_m, CLOUD_PARAMETERS))
     walls = normals[np.abs(normals @ guess) < math.sin(p.steepest_rad)]
-    if len(walls) < p.least_normals:
-        return None
     vertical, spread, weight = guess, np.zeros(3), np.zeros(1)
     for _ in range(p.rounds):
         weight = (1.0 + ((walls @ vertical) / p.scale) ** 2) ** -2
         scatter = (walls * weight[:, None]).T @ walls
-        scatter[1, 1] += p.side_share * weight.sum()
+        scatter[1, 1] += narrow * p.side_share * weight.sum()
         spread, axes = np.linalg.eigh(scatter)
         vertical = axes[:, 0] if axes[:, 0] @ guess > 0.0 else -axes[:, 0]
     return vertical if spread[1] > p.least_share * float(weight.sum()) else None
 
 
-def _normals(points_m: NDArray[np.floating], p: UprightParameters) -> F64:
-    """Estimate normals (K, 3) of flat surfaces."""
-    from scipy.spatial import cKDTree
+def _normals(points_m: F64) -> F64:
+    """Estimate the normals (K, 3) of those of the points (N, 3) that lie on flat surfaces."""
+    from pc2grid.open3d_core import o3d
 
-    points = points_m[random_subset(len(points_m), p.points)].astype(np.float64)
-    _, first = np.unique(np.floor(points / p.voxel_m).astype(np.int64), axis=0, return_index=True)
-    points = points[np.sort(first)]
-    if len(points) < p.neighbours:
-        return np.empty((0, 3))
-    squeezed = points * (1.0, 1.0, p.squeeze)
-    _, near = cKDTree(squeezed).query(squeezed[random_subset(len(points), p.normals)], k=p.neighbours)
-    around = points[near]
-    around -= around.mean(axis=1, keepdims=True)
-    variances, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", around, around) / p.neighbours)
-    flat = (variances[:, 0] < p.flatness * variances[:, 1]) & (variances[:, 1] > p.breadth_m**2)
-    return np.asarray(axes[flat, :, 0])
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
+    cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(UPRIGHT.neighbours))
+    variances, axes = np.linalg.eigh(np.asarray(cloud.covariances))
+    return np.asarray(axes[variances[:, 0] < UPRIGHT.flatness * variances[:, 1], :, 0])
 
 
 def vertical_held(shapes: F64, up: F64) -> tuple[F64, F64]:

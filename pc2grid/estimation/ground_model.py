@@ -63,15 +63,10 @@ class GroundModel:
                 self.ground = self.ground.toward(found, 1.0 / self._observations)
 
     def remove(self, points_m: F32) -> F32:
-        """Remove floor and ceiling from points (N, 3), for KISS-ICP."""
+        """Remove the floor from points (N, 3), for KISS-ICP."""
         if self.ground is None or not len(points_m):
             return points_m
-        slack_m = self._parameters.floor_slack_m
-        heights = self.ground.heights(points_m)
-        keep = heights > slack_m
-        if self.ground.ceiling_m is not None:
-            keep &= heights < self.ground.ceiling_m - slack_m
-        return points_m[keep]
+        return points_m[self.ground.heights(points_m) > self._parameters.floor_slack_m]
 
     def T_level_base(self) -> F64:
         """Return tilt and height (4, 4) of the base over the floor. The heading of the base stays."""

@@ -2,7 +2,7 @@
 
 `KissRegistration` is composed of the public parts of kiss_icp, in the order of `KissICP.register_frame`.
 Three things differ. The initial guess comes from outside (the prediction of the smoother). A scan is added to
-the local map by a call of its own, once its pose is final. And on wheels, floor and ceiling are removed
+the local map by a call of its own, once its pose is final. And on wheels, the floor is removed
 before: the rings of a lidar on the floor move with the sensor and pull point-to-point ICP towards standing
 still.
 """

@@ -597,7 +597,7 @@ def possible_floors(points: F64) -> Iterator[tuple[Ground, float]]:
     building is near to it: with each candidate comes its share of the points over the height of the building
     above it.
     """
-    sample = points[random_subset(len(points), _TILTED.ground_sample)]
+    sample = points[random_subset(len(points), _TILTED.sample)]
     for turn in UPRIGHT.values():
         turned = sample @ turn.T
         # Below half of the points, or, where more of them are floor, below all of them.
@@ -650,7 +650,7 @@ def _refined(points: F64, ground: Ground, p: CloudMapParameters) -> Ground:
     plane: F64 = np.asarray(model) / np.linalg.norm(model[:3])
     if plane[:3] @ ground.normal < 0.0:
         plane = -plane
-    return Ground(plane[:3], float(plane[3]), ground.ceiling_m)
+    return Ground(plane[:3], float(plane[3]))
 
 
 # --- is the right side up, and the right floor mapped? ------------------------------------------------

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from pc2grid.clouds.ground import (
-    CAMERA_UPRIGHT,
     LEVEL,
     FloorBelow,
     Ground,
@@ -49,7 +48,6 @@ def test_floor_found_under_a_table_and_a_tilted_sensor(tilt_deg: tuple[float, fl
     assert ground is not None and ground.seen
     assert np.degrees(np.arccos(ground.normal @ T[:3, 2])) < 0.5
     assert ground.offset_m == pytest.approx(1.0, abs=0.01)
-    assert ground.ceiling_m == pytest.approx(2.5, abs=0.06)
     levelled = leveling(ground.normal)[:3, :3] @ ground.normal
     assert levelled == pytest.approx((0, 0, 1), abs=1e-9)
 
@@ -57,7 +55,7 @@ def test_floor_found_under_a_table_and_a_tilted_sensor(tilt_deg: tuple[float, fl
 def test_a_table_is_never_taken_for_the_expected_floor() -> None:
     rng = np.random.default_rng(1)
     table = rng.uniform((0.5, -1, -0.25), (2, 1, -0.25), (3000, 3)) + rng.normal(0, 0.01, (3000, 3))
-    expected = Ground(np.array([0.0, 0.0, 1.0]), 1.0, 2.5)
+    expected = Ground(np.array([0.0, 0.0, 1.0]), 1.0)
     assert find_ground(table, np.zeros(3), expected) is None
 
 
@@ -184,7 +182,7 @@ def bare_room(tilt_rad: float, *, rng: np.random.Generator) -> np.ndarray:
 @pytest.mark.parametrize("tilt_deg", [-20.0, -4.8, 0.0, 4.8, 30.0])
 def test_walls_show_the_tilt_of_the_base(tilt_deg: float) -> None:
     points = bare_room(math.radians(tilt_deg), rng=np.random.default_rng(1))
-    vertical = vertical_of(points, UP)
+    vertical = vertical_of(points, UP, narrow=False)
     assert vertical is not None
     assert math.degrees(math.asin(vertical[0])) == pytest.approx(tilt_deg, abs=0.7)
     assert abs(math.degrees(math.asin(vertical[1]))) < 0.7
@@ -192,7 +190,7 @@ def test_walls_show_the_tilt_of_the_base(tilt_deg: float) -> None:
 
 def test_a_single_wall_does_not_show_it() -> None:
     y, z = np.meshgrid(np.linspace(-2, 2, 60), np.linspace(0, 2, 20))
-    assert vertical_of(np.column_stack((np.full(y.size, 2.0), y.ravel(), z.ravel())), UP) is None
+    assert vertical_of(np.column_stack((np.full(y.size, 2.0), y.ravel(), z.ravel())), UP, narrow=False) is None
 
 
 def test_a_camera_sees_the_pitch_by_a_single_wall_ahead() -> None:
@@ -202,12 +200,12 @@ def test_a_camera_sees_the_pitch_by_a_single_wall_ahead() -> None:
     wall = np.column_stack((np.full(y.size, 2.0), y.ravel(), z.ravel())) + rng.normal(0, 0.005, (y.size, 3))
     c, s = math.cos(pitch), math.sin(pitch)
     points = wall @ np.array([(c, 0, -s), (0, 1, 0), (s, 0, c)])
-    assert vertical_of(points, UP) is None
-    vertical = vertical_of(points, UP, CAMERA_UPRIGHT)
+    assert vertical_of(points, UP, narrow=False) is None
+    vertical = vertical_of(points, UP, narrow=True)
     assert vertical is not None
     assert math.degrees(math.asin(vertical[0])) == pytest.approx(20.0, abs=0.5)
     beside = points[:, [1, 0, 2]] * (1.0, -1.0, 1.0)  # a wall along the way shows no pitch
-    assert vertical_of(beside, UP, CAMERA_UPRIGHT) is None
+    assert vertical_of(beside, UP, narrow=True) is None
 
 
 def of_walls(points: F64) -> F64:
