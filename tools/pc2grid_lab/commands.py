@@ -13,7 +13,6 @@ OutputFolder = Annotated[
     Path, typer.Option(*OUTPUT_FOLDER, metavar="FOLDER", help="for results; run again to go on")
 ]
 Queries = Annotated[int, typer.Option(min=1, help="queries of each map, or of each plan and sensor")]
-Travel = Annotated[float, typer.Option(min=1.0, help="metres that a query drives at most")]
 OfBase = Annotated[bool, typer.Option("--of-base", help="true poses are of the base, not of the sensor")]
 
 
@@ -23,6 +22,14 @@ class RandomQueries:
 
     jobs: Annotated[int | None, typer.Option(min=1, help="processes [one a core]")] = None
     seed: Annotated[int, typer.Option(help="of the queries and their noise")] = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrivenQueries:
+    """How many queries are driven, and how far."""
+
+    queries: Queries = 24
+    travel: Annotated[float, typer.Option(min=1.0, help="metres that a query drives at most")] = 10.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +67,7 @@ class CompareRecordings:
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompareSensors(RandomQueries):
+class CompareSensors(DrivenQueries, RandomQueries):
     """Map plans with lidar, laser and depth camera, locate sessions of each in each: nine cells.
 
     Example: pc2grid compare sensors maps/fr079.yaml maps/intel.yaml --queries 40 --out matrix
@@ -71,17 +78,15 @@ class CompareSensors(RandomQueries):
         typer.Argument(help="Floor plans: MAP.yaml files; of several, each query is also sought in another."),
     ]
     out: OutputFolder = Path("sensor-matrix")
-    queries: Queries = 10
     map_length: Annotated[float, typer.Option(help="metres driven to make a map")] = 200.0
     clutter: Annotated[int, typer.Option(help="things in the way, different in each session")] = (
         Simulate.clutter
     )
     rate: Annotated[float, typer.Option(help="scans a second, of every sensor")] = 10.0
-    travel: Travel = 15.0
 
 
 @dataclass(frozen=True, kw_only=True)
-class ComparePeers:
+class ComparePeers(DrivenQueries):
     """Locate later parts of real recordings in maps of earlier parts, by pc2grid and by other programs.
 
     MRPT's particle filter gets recordings of a laser; KISS-Matcher, MapClosures and Open3D's FPFH + RANSAC
@@ -99,8 +104,6 @@ class ComparePeers:
         ),
     ]
     out: OutputFolder = Path("peers")
-    queries: Queries = 24
-    travel: Travel = 10.0
     mapped: Annotated[
         list[str] | None,
         typer.Option(metavar="NAME=S", help="seconds of a recording that become the map [half, 600 at most]"),

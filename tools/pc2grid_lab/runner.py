@@ -34,6 +34,7 @@ import pc2grid as product
 import pc2grid_cli
 import signature
 from pc2grid import libraries
+from pc2grid.errors import ConfigError
 from pc2grid.io.atomic import replace_file
 
 FRONT, BACK = Path(product.__file__).parent, Path(signature.__file__).parent
@@ -82,14 +83,31 @@ def write_text(path: Path, text: str) -> None:
         draft.write_text(text, encoding="utf-8")
 
 
+def keep(path: Path, made: object) -> None:
+    """Write a file that `kept` reads."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replace_file(path) as draft:
+        draft.write_bytes(pickle.dumps(made))
+
+
+def kept(path: Path) -> Any:
+    """Return what is kept in a file."""
+    return pickle.loads(path.read_bytes())
+
+
 def once(path: Path, make: Callable[[], T]) -> T:
     """Return what `make` returns; it is kept in a file, and read if the file is there."""
     if not path.exists():
-        made = pickle.dumps(make())
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replace_file(path) as draft:
-            draft.write_bytes(made)
-    return cast(T, pickle.loads(path.read_bytes()))
+        keep(path, make())
+    return cast(T, kept(path))
+
+
+def names_of(files: Sequence[Path]) -> list[str]:
+    """Return the names of files without suffixes. Raises ConfigError if two are the same."""
+    names = [file.stem for file in files]
+    if len(set(names)) != len(names):
+        raise ConfigError(f"two files share a name: {', '.join(names)}", hint="rename one of the files")
+    return names
 
 
 def in_processes(

@@ -11,7 +11,6 @@ is located in and however many programs are compared on it.
 from __future__ import annotations
 
 import math
-import pickle
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -24,7 +23,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.errors import ConfigError
 from pc2grid.geometry import F64, SE2
 from pc2grid.io.maps import load_map
 from pc2grid.matching.score import score_fit
@@ -39,7 +37,7 @@ from pc2grid_lab.commands import CompareSensors
 from pc2grid_lab.pages import Cell, print_cells
 from pc2grid_lab.recordings.catalogue import MAP_DRIVE
 from pc2grid_lab.recordings.table import Counts, QueryRow
-from pc2grid_lab.runner import in_processes, once, write_text
+from pc2grid_lab.runner import in_processes, names_of, once, write_text
 from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, apart, fit_frame, is_right
 from signature.config import Config
 from signature.localization.localizer import Localizer
@@ -101,12 +99,6 @@ class RegisteredSession:
                 stamp_ns=planar_scan.stamp_ns, points_m=no_points, T_base_sensor=np.eye(4), sensor=self.sensor
             )
             yield RegisteredScan(scan=scan, T_session_base=T, health=health), planar_scan
-
-    @staticmethod
-    def load(path: Path) -> RegisteredSession:
-        """Read a file that `once` has written."""
-        session: RegisteredSession = pickle.loads(path.read_bytes())
-        return session
 
 
 def register(
@@ -363,9 +355,7 @@ def compare_sensors(given: CompareSensors, terminal: Console) -> None:
     """Map the plans, locate the sessions, and write the table."""
     plans, out = given.plans, given.out
     setting = {name: getattr(given, name) for name in ("map_length", "clutter", "rate", "travel")}
-    names = [plan.stem for plan in plans]
-    if len(set(names)) != len(names):
-        raise ConfigError(f"two plans share a name: {', '.join(names)}", hint="rename one of the files")
+    names = names_of(plans)
     make_folder(out)
     drives = PlanDrives(out=out, **setting)
     with terminal.progress("map") as advance:

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.errors import MapFileError
 from pc2grid.geometry import F64
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.simulate import Building, SimulationConfig, load_building, prepare_session
@@ -134,17 +133,3 @@ def test_mesh_is_driven_through(tmp_path: Path, suffix: str) -> None:
     x, y = session.drive.poses[:, 0], session.drive.poses[:, 1]
     inside_pillar = (np.abs(x - 5.25) < 0.5) & (np.abs(y - 3.25) < 0.5)
     assert not inside_pillar.any()
-
-
-def test_files_that_are_no_building(tmp_path: Path) -> None:
-    (tmp_path / "notes.txt").write_text("x")
-    with pytest.raises(MapFileError, match="not a building that pc2grid reads"):
-        load_building(tmp_path / "notes.txt")
-    with pytest.raises(MapFileError, match="no such file"):
-        load_building(tmp_path / "gone.ply")
-    (tmp_path / "empty.ply").write_bytes(b"ply\nnonsense")
-    with pytest.raises(MapFileError, match="a PLY without a header"):
-        load_building(tmp_path / "empty.ply")
-    (tmp_path / "empty.obj").write_text("v 0 0 0\n")
-    with pytest.raises(MapFileError, match="neither points nor triangles"):
-        load_building(tmp_path / "empty.obj")

@@ -27,7 +27,7 @@ from pc2grid_lab.paper.experiment import (
     draw_queries,
     evaluate,
 )
-from pc2grid_lab.paper.methods import ABLATION, EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods
+from pc2grid_lab.paper.methods import ABLATION, make_methods
 from pc2grid_lab.paper.rivals import DistanceFeatures
 from pc2grid_lab.paper.tables import (
     MAPS,
@@ -201,9 +201,3 @@ def test_wrong_arguments_say_what_is_wrong(
 ) -> None:
     error = runner.invoke(app, [*COMPARE, "--maps", str(maps), "--out", str(tmp_path), *options]).exception
     assert isinstance(error, kind) and words in str(error)
-
-
-@pytest.mark.parametrize("method", METHOD_NAMES + EXTRA_METHOD_NAMES)
-def test_every_method_that_can_be_asked_for_is_run(method: str) -> None:
-    tasks = list(paper_tasks([Path("intel.yaml")], methods=[method], queries=1, seed=1))
-    assert {task.method for task in tasks} == {method}

@@ -79,11 +79,6 @@ def test_a_map_of_empty_submaps_can_be_fitted(name: str) -> None:
     assert scores.shape == (2,) and np.isfinite(scores).all()
 
 
-def test_unknown_methods_are_named() -> None:
-    with pytest.raises(KeyError, match="orb"):
-        make_methods(["orb_bow"])
-
-
 def test_methods_that_differ_in_comparing_share_the_description_of_a_query(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

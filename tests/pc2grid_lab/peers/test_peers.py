@@ -50,9 +50,7 @@ def judged(
     """The answer to a query, so far beside the truth; None: no answer."""
     pose = None if error_m is None else (4.0, 3.0 + error_m, 0.5 + turned_rad)
     answer = {"pose": pose, "score": score, "cpu_s": cpu_s, "peak_mb": 100.0}
-    return PeerTrial.of(
-        peer, "here", map_, SiteQuery(pose=(4.0, 3.0, 0.5), covered=covered, travel_m=10.0), answer
-    )
+    return PeerTrial.of(peer, "here", map_, SiteQuery(pose=(4.0, 3.0, 0.5), covered=covered), answer)
 
 
 def session(scans: int = 30) -> RegisteredSession:

@@ -59,7 +59,7 @@ class Known(Judge):
     def _problem(self, pair: Pair) -> str:
         return ""
 
-    def _fine(self, pair: Pair, query: Recording, one: LocatedWindow, expected: Any) -> float:
+    def _fine(self, pair: Pair, one: LocatedWindow, expected: Any) -> float:
         return 0.95 if one.window % 2 else 0.6
 
 

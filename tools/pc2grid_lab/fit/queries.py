@@ -46,9 +46,10 @@ from pc2grid.simulate import office_floorplan
 from pc2grid.simulate.scene import covered, place_clutter
 from pc2grid.submaps.submaps import look_around, submap_centers
 from pc2grid_lab.peers.programs import recorded_site
-from pc2grid_lab.recordings.catalogue import Catalogue, Pair
+from pc2grid_lab.recordings.catalogue import UNTIL_S, Catalogue, Pair
 from pc2grid_lab.recordings.judging import Judge, config_of
 from pc2grid_lab.recordings.run import Folder
+from pc2grid_lab.runner import kept
 from pc2grid_lab.sensors import PlanMap, RegisteredSession
 from pc2grid_lab.truth import apart
 from signature.config import Config
@@ -98,19 +99,19 @@ def queries_of(session: RegisteredSession, config: Config) -> Iterator[tuple[Que
                 yield query.map(), session.T_world_odom(number + 1)
 
 
-MAPPED_S = {"fr079": 600.0, "intel": 900.0, "csail": 250.0, "killian": 900.0}
-"""Seconds of each log that become the map."""
+LOGS = ("fr079", "intel", "csail", "killian")
+"""Logs with true poses, of which the beginning becomes the map."""
 
 Drawn = tuple[OccupancyGrid, list[RegisteredSession]]
 """The map of the first part of a log, and its later parts as registered queries."""
 
 
-def read(data: Path, name: str, queries: int, kept: Path, config: Config) -> Drawn:
-    """Read the map of the first part of a log, and its later parts as registered queries; `kept` has them."""
+def read(data: Path, name: str, queries: int, folder: Path, config: Config) -> Drawn:
+    """Read the map of the first part of a log, and its later parts as queries, kept in a folder."""
     log = data / "laser" / f"{name}.mcap"
-    travel_m, mapped_s = ASKED_AFTER_M[-1] + 2.0, MAPPED_S[name]
-    site = recorded_site(log, kept / name, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s)
-    sessions = [RegisteredSession.load(site.stem(number).with_suffix(".pickle")) for number in site.queries()]
+    travel_m, mapped_s = ASKED_AFTER_M[-1] + 2.0, UNTIL_S[name]
+    site = recorded_site(log, folder / name, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s)
+    sessions = [kept(site.stem(number).with_suffix(".pickle")) for number in site.queries()]
     return load_map(site.map_stem.with_suffix(".yaml")), sessions
 
 
@@ -350,17 +351,17 @@ def weights(
     work: Path,
     out: Path,
     without: Annotated[str, typer.Option(help="building that is left out")] = "",
-    logs: str = ",".join(MAPPED_S),
+    logs: str = ",".join(LOGS),
     maps: str = "aces,workshop_1",
     queries: int = 24,
 ) -> None:
     """Learn and store the statistics."""
     config, catalogue, folder = Config(), Catalogue.of(), Folder(data.resolve(), work.resolve())
     # Beside what this version of the program has made: another one would not read it.
-    kept = folder.work / "logs"
-    kept.mkdir(exist_ok=True)
+    made = folder.work / "logs"
+    made.mkdir(exist_ok=True)
     building = {name: recording.building for name, recording in catalogue.recordings.items()}
-    drawn = {name: read(data, name, queries, kept, config) for name in logs.split(",") if name != without}
+    drawn = {name: read(data, name, queries, made, config) for name in logs.split(",") if name != without}
     asked = [
         pair
         for pair in catalogue.pairs

@@ -422,8 +422,7 @@ def describe_points(image: NDArray[np.uint8], points: F64) -> F32:
     For each of 4 x 4 fields of a square of 20 scales, turned with the point: the sums of dx, dy, |dx|, |dy|
     of 5 x 5 wavelets. A descriptor has length 1, or 0 where the image does not change.
     """
-    integral = np.zeros((image.shape[0] + 1, image.shape[1] + 1))
-    integral[1:, 1:] = image.astype(np.float64).cumsum(axis=0).cumsum(axis=1)
+    integral = cv2.integral(image).astype(np.float64)
     y, x, scale = points.T[:, :, None]
     turn = orientations(integral, points)[:, None]
     c, s = np.cos(turn), np.sin(turn)

@@ -65,6 +65,8 @@ from pc2grid_lab.runner import (
     LABORATORY,
     digest_of_sources,
     in_processes,
+    keep,
+    kept,
     once,
     write_text,
 )
@@ -189,11 +191,9 @@ def computed_cells(tasks: Sequence[PaperTask], folder: Path) -> list[PaperCell]:
     Methods are fitted once for all levels, and queries drawn once for all methods of a level: tasks that
     share queries stand together.
     """
-    made: dict[PaperTask, PaperCell] = {}
     for cell in _run([task for task in tasks if not task.file(folder).exists()], folder):
-        made[cell.task] = cell
-        once(cell.task.file(folder), partial(made.__getitem__, cell.task))
-    return [once(task.file(folder), partial(made.__getitem__, task)) for task in tasks]
+        keep(cell.task.file(folder), cell)
+    return [kept(task.file(folder)) for task in tasks]
 
 
 def _run(tasks: Sequence[PaperTask], folder: Path) -> Iterator[PaperCell]:
@@ -364,8 +364,8 @@ def compare_paper(given: ComparePaper, terminal: Console) -> None:
         paper_tasks(found, methods=chosen, offsets_m=offsets_m, queries=given.queries, seed=given.seed)
     )
     with terminal.progress(f"{len(tasks)} cells of the tables") as advance:
-        kept = kept_in(out, found)
-        groups = [(group, kept) for group in that_share_submaps(tasks)]
+        folder = kept_in(out, found)
+        groups = [(group, folder) for group in that_share_submaps(tasks)]
         cells = itertools.chain.from_iterable(
             in_processes(computed_cells, groups, jobs=given.jobs, advance=advance)
         )
@@ -624,12 +624,12 @@ def compare_scale(given: CompareScale, terminal: Console) -> None:
     maps, out, queries, seed = given.maps, given.out, given.queries, given.seed
     asked, sources = known_maps(maps), sources_of(maps)
     make_folder(out)
-    kept = kept_in(out, sorted(maps.glob("*.yaml")))
+    folder = kept_in(out, sorted(maps.glob("*.yaml")))
     experiment = Experiment(queries=queries, seed=seed)
     with terminal.progress(f"places of {len(sources)} maps") as advance:
-        described = [(source, kept) for source in [*map(own_of, asked), *sources]]
+        described = [(source, folder) for source in [*map(own_of, asked), *sources]]
         in_processes(MapSource.places, described, jobs=given.jobs, advance=advance)
-    tasks = [(path, level, experiment, sources, kept) for level in LEVELS for path in asked]
+    tasks = [(path, level, experiment, sources, folder) for level in LEVELS for path in asked]
     with terminal.progress(f"queries of {len(asked)} maps") as advance:
         results = in_processes(count, tasks, jobs=given.jobs, advance=advance)
     drawn = list(curves(results))

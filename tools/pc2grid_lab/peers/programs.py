@@ -61,7 +61,17 @@ from pc2grid_lab.pages import Cell, clopper_pearson, print_cells
 from pc2grid_lab.peers.cloud_matchers import PoseAndScore, serve, thinned
 from pc2grid_lab.recordings.catalogue import MAP_DRIVE, beginning_s, drive_config
 from pc2grid_lab.recordings.judging import known_share
-from pc2grid_lab.runner import BACK, FRONT, LABORATORY, digest_of_sources, once, run, write_text
+from pc2grid_lab.runner import (
+    BACK,
+    FRONT,
+    LABORATORY,
+    digest_of_sources,
+    keep,
+    kept,
+    names_of,
+    run,
+    write_text,
+)
 from pc2grid_lab.sensors import RegisteredSession, index_of, register, start_on
 from pc2grid_lab.truth import JUDGEMENT, apart, is_right, nearest
 from signature.config import Config
@@ -90,12 +100,11 @@ class SiteQuery:
     """What a query is judged by.
 
     pose : true x, y, yaw of the base in the map at the last scan. covered : the map shows what was seen
-        there. travel_m : metres driven.
+        there.
     """
 
     pose: tuple[float, float, float]
     covered: bool
-    travel_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -264,7 +273,7 @@ def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Con
     if np.isnan(session.T_world_base[:, 0]).all():
         return
     truth = session.T_world_odom() @ [*session.trajectory.poses()][-1]
-    once(stem.with_suffix(".pickle"), lambda: session)
+    keep(stem.with_suffix(".pickle"), session)
     if site.planar:
         save_beams(stem.with_suffix(".ranges.npz"), [registered.scan for registered in seen])
     else:
@@ -280,7 +289,6 @@ def _save_query(site: Site, number: int, scans: Iterable[PosedScan], config: Con
     query = SiteQuery(
         pose=(truth.x, truth.y, truth.yaw),
         covered=known_share(grid, truth.apply(alone.hits_m)) >= JUDGEMENT.mapped,
-        travel_m=session.trajectory.length_m,
     )
     write_text(stem.with_suffix(".json"), json.dumps(asdict(query)))  # last: the query is complete
 
@@ -371,19 +379,19 @@ def how_to_install(kind: PeerKind) -> str | None:
     return None
 
 
-def answers(kind: PeerKind, map_stem: Path, queries: Sequence[Path], kept: Path) -> list[dict[str, Any]]:
+def answers(kind: PeerKind, map_stem: Path, queries: Sequence[Path], file: Path) -> list[dict[str, Any]]:
     """Return what a program says to each query in a map: pose (x, y, yaw of the base in the map, None without
     an answer), score (larger is surer, in a unit of its own), cpu_s (processor time from the registered query
     to the pose), peak_mb (largest memory of the process so far, with the map and the libraries).
 
-    kept : the file of the answers; if it exists, it is read. Raises PeerFailed.
+    file : of the answers; if it exists, it is read. Raises PeerFailed.
     """
-    if not kept.exists():
-        paths = (path.absolute() for path in (map_stem, kept, *queries))
+    if not file.exists():
+        paths = (path.absolute() for path in (map_stem, file, *queries))
         done = run(kind.python, Path(__file__).with_name(kind.file), kind.name, *paths)
-        if not kept.exists():
+        if not file.exists():
             raise PeerFailed(f"{kind.name}: no answers to the queries of {queries[0].parent}: {done.error}")
-    found: list[dict[str, Any]] = json.loads(kept.read_text())
+    found: list[dict[str, Any]] = json.loads(file.read_text())
     return found
 
 
@@ -492,7 +500,7 @@ def particle_filter(map_stem: str) -> Callable[[str], PoseAndScore]:
         log, config = Path(folder.name, "query.log"), Path(folder.name, "query.ini")
         with np.load(f"{query}.ranges.npz") as file:
             ranges_m, fov_rad, T_base_middle = file["ranges_m"], float(file["fov_rad"]), file["T_base_middle"]
-        session = RegisteredSession.load(Path(f"{query}.pickle"))
+        session = kept(Path(f"{query}.pickle"))
         log.write_text(carmen_log(session, ranges_m, fov_rad, SE2.from_matrix(T_base_middle)))
         _output_of("carmen2rawlog", "-q", "-w", "-i", str(log), "-o", setting["rawlog"])
         config.write_text(_CONFIG.format(**setting, decimation=max(ranges_m.shape[1] // 36, 1)))
@@ -550,7 +558,7 @@ def own(map_stem: str) -> Callable[[str], PoseAndScore]:
 
     def locate(query: str) -> PoseAndScore:
         localizer = Localizer(index)
-        for scan in RegisteredSession.load(Path(f"{query}.pickle")).scans():
+        for scan in kept(Path(f"{query}.pickle")).scans():
             localizer.add(*scan)
         answer = localizer.answer()
         return None if answer.T_map_base is None else (answer.T_map_base.lift(), answer.confidence)
@@ -676,8 +684,8 @@ def compare_peers(given: ComparePeers, terminal: Console) -> None:
     with terminal.progress("locate") as advance:
         for done, (kind, site, map_site) in enumerate(tasks, start=1):
             asked = site.queries()
-            kept = work / f"{kind.name}.{site.folder.name}.in.{map_site.folder.name}.json"
-            found = answers(kind, map_site.map_stem, [site.stem(one) for one in asked], kept)
+            file = work / f"{kind.name}.{site.folder.name}.in.{map_site.folder.name}.json"
+            found = answers(kind, map_site.map_stem, [site.stem(one) for one in asked], file)
             for query, answer in zip(asked.values(), found, strict=True):
                 trials.append(PeerTrial.of(kind.name, site.name, map_site.name, query, answer))
             advance(done / len(tasks))
@@ -734,9 +742,7 @@ def _site(recording: Path, work: Path, given: ComparePeers, mapped_s: float | No
 
 def _seconds(mapped: Sequence[str], recordings: Sequence[Path]) -> dict[str, float]:
     """Return the values of `--mapped`, by name. Raises ConfigError."""
-    names, seconds = [recording.stem for recording in recordings], {}
-    if len(set(names)) != len(names):
-        raise ConfigError(f"two recordings share a name: {', '.join(names)}", hint="rename one of the files")
+    names, seconds = names_of(recordings), {}
     for text in mapped:
         name, _, value = text.partition("=")
         try:

@@ -433,6 +433,11 @@ PAIRS += tuple(
 )
 
 
+UNTIL_S = {
+    pair.query: pair.until_s for pair in PAIRS if pair.kind == "later part" and pair.until_s is not None
+}
+"""Seconds of a recording that become the map in which its later parts are located."""
+
 NOT_ALIKE = (("fr079", "wean.yaml"),)
 """Maps of two buildings that were joined once: walls of one are drawn .3 m thick."""
 FOREIGN_MAPS = 2

@@ -93,12 +93,11 @@ class RecordedDrive:
     """A recording as it was driven: its own trajectories, and true poses if there are any.
 
     parts : the sessions of the map of the whole recording; none for a map that is no recording.
-    truth : poses of the base in the world, whose z is up; None without. late_ns : see `Recording.late_s`.
+    truth : poses of the base in the world, whose z is up, stamped as the scans are; None without.
     """
 
     parts: tuple[Trajectory, ...]
     truth: Trajectory | None
-    late_ns: int = 0
 
     def own_pose(self, stamp_ns: int) -> tuple[int, SE2] | None:
         """Return the part and T_part_base of the scan with that stamp; None if no part has it."""
@@ -119,40 +118,37 @@ class RecordedDrive:
         """Return t_world_base by the true poses; where they are far apart, carried on by the own
         trajectory."""
         assert self.truth is not None
-        T = pose_at_stamp(self.truth, stamp_ns - self.late_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
-        return self._carried(stamp_ns - self.late_ns) if T is None else SE2.from_matrix(T)
+        T = pose_at_stamp(self.truth, stamp_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
+        return self._carried(stamp_ns) if T is None else SE2.from_matrix(T)
 
     def _carried(self, stamp_ns: int) -> SE2 | None:
         """Return the own trajectory around a stamp, laid on the true poses there."""
         assert self.truth is not None
-        own = self.own_pose(stamp_ns + self.late_ns)
+        own = self.own_pose(stamp_ns)
         near = np.flatnonzero(np.abs(self.truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
-        if own is None or not len(near):
+        if own is None:
             return None
         pairs = [
             (there[1], SE2.from_matrix(self.truth.T_session_base[k]))
             for k in near.tolist()
-            if (there := self.own_pose(int(self.truth.stamps_ns[k]) + self.late_ns)) is not None
-            and there[0] == own[0]
+            if (there := self.own_pose(int(self.truth.stamps_ns[k]))) is not None and there[0] == own[0]
         ]
-        if not pairs:
-            return None
-        return fit_frame(pairs, AHEAD_M) @ own[1]
+        return fit_frame(pairs, AHEAD_M) @ own[1] if pairs else None
 
 
 @cache
 def drive_of(recording: Recording, folder: Folder) -> RecordedDrive:
     """Return the drive of a recording whose whole map is in the folder."""
     parts = tuple(sessions(folder, recording.name).values())
-    late_ns = round(recording.late_s * 1e9)
     poses = folder.true(recording, recording.poses)
     if poses is None:
-        return RecordedDrive(parts, None, late_ns)
+        return RecordedDrive(parts, None)
     truth = read_tum(poses)
+    truth = replace(truth, stamps_ns=truth.stamps_ns + round(recording.late_s * 1e9))
     if not recording.of_base:
         T_sensor_base = invert_pose(mount(folder, recording))
         truth = replace(truth, T_session_base=truth.T_session_base @ T_sensor_base)
-    return RecordedDrive(parts, levelled(truth, parts, late_ns), late_ns)
+    return RecordedDrive(parts, levelled(truth, parts))
 
 
 @cache
@@ -162,7 +158,7 @@ def grids(folder: Folder, name: str) -> dict[str, OccupancyGrid]:
         return {info.name: database.grid(info.name) for info in database.sessions()}
 
 
-def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -> Trajectory:
+def levelled(truth: Trajectory, parts: Sequence[Trajectory]) -> Trajectory:
     """Turn true poses of the base so that z of the world is up.
 
     The world of a camera's poses may lie as its first image does. Which way is up in it is told by the own
@@ -170,8 +166,8 @@ def levelled(truth: Trajectory, parts: Sequence[Trajectory], late_ns: int = 0) -
     """
     up = np.zeros(3)
     for part in parts:
-        at = np.searchsorted(part.stamps_ns, truth.stamps_ns + late_ns).clip(max=len(part) - 1)
-        same = np.abs(part.stamps_ns[at] - truth.stamps_ns - late_ns) <= SAME_NS
+        at = np.searchsorted(part.stamps_ns, truth.stamps_ns).clip(max=len(part) - 1)
+        same = np.abs(part.stamps_ns[at] - truth.stamps_ns) <= SAME_NS
         # The third row of a rotation is the vertical of its frame, as the base sees it.
         vertical = part.T_session_base[at[same], 2, :3, None]
         up += (truth.T_session_base[same, :3, :3] @ vertical).sum(axis=(0, 2))
@@ -229,22 +225,20 @@ EXACT_M, WRONG_M = 0.1, 0.25
 
 def map_row(recording: Recording, folder: Folder) -> MapRow:
     """Return the row of a recording as a map; what cannot be judged is a row that says why."""
-    row: dict[str, Any] = {
-        "name": recording.name,
-        "building": recording.building,
-        "sensor": recording.sensor_shown,
-    }
-    if folder.missing(recording):
-        return MapRow(**row, problem=MISSING)
+    row = MapRow(name=recording.name, building=recording.building, sensor=recording.sensor_shown)
     done = kept_result(folder.kept("maps", recording.name))
-    if done is None:
-        return MapRow(**row, problem=NOT_RUN)
-    if done.failed:
-        return MapRow(**row, problem=done.error, cpu_s=done.cpu_s)
+    problem = MISSING if folder.missing(recording) else problem_of(done)
+    if problem or done is None:
+        return replace(row, problem=problem, cpu_s=None if done is None else done.cpu_s)
     try:
-        return MapRow(**row, cpu_s=done.cpu_s, **_figures(recording, folder, done))
+        return replace(row, cpu_s=done.cpu_s, **_figures(recording, folder, done))
     except Exception as error:
-        return MapRow(**row, problem=said(error))
+        return replace(row, problem=said(error))
+
+
+def problem_of(done: Finished | None) -> str:
+    """Return why a command has no result; empty if it has one."""
+    return NOT_RUN if done is None else done.error
 
 
 def said(error: Exception) -> str:
@@ -409,17 +403,23 @@ class Judge:
     def row(self, pair: Pair) -> PairRow:
         """Return the row of a pair; what cannot be judged is a row that says why."""
         query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
-        row: dict[str, Any] = {
-            "query": pair.query,
-            "map": pair.map_name,
-            "kind": pair.kind,
-            "building": map_.building,
-            "sensors": " in ".join(dict.fromkeys((query.sensor_shown, map_.sensor_shown))),
-        }
+        row = PairRow(
+            query=pair.query,
+            map=pair.map_name,
+            kind=pair.kind,
+            building=map_.building,
+            sensors=" in ".join(dict.fromkeys((query.sensor_shown, map_.sensor_shown))),
+        )
         try:
-            return self._judged(pair, query, map_, row)
+            problem = self._problem(pair)
+            if problem:
+                return replace(row, problem=problem)
+            truth, windows, frames = self._frames(pair)
+            agreeing = sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None
+            queries = tuple(self._row_of(pair, one, frames) for one in windows)
+            return replace(row, truth=truth, agreeing=agreeing, queries=queries)
         except Exception as error:
-            return PairRow(**row, problem=said(error))
+            return replace(row, problem=said(error))
 
     def truths(self, pair: Pair) -> Iterator[tuple[TimeSpan, dict[str, SE2], bool]]:
         """Yield the windows of a pair whose place is known: the window, the base at its end in each session
@@ -427,27 +427,14 @@ class Judge:
 
         Of a pair with another building, every window, and no place.
         """
-        query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
-        _, windows, frames = self._frames(pair, query, map_)
+        _, windows, frames = self._frames(pair)
         for one in windows:
             expected = _expected(one, frames)
             if expected or pair.kind == "elsewhere":
                 poses = {session: pose for session, (pose, _) in expected.items()}
                 yield one.span, poses, self._covered(pair, one, expected)
 
-    def _judged(self, pair: Pair, query: Recording, map_: Recording, row: dict[str, Any]) -> PairRow:
-        problem = self._problem(pair)
-        if problem:
-            return PairRow(**row, problem=problem)
-        truth, windows, frames = self._frames(pair, query, map_)
-        return PairRow(
-            **row,
-            truth=truth,
-            agreeing=sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None,
-            queries=tuple(self._row_of(pair, query, one, frames) for one in windows),
-        )
-
-    def _row_of(self, pair: Pair, query: Recording, one: LocatedWindow, frames: Frames) -> QueryRow:
+    def _row_of(self, pair: Pair, one: LocatedWindow, frames: Frames) -> QueryRow:
         """Judge an answer by where the query is in the sessions of the map; where it is missed, with what
         `--check` says of its true pose."""
         row, expected = _answered(one), _expected(one, frames)
@@ -456,7 +443,7 @@ class Judge:
         if one.answer is None or not expected:
             return row
         row = replace(row, covered=self._covered(pair, one, expected), **_best(one.places, expected))
-        return replace(row, fine=self._fine(pair, query, one, expected)) if row.missed else row
+        return replace(row, fine=self._fine(pair, one, expected)) if row.missed else row
 
     def _covered(self, pair: Pair, one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]]) -> bool:
         """Return whether a map knows the ground that a window has last seen."""
@@ -467,11 +454,12 @@ class Judge:
         )
 
     def _fine(
-        self, pair: Pair, query: Recording, one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]]
+        self, pair: Pair, one: LocatedWindow, expected: Mapping[str, tuple[SE2, float]]
     ) -> float | None:
         """Return the probability of the true pose of a window by `check_pose`; None if that does not call it
         fine."""
-        config, folder, found = config_of(query), self._folder, []
+        query, folder, found = self._catalogue.recordings[pair.query], self._folder, []
+        config = config_of(query)
         for session, (T_map_base, _) in expected.items():
             with (
                 open_database(folder.map(pair.map_name)) as database,
@@ -488,7 +476,7 @@ class Judge:
         row = FollowedRow(before=one.before, after=one.after, map=one.map_name, building=building)
         done = kept_result(self._folder.kept("followed", one.asked))
         if done is None or done.failed:
-            return replace(row, problem=NOT_RUN if done is None else done.error or MISSING)
+            return replace(row, problem=problem_of(done))
         if one.after is not None:
             begin_ns = done.document["put_down_ns"] - done.document["shift_ns"]
             row = replace(row, shown=self._shows(one, one.after, begin_ns) is True)
@@ -549,7 +537,7 @@ class Judge:
         row = JoinRow(target=target, source=source, same=building == other)
         done = kept_result(self._folder.kept("joins", f"{source}.in.{target}"))
         if done is None or done.failed:
-            return replace(row, problem=NOT_RUN if done is None else done.error)
+            return replace(row, problem=problem_of(done))
         found, right, error_m = done.document, None if row.same else False, None
         T, middle = (SE2(**found[name]) for name in ("T_target_source", "middle"))
         try:
@@ -577,7 +565,7 @@ class Judge:
                 continue
             names, clues, within_m = (query.name, map_.name), [], []
             pair = next((p for p in self._catalogue.pairs if (p.query, p.map_name) == names), None)
-            known_by = {} if pair is None or self._problem(pair) else self._frames(pair, query, map_)[2]
+            known_by = {} if pair is None or self._problem(pair) else self._frames(pair)[2]
             for part in drive_of(query, self._folder).parts[:1]:
                 for k in _steps(part, AGREEMENT.place_m):
                     place = self._lies_at(query, map_, int(part.stamps_ns[k]), known_by)
@@ -631,11 +619,10 @@ class Judge:
         where = drive.where(stamp_ns) if pair.placed is None else drive.own_pose(stamp_ns)
         return replace(one, where=where, hits_m=hits_at(self._folder, query, stamp_ns))
 
-    def _frames(
-        self, pair: Pair, query: Recording, map_: Recording
-    ) -> tuple[Truth | None, list[LocatedWindow], Frames]:
+    def _frames(self, pair: Pair) -> tuple[Truth | None, list[LocatedWindow], Frames]:
         """Return the windows, and how the parts of the drive lie in the sessions of the map: by true poses,
         by the trajectory of the whole recording, by a pose that was found once, or else by the answers."""
+        query, map_ = (self._catalogue.recordings[name] for name in (pair.query, pair.map))
         windows = self._located_windows(pair)
         if pair.kind == "elsewhere":
             return "elsewhere", windows, {}
@@ -752,12 +739,10 @@ def _agreed(said: Iterable[tuple[tuple[int, str], Clue]]) -> Frames:
 
 def _answered(one: LocatedWindow) -> QueryRow:
     """Return what a row holds of an answer before it is judged."""
-    row = QueryRow(window=one.window, start_s=one.span.start_s)
-    if one.done is None:
-        return replace(row, problem=NOT_RUN)
-    row = replace(row, cpu_s=one.done.cpu_s)
+    row = QueryRow(window=one.window, start_s=one.span.start_s, problem=problem_of(one.done))
+    row = row if one.done is None else replace(row, cpu_s=one.done.cpu_s)
     if one.answer is None:
-        return replace(row, problem=one.done.error)
+        return row
     space = one.answer.get("in_space")
     return replace(
         row,

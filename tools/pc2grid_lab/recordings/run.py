@@ -39,6 +39,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.model import Scan, Trajectory
 from pc2grid.observer import TimeSpan
 from pc2grid_lab.recordings.catalogue import (
+    UNTIL_S,
     Catalogue,
     Pair,
     Recording,
@@ -186,10 +187,7 @@ FOLLOWED: tuple[Followed, ...] = (
     *_in("workshop_1", "workshop_1_changed"),
     *_in("workshop_1_changed", "workshop_1"),
     *(Followed(before="fr079", map=name) for name in ("fr079 lidar", "fr079 depth", "fr079_floor.ply")),
-    *(
-        Followed(before=name, map=name, until_s=until_s)
-        for name, until_s in (("fr079", 600.0), ("intel", 900.0), ("csail", 250.0))
-    ),
+    *(Followed(before=name, map=name, until_s=UNTIL_S[name]) for name in ("fr079", "intel", "csail")),
 )
 """All rows, in the order of the page."""
 
@@ -310,7 +308,13 @@ def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[Task]:
         windows = catalogue.windows(pair, folder.length_s(query))
     except (Pc2GridError, OSError):
         return []
-    return [_locate(folder, query, pair, window) for _, window in windows]
+    asked: tuple[str | Path, ...] = (folder.source(query), "-d", folder.map(pair.map_name), *query.options)
+
+    def locate(window: TimeSpan) -> Task:
+        span = ("--start", f"{window.start_s:.3f}", "--duration", f"{window.duration_s:g}", "--json")
+        return Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *asked, *span))
+
+    return [locate(window) for _, window in windows]
 
 
 def _convert(folder: Folder, name: str, recording: Recording, until_s: float | None) -> Task:
@@ -341,18 +345,6 @@ def _bare(folder: Folder, recording: Recording) -> Task:
     poses = () if truth is None or truth.suffix != ".tum" else (truth,)
     command = (sys.executable, "-m", "pc2grid_lab.recordings.run", folder.source(recording), *poses)
     return Task(folder.kept("bare", recording.name), lambda: run(*command, limit_s=1800.0))
-
-
-def _locate(folder: Folder, recording: Recording, pair: Pair, window: TimeSpan) -> Task:
-    span = ("--start", f"{window.start_s:.3f}", "--duration", f"{window.duration_s:g}", "--json")
-    asked: tuple[str | Path, ...] = (
-        folder.source(recording),
-        "-d",
-        folder.map(pair.map_name),
-        *recording.options,
-        *span,
-    )
-    return Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *asked))
 
 
 _JOIN = "from pc2grid_lab.recordings.run import print_join; print_join()"

@@ -272,17 +272,13 @@ class Table:
     followed: tuple[FollowedRow, ...] = ()
     joins: tuple[JoinRow, ...] = ()
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the table in plain types; numbers are rounded to what the page could show."""
+    def to_text(self) -> str:
+        """Return the table as a JSON text with a line for each row, so that versions can be compared; numbers
+        are rounded to what the page could show."""
         text = json.dumps({"schema_version": 1, **asdict(self)})
         document: dict[str, Any] = json.loads(
             text, parse_float=lambda digits: round(float(digits), 4), parse_constant=lambda _: None
         )
-        return document
-
-    def to_text(self) -> str:
-        """Return the table as a JSON text with a line for each row, so that versions can be compared."""
-        document = self.to_json()
         rows = {name: document.pop(name) for name in ("maps", "pairs", "followed", "joins")}
         head = json.dumps(document)[1:-1]
         lists = (
@@ -293,7 +289,7 @@ class Table:
 
     @staticmethod
     def from_json(document: dict[str, Any]) -> Table:
-        """Return the table that `to_json` made. Raises ValueError for any other document."""
+        """Return the table that `to_text` wrote. Raises ValueError for any other document."""
         return TypeAdapter(Table).validate_python(document)
 
 
@@ -819,20 +815,12 @@ def _failures(table: Table) -> list[str]:
         for query in row.queries
         if query.problem not in ("", NOT_RUN)
     ]
-    found = ["## Wrong answers", "", *wrong, ""] if wrong else [_none_wrong(table), ""]
+    counts = _total(table.pairs)
+    none = f"Of {counts.located} located answers none is known to be wrong; {counts.unjudged} are not judged."
+    found = ["## Wrong answers", "", *wrong, ""] if wrong else [none, ""]
     for title, lines in (("Not judged", unjudged), ("Failed", problems)):
         found += [f"## {title}", "", *lines, ""] if lines else []
     return found
-
-
-def _none_wrong(table: Table) -> str:
-    """Return what can be said where no answer is known to be wrong."""
-    counts = _total(table.pairs)
-    if not counts.located:
-        return "Nothing is located." if counts.queries else "Nothing is asked."
-    if counts.unjudged == counts.located:
-        return f"Whether the {counts.located} located answers are right is not known."
-    return "No answer that is judged is wrong." if counts.unjudged else "No answer is wrong."
 
 
 _HIDDEN = {"building", "over KISS-ICP", "bare KISS-ICP", "right of covered", "overlooked", "rank", "in space"}
@@ -904,7 +892,8 @@ def changes(before: Table, after: Table) -> list[RowChange]:
     exceed."""
     maps = [(old, new) for new in after.maps for old in before.maps if old.name == new.name]
     recorded = filter(lambda row: row.kind != "disturbed", after.pairs)  # the others ask the same again
-    pairs = [(old, new) for new in recorded for old in before.pairs if _key(old) == _key(new)]
+    asked = {(row.kind, row.name): row for row in before.pairs}
+    pairs = [(asked[new.kind, new.name], new) for new in recorded if (new.kind, new.name) in asked]
     pace = _pace(maps)
     same_form = before.quick == after.quick
     found = [change for old, new in maps for change in _map_changes(old, new, pace)]
@@ -922,10 +911,6 @@ def changes(before: Table, after: Table) -> list[RowChange]:
             name, text = f"{row.source} joined with {row.target}", f"{was} -> {row.outcome}"
             found.append(RowChange(row=name, text=text, worse=row.outcome in ("wrong", "failed")))
     return found
-
-
-def _key(row: PairRow) -> tuple[str, str, str]:
-    return row.kind, row.query, row.map
 
 
 def _pace(maps: Sequence[tuple[MapRow, MapRow]]) -> float:
