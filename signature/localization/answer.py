@@ -101,6 +101,8 @@ class Place:
     the base now. mass : probability of it.
     seen_m, T_odom_seen, seen : of a place to which odometry has carried the robot: metres driven, the base,
     and the covariances of the fits (3, 3), where the maps showed the place last.
+    beside : the same place where odometry has carried the robot, of what the map hardly shows; its mass is a
+    part of this one's.
     """
 
     fits: tuple[Fit, ...]
@@ -108,6 +110,7 @@ class Place:
     seen_m: float = 0.0
     T_odom_seen: SE2 = field(default_factory=SE2)
     seen: tuple[F64, ...] = ()
+    beside: Place | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,8 +118,7 @@ class Answer:
     """Where the query was.
 
     status : located, ambiguous (several places fit) or not_found (none does).
-    confidence : mass of the first place, see `signature.localization.decision`.
-    places : all that fit, the likeliest first. log_odds : of the first one over "nowhere", by the walls.
+    places : all that fit, the likeliest first, with their masses, see `signature.localization.posterior`.
     off_map : further places, of which the map shows too little to tell; odometry has carried the robot there
     from places that it shows. The likeliest first; their masses are parts of the same probability.
     history : the answers so far, this one last: the best place of each (`moment`).
@@ -147,9 +149,7 @@ class Answer:
     """
 
     status: Status
-    confidence: float
     places: tuple[Place, ...]
-    log_odds: float = -math.inf
     stamp_ns: int
     path_m: float
     T_odom_base: SE2
@@ -202,6 +202,11 @@ class Answer:
         walls_m = self.local_map.to_point(np.argwhere(self.local_map.occupied))
         there_m = self.best.T_map_query.apply(walls_m)
         return map_png(self.map.cells, self.map.resolution_m, self.map.origin_m, centers_m=there_m)
+
+    @property
+    def confidence(self) -> float:
+        """Return the mass of the first place."""
+        return self.places[0].mass if self.places else 0.0
 
     @property
     def mass(self) -> float:

@@ -2,8 +2,8 @@
 
 Hypotheses are carried along the query's travel: after every metre the old ones are refined on what has been
 seen since, and the database is searched again, so that a wrong first hypothesis is replaced. What was seen
-before the last metres is in the masses of the belief (`signature.localization.belief`). An answer rests on
-both, is refined, and is checked in space where query and map have points (`Localizer.search`).
+before the last metres is in the masses of the belief. `Localizer.search` is the whole way of an answer; its
+equations are in `signature.localization.posterior`.
 
 A search takes up to seconds in a large building, and a robot sends 40 scans a second. So `Follower` searches
 in a thread while tracking goes on; the most expensive parts are compiled and run beside Python.
@@ -31,11 +31,18 @@ from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.localization.answer import LIKELY, Answer, State, fits_changed
-from signature.localization.belief import Belief, mass_at, with_mass
-from signature.localization.decision import PriorOf, decide, judge, slip_of, weighed
 from signature.localization.hypotheses import HYPOTHESES, moved_to_origin
-from signature.localization.in_space import settle_in_space
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import (
+    Belief,
+    PriorOf,
+    decide,
+    elsewhere,
+    judge,
+    settle_in_space,
+    slip_of,
+    weighed,
+)
 from signature.localization.query import Query, QueryMap, ViewSpacing, map_as_query
 
 _MOMENTS = 10_000
@@ -178,21 +185,16 @@ class Localizer:
         """
         seen, index, clock = query.map(), index or self.index, self._clock
         clock.lap("describe")
-        believed, off_map = self._belief.before(index, seen)
-        prior_of = prior_of or believed
-        answer, found = decide(index, seen, (*self._known, *known), prior_of)
+        before, off_map = self._belief.before(index, seen)
+        answer, found = decide(index, seen, (*self._known, *known), prior_of or before)
         clock.lap("search")
         answer = _with_prior(index, seen, answer, found)
-        slipped, later = 0.0, None
-        best = answer.best
-        if best is not None:
-            walls = index.maps_for(seen)[best.session_index].walls
-            slipped, scans = slip_of(seen, best, walls, index.config.step_m)
-            if scans and query is self.query:
-                later = self.search(query.since(scans), index=index)
-                slipped *= _elsewhere(later[1], best)
-        answer = weighed(answer, prior_of, off_map, slipped, index.config.accept)
-        if later and slipped * answer.places[0].mass >= LIKELY:
+        slipped, since = slip_of(index, seen, answer)
+        later = self.search(query.since(since), index=index) if since and query is self.query else None
+        if later is not None:
+            slipped *= elsewhere(later[1], answer)
+        answer = weighed(answer, off_map, slipped, index.config.accept)
+        if later is not None and slipped * answer.places[0].mass >= LIKELY:
             return later
         answer = self._belief.in_its_map(answer)
         clock.lap("decide")
@@ -219,21 +221,13 @@ class Clock:
 def _with_prior(index: MapIndex, query: QueryMap, answer: Answer, found: tuple[Fit, ...]) -> Answer:
     """Return the answer with whether the prior was used, and, if no place that it allows is certain, the best
     place found that it excludes."""
-    if index.whole is None or index.region is None:
+    if index.whole is None or index.prior is None:
         return answer
-    if not index.prior_applies(query):
-        return replace(answer, prior="ahead" if index.region.is_ahead(query) else "lapsed")
+    if index.prior_for(query) is None:
+        return replace(answer, prior="ahead" if index.prior.is_ahead(query) else "lapsed")
     everywhere = judge(index.whole, query, () if answer.located else found)
     excluded = everywhere.best is not None and not index.allows(query, everywhere.best)
     return replace(answer, prior="used", excluded=everywhere.moment if excluded else None)
-
-
-def _elsewhere(alone: Answer, place: Fit) -> float:
-    """Return the mass of all that a query can be but one place, as a multiple of the mass of "nowhere"."""
-    if not alone.places or not alone.places[0].mass:
-        return 1.0
-    here = mass_at([place], with_mass(alone), alone.T_odom_base)
-    return 1.0 + math.exp(alone.log_odds) / alone.places[0].mass * (alone.mass - here)
 
 
 @one_blas_thread

@@ -7,6 +7,7 @@ import copy
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from itertools import chain
 from typing import TYPE_CHECKING
 
@@ -23,8 +24,7 @@ from pc2grid.observer import Observer
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
 from signature.localization.hypotheses import look_up
-from signature.localization.in_space import SurfaceOf, surface_reader
-from signature.localization.prior import Prior, Region
+from signature.localization.prior import Prior
 from signature.localization.query import QueryMap
 from signature.paper import PlaceTable
 from signature.retrieval.places import (
@@ -47,15 +47,15 @@ class MapIndex:
 
     Each map is prepared (in tens of milliseconds) when it first matters to a query, and kept.
 
-    region : of the places that a prior allows, see `within`. whole : the index without the prior.
+    prior : what is known of the pose beforehand, see `within`. whole : the index without it.
     look : number of the look of a robot that is searched for, see `at_look`.
     surface_of : the points of the maps, which answers are refined and checked with; None if they have none.
     """
 
-    region: Region | None = None
+    prior: Prior | None = None
     whole: MapIndex | None = None
     look: int | None = None
-    surface_of: SurfaceOf | None = None
+    surface_of: Callable[[str], MapSurface | None] | None = None
 
     def __init__(
         self,
@@ -147,7 +147,14 @@ class MapIndex:
             frames = database.frames()
         drawn = {name for name, info in infos.items() if info.sensor == "map"}
         index = MapIndex(grids, places, made_with, config, labels, areas_m2, stored, frames, drawn)
-        index.surface_of = surface_reader(database)
+        if any(info.points for info in infos.values()):
+
+            def surface_of(name: str) -> MapSurface | None:
+                points = database.points(name)
+                return None if points is None else MapSurface(points)
+
+            # As many as an answer may compare.
+            index.surface_of = lru_cache(index.config.hypotheses)(surface_of)
         with observer.step("prepare places"):
             index.places.index(observer.on_progress)
         if lacking:
@@ -168,11 +175,6 @@ class MapIndex:
         """Return the points of a session in space; None if it has none."""
         return None if self.surface_of is None else self.surface_of(self.sessions[session_index])
 
-    @property
-    def prior(self) -> Prior | None:
-        """Return what is known of the pose beforehand."""
-        return None if self.region is None else self.region.prior
-
     def within(self, prior: Prior) -> MapIndex:
         """Return an index of which only places that the prior allows are answers; all that is prepared is
         shared.
@@ -180,7 +182,7 @@ class MapIndex:
         Raises ConfigError if the prior does not name its session where there are several, or an unknown one.
         """
         restricted = copy.copy(self)
-        restricted.region, restricted.whole = Region.of(prior, self.sessions), self.whole or self
+        restricted.prior, restricted.whole = prior.of_one(self.sessions), self.whole or self
         return restricted
 
     def at_look(self, number: int) -> MapIndex:
@@ -195,20 +197,19 @@ class MapIndex:
         limited.look = number
         return limited
 
-    def prior_applies(self, query: QueryMap) -> bool:
-        """Return whether there is a prior, and the motion of the query since its time is known."""
-        return self._region_for(query) is not None
-
-    def _region_for(self, query: QueryMap) -> Region | None:
-        lapsed = self.region is None or self.region.T_odom_prior(query) is None
-        return None if lapsed else self.region
+    def prior_for(self, query: QueryMap) -> Prior | None:
+        """Return the prior, if there is one and the motion of the query since its time is known."""
+        lapsed = self.prior is None or self.prior.T_odom_prior(query) is None
+        return None if lapsed else self.prior
 
     def allows(self, query: QueryMap, h: Fit) -> bool:
         """Return whether the prior allows the place of a hypothesis; true if there is none that applies."""
-        region = self._region_for(query)
-        return region is None or (
-            h.session_index == region.session_index and region.allows(query, h.T_map_query)
-        )
+        prior = self.prior_for(query)
+        T_odom_prior = None if prior is None else prior.T_odom_prior(query)
+        if prior is None or T_odom_prior is None:
+            return True
+        here = self.sessions[h.session_index] == prior.session
+        return here and prior.allows(h.T_map_query @ T_odom_prior, query.since_prior_m)
 
     def search(self, query: QueryMap, known: tuple[Fit, ...] = ()) -> Iterator[tuple[tuple[Fit, ...], float]]:
         """Yield hypotheses for the query, best first, again and again: the known ones, refined, and those
@@ -240,10 +241,10 @@ class MapIndex:
 
     def _allowed(self, query: QueryMap) -> Iterator[Area]:
         """Yield the region of the prior, if there is one that applies."""
-        region = self._region_for(query)
-        if region is not None:
-            squares_m = region.squares(query, self.places.ground[region.session_index][0], SQUARE_M)
-            yield Area(region.session_index, squares_m)
+        prior = self.prior_for(query)
+        if prior is not None and prior.session is not None:
+            number = self.sessions.index(prior.session)
+            yield Area(number, prior.squares(query, self.places.ground[number][0], SQUARE_M))
 
     def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
         """Return the maps as they are searched for a query: to one in a lower plane, their free space is

@@ -1,7 +1,7 @@
 """Is a pose that the robot believes in still right?
 
 The same posterior as that of any query, with the robot's belief as the prior: before what it has seen lately,
-the mass was near where the robot believes to be (`signature.localization.belief`). The pose is
+the mass was near where the robot believes to be (`signature.localization.posterior`). The pose is
 
 - fine, if the place within its tolerance has the mass that is needed to be located;
 - lost, if another place has it, or if the map at the pose contradicts what the robot has seen: its likelihood
@@ -32,9 +32,9 @@ from pc2grid.matching.evidence import evidence_of
 from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
-from signature.localization.belief import kept
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import kept
 from signature.localization.prior import Prior
 
 CheckStatus = Literal["fine", "lost", "unsure"]
@@ -136,8 +136,9 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     """Return whether a pose at the query's last scan is right. Raises the errors of `check_pose`."""
     index, seen = localizer.index, localizer.query.map()
     near = index.within(_around(T_map_base, session))
-    assert near.region is not None
-    number = near.region.session_index
+    assert near.prior is not None and near.prior.session is not None
+    session = near.prior.session
+    number = index.sessions.index(session)
     T_map_query = T_map_base @ seen.T_odom_base.inverse()
     walls = index.maps_for(seen)[number].walls
     believed = replace(score_fit(walls, seen.walls, T_map_query, np.zeros((3, 3))), session_index=number)
@@ -163,7 +164,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
         status=status,
         probability=mass_here if status == "fine" else at_most,
         T_map_base=T_map_base,
-        session=index.sessions[number],
+        session=session,
         stamp_ns=seen.stamp_ns,
         path_m=seen.path_m,
         off_m=off_m,

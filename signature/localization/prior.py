@@ -1,8 +1,8 @@
-"""What is known of the pose of a robot beforehand: a region of a map (`Prior`), of one of several (`Region`).
+"""What is known of the pose of a robot beforehand: a region of a map.
 
 It excludes: a place outside has probability 0 and is no answer. Between places that fit equally well it
 decides. But what scores differently outside still shows what wrong places score for this query, so it remains
-evidence (`signature.localization.decision`): a place that fits poorly is not certain because few others are
+evidence (`signature.localization.posterior`): a place that fits poorly is not certain because few others are
 in the region, and if another place fits better by far, nothing inside is. That place is reported
 (`Answer.excluded`).
 """
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -146,54 +146,37 @@ class Prior:
         center = (self.T_map_base.x, self.T_map_base.y)
         return np.asarray(np.hypot(*(squares_m - center).T) <= reach)
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Region:
-    """A prior on the map of one of several sessions. session_index : number of that session."""
-
-    prior: Prior
-    session_index: int
-
-    @staticmethod
-    def of(prior: Prior, sessions: Sequence[str]) -> Region:
-        """Return the prior on the map of the session that it names. Raises ConfigError if it does not name
-        one where there are several, or names an unknown one."""
+    def of_one(self, sessions: Sequence[str]) -> Prior:
+        """Return the prior with the name of its session. Raises ConfigError if it does not name one where
+        there are several, or names an unknown one."""
         names = ", ".join(sessions[:12]) + (", ..." if len(sessions) > 12 else "")
-        if prior.session is None and len(sessions) > 1:
+        if self.session is None and len(sessions) > 1:
             raise ConfigError(
                 f"near: the database holds {len(sessions)} sessions, each with a map frame of its own",
                 hint=f"--session NAME says whose frame is meant: {names}",
             )
-        if prior.session is not None and prior.session not in sessions:
+        if self.session is not None and self.session not in sessions:
             raise ConfigError(
-                f"near: no session {prior.session!r} where it is looked for", hint=f"there is: {names}"
+                f"near: no session {self.session!r} where it is looked for", hint=f"there is: {names}"
             )
-        return Region(
-            prior=prior, session_index=0 if prior.session is None else sessions.index(prior.session)
-        )
+        return replace(self, session=self.session or next(iter(sessions), None))
 
     def is_ahead(self, query: QueryMap) -> bool:
         """Return whether the query ends before the time that the prior is about."""
-        return self.prior.stamp_ns is not None and query.stamp_ns < self.prior.stamp_ns
+        return self.stamp_ns is not None and query.stamp_ns < self.stamp_ns
 
     def T_odom_prior(self, query: QueryMap) -> SE2 | None:
         """Return the base at the time that the prior is about; None before, and if the motion since is not
         known."""
-        if self.prior.stamp_ns is None:
+        if self.stamp_ns is None:
             return query.T_odom_base
         return None if self.is_ahead(query) else query.T_odom_prior
 
-    def allows(self, query: QueryMap, T_map_query: SE2) -> bool:
-        """Return whether the query can lie at a pose. The motion since the time of the prior must be
-        known."""
-        T_odom_prior = self.T_odom_prior(query)
-        assert T_odom_prior is not None
-        return self.prior.allows(T_map_query @ T_odom_prior, query.since_prior_m)
-
     def squares(self, query: QueryMap, free_m: F64, side_m: float) -> F64:
-        """Return those of the squares of `side_m` around (K, 2) that may hold the base now."""
+        """Return those of the squares of `side_m` around (K, 2) that may hold the base now. The motion since
+        the time of the prior must be known."""
         T_odom_prior = self.T_odom_prior(query)
         assert T_odom_prior is not None
         step = T_odom_prior.inverse() @ query.T_odom_base
         moved_m = math.hypot(step.x, step.y)
-        return np.asarray(free_m[self.prior.may_hold(free_m, side_m, moved_m, query.since_prior_m)])
+        return np.asarray(free_m[self.may_hold(free_m, side_m, moved_m, query.since_prior_m)])

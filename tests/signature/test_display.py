@@ -36,10 +36,9 @@ def answer(status: str, confidence: float) -> Answer:
     return Answer(
         status=status,  # type: ignore[arg-type]
         stamp_ns=0,
-        confidence=confidence,
         places=()
         if status == "not_found"
-        else (Place(fits=(best,), mass=0.0), Place(fits=(other,), mass=0.0)),
+        else (Place(fits=(best,), mass=confidence), Place(fits=(other,), mass=0.0)),
         history=(),
         T_odom_base=SE2(1.0, 0.0, 0.0),
         path_m=3.25,

@@ -10,58 +10,53 @@ import pytest
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import ConfigError
 from pc2grid.geometry import SE2
-from pc2grid.matching.score import Fit
 from pc2grid.model import Health, RegisteredScan
 from signature.config import Config, RelocalizeConfig
 from signature.localization.answer import Answer
-from signature.localization.decision import POSTERIOR, decide, slip_of
 from signature.localization.localizer import Localizer
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import POSTERIOR, decide, slip_of
 from signature.localization.prior import Prior
 from signature.localization.query import Query, QueryMap
 from tests.helpers.simulated_drives import TWINS, building, drive, office
 
 
 @functools.cache
-def driven_through_the_office() -> tuple[MapIndex, QueryMap, Fit]:
-    """Return the index of the office, what a drive has seen there, and how it fits best."""
+def driven_through_the_office() -> tuple[MapIndex, QueryMap, Answer]:
+    """Return the index of the office, what a drive has seen there, and where that is."""
     index = building({"office": office()})
     query = Query(index.made_with, index.config)
     for registered, planar_scan, _ in drive(office(), [(1.5, 7.0), (9.5, 7.0)]):
         query.add(registered, planar_scan)
     seen = query.map()
-    fit = decide(index, seen)[0].hypotheses[0]
-    return index, seen, fit
+    return index, seen, decide(index, seen)[0]
 
 
 @pytest.mark.parametrize(("turned", "likely"), [(0, False), (1, False), (10, True)])
 def test_scans_that_contradict_a_place_say_since_when_tracking_slipped(turned: int, likely: bool) -> None:
     """A single one that is seen from the same place may be a person who stands in the way."""
-    index, seen, fit = driven_through_the_office()
+    index, seen, answer = driven_through_the_office()
     last = len(seen.keyframes) - turned
     keyframes = tuple(
         k if n < last else replace(k, T_odom_base=k.T_odom_base @ SE2(0.0, 0.0, 0.7))
         for n, k in enumerate(seen.keyframes)
     )
-    walls, step_m = index.maps[0].walls, index.config.step_m
-    odds, since = slip_of(replace(seen, keyframes=keyframes), fit, walls, step_m)
+    odds, since = slip_of(index, replace(seen, keyframes=keyframes), answer)
     assert since == turned and (odds > 0.5) is likely
     weak = tuple(replace(k, weak=True) for k in keyframes)
-    more, _ = slip_of(replace(seen, keyframes=weak), fit, walls, step_m)
+    more, _ = slip_of(index, replace(seen, keyframes=weak), answer)
     assert more == pytest.approx(odds * POSTERIOR.slip_weak / POSTERIOR.slip) and more > odds
 
 
 @pytest.mark.parametrize(("poor", "likely"), [(10, True), (1000, False)])
 def test_scans_that_all_fit_poorly_do_not_tell_of_a_slip(poor: int, likely: bool) -> None:
     """So fit those of a camera in the map of a laser. If only the last ones do, that tells."""
-    index, seen, fit = driven_through_the_office()
+    index, seen, answer = driven_through_the_office()
     keyframes = [
         k if n < len(seen.keyframes) - poor else replace(k, planar_scan=_blurred(k.planar_scan))
         for n, k in enumerate(seen.keyframes)
     ]
-    odds, _ = slip_of(
-        replace(seen, keyframes=tuple(keyframes)), fit, index.maps[0].walls, index.config.step_m
-    )
+    odds, _ = slip_of(index, replace(seen, keyframes=tuple(keyframes)), answer)
     assert (odds > 0.1) is likely
 
 

@@ -17,9 +17,8 @@ from pc2grid.model import UNKNOWN, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config, RelocalizeConfig
 from signature.localization import localizer as follower_module
 from signature.localization.answer import Answer, Place, fits_changed
-from signature.localization.belief import Belief
-from signature.localization.decision import anywhere, decide, weighed
 from signature.localization.localizer import Follower, Localizer
+from signature.localization.posterior import Belief, decide, weighed
 from signature.localization.prior import Prior
 from signature.localization.query import query_of
 from tests.helpers.simulated_drives import building, drive, office, plan
@@ -76,20 +75,20 @@ def test_what_odometry_says_counts_for_the_place_where_walls_say_it_more_exactly
     )
     away = Place(
         fits=(moved,),
-        mass=1e3 * math.exp(verdict.log_odds),
+        mass=1e3 * verdict.confidence / (1.0 - verdict.mass),
         seen_m=0.0,
         T_odom_seen=query.T_odom_base,
         seen=(moved.covariance,),
     )
     assert verdict.status == "located"
-    told = weighed(verdict, anywhere, [away], 0.0, 0.75)
+    told = weighed(verdict, [away], 0.0, 0.75)
     assert (told.status == "located") == counts == (told.confidence > 0.75)
 
 
 def test_a_place_is_the_less_certain_the_likelier_tracking_slipped() -> None:
     query = query_of(office(), np.array([(2.0, 7.0), (7.0, 7.0)]), Config(), Config().relocalize)
     verdict, _ = decide(OFFICE, query)
-    told = weighed(verdict, anywhere, [], 2.0, 0.75)
+    told = weighed(verdict, [], 2.0, 0.75)
     assert verdict.status == "located" and told.status == "ambiguous"
     assert (
         told.confidence
@@ -176,7 +175,7 @@ def test_a_place_is_given_up_when_it_is_as_certain_that_the_robot_is_not_there()
 def said(answer: Answer, mass: float, *, located: bool = True) -> Answer:
     """An answer whose first place has a mass; whether that is where it is located."""
     places = tuple(replace(place, mass=0.0 if n else mass) for n, place in enumerate(answer.places))
-    return replace(answer, places=places, confidence=mass, status="located" if located else "not_found")
+    return replace(answer, places=places, status="located" if located else "not_found")
 
 
 def test_a_place_is_told_when_a_second_search_agrees() -> None:

@@ -14,7 +14,6 @@ from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config, RelocalizeConfig, ShortlistBy
 from signature.localization import map_index
 from signature.localization.answer import ambiguous_line
-from signature.localization.decision import decide
 from signature.localization.hypotheses import (
     HYPOTHESES,
     best_around,
@@ -23,6 +22,7 @@ from signature.localization.hypotheses import (
     fitted,
 )
 from signature.localization.place_recognition import RecognitionParameters, SessionRecognizer
+from signature.localization.posterior import decide
 from signature.localization.query import query_of
 from tests.helpers.simulated_drives import building, office, office_part, with_tables
 

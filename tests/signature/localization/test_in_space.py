@@ -15,9 +15,9 @@ from pc2grid.model import Health, PointMap
 from signature.database import Label
 from signature.localization.answer import Answer, Place
 from signature.localization.hypotheses import HYPOTHESES
-from signature.localization.in_space import SPACE, log_odds_in_space, masses_of, settle_in_space
 from signature.localization.localizer import Follower, Localizer
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import SPACE, log_odds_in_space, masses_of, settle_in_space
 from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
 from tests.helpers.simulated_drives import building, office
@@ -54,7 +54,6 @@ def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[Que
     mass = 0.95 if alone else 0.49
     verdict = Answer(
         status="located" if alone else "ambiguous",
-        confidence=mass,
         places=tuple(Place(fits=(fit,), mass=mass) for fit in fits),
         stamp_ns=0,
         path_m=0.0,
@@ -99,7 +98,7 @@ def test_twins_in_the_plane_are_told_apart_by_their_height(
 def with_masses(verdict: Answer, *masses: float) -> Answer:
     """The verdict, located at the first place, with other masses."""
     places = [replace(place, mass=mass) for place, mass in zip(verdict.places, masses, strict=True)]
-    return replace(verdict, status="located", confidence=masses[0], places=tuple(places))
+    return replace(verdict, status="located", places=tuple(places))
 
 
 def test_equal_twins_stay_ambiguous(points: MapSurface) -> None:
@@ -155,7 +154,7 @@ def test_a_place_that_the_plane_leaves_open_is_located_by_its_points(points: Map
     query, verdict = ask(HEIGHTS_M[0], 0.0, APART_M + 3.0)
     right, wrong = verdict.places
     places = (replace(wrong, mass=0.2), replace(right, mass=0.02))
-    unsure = replace(verdict, status="not_found", confidence=0.2, places=places)
+    unsure = replace(verdict, status="not_found", places=places)
     settled = settle_in_space(unsure, query, lambda _: points, accept=0.9)
     in_space = settled.in_space
     assert settled.status == "located" and settled.places[0].mass > settled.places[1].mass

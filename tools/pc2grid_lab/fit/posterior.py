@@ -6,7 +6,7 @@ Each file is one that `queries evidence` has written. An answer is judged by a f
 query or map is of one of its buildings. Prints for the parameters in use, for those fitted, and for those
 fitted without the buildings of query and map: how many queries would be located, rightly and wrongly, in all
 and by kind of query, and the log loss; and the parameters for `pc2grid.matching.evidence`. With --in-space
-those for `signature.localization.in_space`, and the same also by the masses in the plane, and by the
+those for `signature.localization.posterior`, and the same also by the masses in the plane, and by the
 parameters in use with the rays of places drawn at random.
 
 Queries whose place was found and all others weigh the same in the fit, however many of each there are. So the
@@ -35,7 +35,7 @@ from pc2grid.geometry import F64
 from pc2grid.matching.evidence import EVIDENCE, Evidence, masses
 from pc2grid_lab.pages import share
 from signature.config import Config
-from signature.localization.in_space import SPACE, masses_in_space
+from signature.localization.posterior import SPACE, masses_in_space
 
 RIGHT_M, RIGHT_RAD = 0.5, math.radians(5.0)
 """Errors of answers to real logs at the right place. How precise they are is not the question here; the poses

@@ -54,9 +54,9 @@ from pc2grid_lab.sensors import PlanMap, RegisteredSession
 from pc2grid_lab.truth import apart
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.in_space import SPACE, fit_in_space, terms_in_space
 from signature.localization.joining.join import JOIN
 from signature.localization.map_index import MapIndex
+from signature.localization.posterior import fit_in_space, terms_in_space
 from signature.localization.query import Query, QueryInSpace, QueryMap, best_observed
 from signature.visible import PROFILE_BEARINGS, seen_signatures, viewpoints_of
 from signature.weights import Pairs, SeenStatistics
@@ -232,9 +232,7 @@ def _asked(
     row = {"evidence": list(map(asdict, evidence)), "errors": errors}
     if in_space is None or not in_space.views or index.surface_of is None:
         return row
-    odds = [e.log_odds() for e in evidence]
-    likeliest = np.argsort(odds)[::-1][: SPACE.places].tolist()
-    compared = {k: _in_space(index, in_space, found[k], truth) for k in likeliest}
+    compared = {k: _in_space(index, in_space, fit, truth) for k, fit in enumerate(found)}
     return row | {"in_space": {k: told for k, told in compared.items() if told is not None}}
 
 
