@@ -191,7 +191,7 @@ class Answer:
         ]
         status = self.status.replace("_", " ")
         title = f"{status}, confidence {probability(self.confidence)}, after {self.path_m:.1f} m"
-        table = html_table(title, rows[:_SHOWN], ("place", "session", "pose of the robot", "score", ""))
+        table = html_table(title, rows, ("place", "session", "pose of the robot", "score", ""))
         picture = self._repr_png_()
         return table if picture is None else table + html_picture(picture, "the query's walls in the map")
 
@@ -392,9 +392,6 @@ class Answer:
 
 
 AnswerT = TypeVar("AnswerT", bound=Answer)
-
-_SHOWN = 6
-"""Hypotheses in the table of a notebook, as many as in the picture of the command line."""
 
 
 def pose_text(pose: SE2) -> str:

@@ -45,8 +45,9 @@ from signature.localization.posterior import (
 )
 from signature.localization.query import Query, QueryMap, ViewSpacing, map_as_query
 
-_MOMENTS = 10_000
-"""The latest answers that `Answer.history` holds, some kilometres, so that memory is bounded; by hand."""
+MOST_KEPT = 5000
+"""So many of the latest answers, scans that wait for a search to end, and poses of scans are kept, so that
+memory is bounded: some kilometres, and 50 MB or two minutes of 40 scans a second. By hand."""
 _LOST_SCANS = 20
 """A robot of which so many scans in a row cannot be registered is looked for by the last one; by hand."""
 _STANDING_S = 2.0
@@ -80,7 +81,7 @@ class Localizer:
         """
         self.index = index
         self._belief = Belief(index.config.accept)
-        self._history: deque[Answer] = deque(maxlen=_MOMENTS)
+        self._history: deque[Answer] = deque(maxlen=MOST_KEPT)
         prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
         self.query = Query(index.made_with, index.config, prior_ns=prior_ns, in_space=self.uses_points)
         # Of the last search: part of the query, metres driven in it, and hypotheses.
@@ -295,11 +296,6 @@ class Follows(Protocol[ResultT_co]):
         ...
 
 
-_MOST_WAITING = 2000
-"""Scans that wait for a search to end; beyond, the oldest are left out. Chosen by hand: some 20 MB,
-and the points of a scan every 0.2 m where they are used."""
-
-
 class Follower(Generic[ResultT]):
     """Feeds a `Localizer` or a `PoseWatch` with scans, here or in a thread. Use as a context manager.
 
@@ -317,7 +313,7 @@ class Follower(Generic[ResultT]):
         self._path_m = 0.0
         self._last: SE2 | None = None
         self._spacing = ViewSpacing()
-        self._waiting: deque[tuple[RegisteredScan, PlanarScan, float] | None] = deque(maxlen=_MOST_WAITING)
+        self._waiting: deque[tuple[RegisteredScan, PlanarScan, float] | None] = deque(maxlen=MOST_KEPT)
         self._results: deque[Future[ResultT | None]] = deque()
         self._thread = ThreadPoolExecutor(1, "searches") if beside else None
 
@@ -388,18 +384,13 @@ class Follower(Generic[ResultT]):
 class ResetPolicy:
     """When `/initialpose` is sent: when the robot is located first, and when it was lost or carried away.
 
-    Limits how often: repeated resets would keep navigation from continuing.
-
-    pause_s : least time between two resets. most : resets until the robot has been located for `calm_s`.
+    pause_s : least time between two resets. More of them would keep navigation from continuing.
     """
 
     pause_s: float = 10.0
-    most: int = 5
-    calm_s: float = 60.0
     clock: Callable[[], float] = time.monotonic
     _is_due: bool = True
-    _last_s: float | None = None
-    _count: int = 0
+    _last_s: float = -math.inf
 
     def allows(self, state: State | None) -> bool:
         """Return whether the pose of an answer is to be sent; it then counts as sent.
@@ -410,11 +401,7 @@ class ResetPolicy:
         if state not in ("located", "recovered") or not self._is_due:
             return False
         now_s = self.clock()
-        if self._last_s is not None:
-            if now_s - self._last_s > self.calm_s:
-                self._count = 0
-            if now_s - self._last_s < self.pause_s or self._count >= self.most:
-                return False
+        if now_s - self._last_s < self.pause_s:
+            return False
         self._is_due, self._last_s = False, now_s
-        self._count += 1
         return True

@@ -32,7 +32,7 @@ from pc2grid.matching.evidence import evidence_of
 from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
-from signature.localization.localizer import Localizer
+from signature.localization.localizer import MOST_KEPT, Localizer
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import kept
 from signature.localization.prior import Prior
@@ -47,15 +47,12 @@ class CheckParameters:
     tolerance_m, tolerance_rad : a pose this near to the right one is fine: three times the usual error of
         AMCL, and less than two hypotheses differ by.
     near_m, near_rad : poses so far around the checked one are compared with it.
-    most_scans : so many past scans of a running robot are remembered with their poses; a belief may be as old
-        as the oldest, at 40 scans a second two minutes.
     """
 
     tolerance_m: float = 0.3
     tolerance_rad: float = math.radians(8.0)
     near_m: float = 1.5
     near_rad: float = math.radians(45.0)
-    most_scans: int = 5000
 
 
 CHECK = CheckParameters()
@@ -222,7 +219,7 @@ class PoseWatch:
     def restart(self) -> None:
         """Begin anew: the next scans do not continue those before."""
         self._localizer = Localizer(self._index)
-        self._driven: deque[tuple[int, SE2]] = deque(maxlen=CHECK.most_scans)
+        self._driven: deque[tuple[int, SE2]] = deque(maxlen=MOST_KEPT)
         self._waiting: MapPose | None = None
         self._T_map_session: SE2 | None = None
         self._judged: SE2 | None = None

@@ -23,6 +23,7 @@ from pc2grid.matching.icp_in_space import SpatialView
 from pc2grid.matching.score import self_similarity
 from pc2grid.matching.walls import Walls
 from pc2grid.model import SENSOR_MODELS, Health, OccupancyGrid, RegisteredScan
+from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.junction_graph import sample_evenly, skeleton_of
 from pc2grid.submaps.submaps import HIDDEN, isovist, look_around
 from signature.config import Config, RelocalizeConfig
@@ -34,21 +35,12 @@ class QueryParameters:
     """What a query is made of. All chosen by hand.
 
     keyframe_m, keyframe_rad : a scan is kept if the robot has moved or turned so far since the last one.
-    clearance_m : views on the middle lines of the free space are at least so far from walls.
-    every_m : distance of the candidates for views along the middle lines.
-    path_candidates : candidates for views on the path, evenly spread.
-    space_m, space_every_m : metres of travel whose scans are compared in space, and travel between two of
-        them. voxel_m : edge of the voxels that such a scan is reduced to.
+    space_every_m : travel between two scans that are compared in space.
     """
 
     keyframe_m: float = 0.1
     keyframe_rad: float = math.radians(5.0)
-    clearance_m: float = 0.3
-    every_m: float = 0.5
-    path_candidates: int = 40
-    space_m: float = 5.0
     space_every_m: float = 0.2
-    voxel_m: float = 0.05
 
 
 QUERY = QueryParameters()
@@ -120,9 +112,12 @@ class ViewSpacing:
 
 
 class QueryInSpace:
-    """The scans of the last metres of a query, in its odom frame. Memory is bounded by the metres."""
+    """The scans of the last metres of a query, in its odom frame: as many as a place is described by
+    (`PartitionConfig.radius_m`). Memory is bounded by the metres."""
 
-    def __init__(self) -> None:
+    def __init__(self, made_with: Config) -> None:
+        """Begin without any scan. made_with : of the database; points are as close as in its maps."""
+        self._made_with = made_with
         self._views: deque[tuple[float, SpatialView]] = deque()
         self._spacing = ViewSpacing()
         self.T_odom_base: F64 | None = None
@@ -139,12 +134,12 @@ class QueryInSpace:
         # A scan may come without its points, which `Follower` leaves out.
         if not len(scan.points_m) or not self._spacing.takes(registered):
             return
-        cloud = VoxelCloud(QUERY.voxel_m)
+        cloud = VoxelCloud(self._made_with.projection.resolution_m)
         cloud.add(scan.points_m)
         sensor_m = (T @ scan.T_base_sensor)[:3, 3]
         view = SpatialView(sensor_m=sensor_m, points_m=transform_points(T, cloud.points_m()))
         self._views.append((self._spacing.path_m, view))
-        while self._spacing.path_m - self._views[0][0] > QUERY.space_m:
+        while self._spacing.path_m - self._views[0][0] > self._made_with.partition.radius_m:
             self._views.popleft()
 
     def since(self, travel_m: float) -> QueryInSpace:
@@ -186,7 +181,7 @@ class Query:
         prior_ns : the time of a prior; the pose there is remembered.
         """
         self._made_with, self._config, self._prior_ns = made_with, config, prior_ns
-        self.in_space = QueryInSpace() if in_space else None
+        self.in_space = QueryInSpace(made_with) if in_space else None
         self.part = self.lost_scans = 0
         self._slipped_m = 0.0
         self.first_ns: int | None = None
@@ -245,7 +240,7 @@ class Query:
         self._keyframes.clear()
         self._newest = self._drawn = None
         self._at_prior = self._at_prior[0], None
-        self.in_space = self.in_space and QueryInSpace()
+        self.in_space = self.in_space and QueryInSpace(self._made_with)
 
     def since(self, scans: int) -> Query:
         """Return the query that begins with the last so many `QueryMap.keyframes`, before which tracking
@@ -305,10 +300,10 @@ def query_of(
     made_with : how the database was made, or the two sides are not comparable.
     """
     T_odom_base = T_odom_base or SE2()
-    radius_m = made_with.partition.radius_m
+    partition = made_with.partition
     views = tuple(
-        View(center_m=center, profile=isovist(grid, center, radius_m, bearings=PROFILE_BEARINGS))
-        for center in best_observed(grid, path_xy_m, radius_m, config)
+        View(center_m=center, profile=isovist(grid, center, partition.radius_m, bearings=PROFILE_BEARINGS))
+        for center in best_observed(grid, path_xy_m, partition, config)
     )
     return QueryMap(
         stamp_ns=0,
@@ -341,22 +336,24 @@ def map_as_query(
 
 
 def best_observed(
-    grid: OccupancyGrid, path_xy_m: F64, sight_m: float, config: RelocalizeConfig
+    grid: OccupancyGrid, path_xy_m: F64, partition: PartitionConfig, config: RelocalizeConfig
 ) -> tuple[tuple[float, float], ...]:
     """Return up to `config.views` points, `config.view_spacing_m` apart, best observed first.
 
     Half of them lie on the path, where the robot has looked around; the others on the middle lines of all
     the free space seen, because much of what surrounds a place is seen from elsewhere. How well a place
     is observed is the share of the rays from it that end on something known.
+
+    partition : the middle lines and the sight are those of the database.
     """
-    middle = skeleton_of(grid.ground, grid.resolution_m, QUERY.clearance_m)
-    spaced = sample_evenly(cells_of(middle), QUERY.every_m / grid.resolution_m)
+    middle = skeleton_of(grid.ground, grid.resolution_m, partition.clearance_m)
     chosen: list[tuple[float, float]] = []
     for points, most in (
-        (path_xy_m[:: max(1, len(path_xy_m) // QUERY.path_candidates)], (config.views + 1) // 2),
-        (grid.to_point(spaced), config.views),
+        (path_xy_m, (config.views + 1) // 2),
+        (grid.to_point(cells_of(middle)), config.views),
     ):
-        _, ends = look_around(grid, points, sight_m, bearings=PROFILE_BEARINGS)
+        points = sample_evenly(points, 0.5 * config.view_spacing_m)
+        _, ends = look_around(grid, points, partition.radius_m, bearings=PROFILE_BEARINGS)
         hidden = np.count_nonzero(ends == HIDDEN, axis=1)
         for x, y in points[np.argsort(hidden, kind="stable")].tolist():
             if len(chosen) == most:

@@ -35,7 +35,7 @@ from pc2grid.errors import OutputError
 from pc2grid.geometry import F32, F64, I64, SE2
 from pc2grid.io.atomic import replace_file, require_writable
 from pc2grid.matching.score import Support
-from pc2grid.model import Consistency, Loop, OccupancyGrid, Precision, ReadReport, Submap, Trajectory
+from pc2grid.model import Loop, OccupancyGrid, ReadReport, Submap, Trajectory
 from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import look_around
 from signature.boundary import PAIR_BINS, RANGE_BINS, boundary_edges, boundary_points, boundary_seen
@@ -65,14 +65,10 @@ if TYPE_CHECKING:
 
 
 _LARGEST_PIXELS = 3000
+_EPOCH = datetime.fromtimestamp(0, timezone.utc)
+"""The year in which stamps begin that count from a start."""
 _MOST_EXPLAINED = 2000
 """A page of more submaps does not show where signatures come from: it takes 10 ms and 3 kB for each."""
-_CLOCK_FROM_S = 3e8
-"""Stamps below this, 1979, are not read as a date: no robot recorded then, but logs count from 0."""
-_STEP_M = 0.05
-"""Poses nearer than this to the last one drawn are left out: they would not be visible."""
-_BAND_FROM_M = 0.1
-"""Positions with a smaller standard deviation have no band: two cells of the default resolution."""
 
 
 NO_POSES = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
@@ -181,9 +177,9 @@ def contents(
                 "image": _picture(database.grid(info.name)),
                 "submaps": _submaps(database, table, index, info.name, explain=info.name in explained),
                 "graph": _graph(database.graph(info.name)),
-                "path": runs(database.trajectory(info.name)),
-                "contradicted": _contradicted(database.trajectory(info.name), info.consistency),
-                "loose": _bands(database.trajectory(info.name), info.precision),
+                "path": runs(database.trajectory(info.name), info.resolution_m),
+                "contradicted": _contradicted(database.trajectory(info.name), info),
+                "loose": _bands(database.trajectory(info.name), info),
                 "loops": _loops(database.trajectory(info.name), database.loops(info.name)),
             }
             for index, info in enumerate(infos)
@@ -215,8 +211,8 @@ def _facts(info: SessionInfo, poses: Trajectory) -> dict[str, Any]:
 
 def _date(poses: Trajectory) -> str | None:
     """Return the day of the first scan, UTC; None if its stamp is no time of day but counts from a start."""
-    begin_s = poses.stamps_ns[0] / 1e9 if len(poses) else 0.0
-    return None if begin_s < _CLOCK_FROM_S else f"{datetime.fromtimestamp(begin_s, timezone.utc):%Y-%m-%d}"
+    begin = datetime.fromtimestamp(poses.stamps_ns[0] / 1e9 if len(poses) else 0.0, timezone.utc)
+    return None if begin.year == _EPOCH.year else f"{begin:%Y-%m-%d}"
 
 
 def _submaps(
@@ -257,8 +253,11 @@ def _graph(graph: nx.Graph) -> dict[str, Any]:
     }
 
 
-def runs(poses: Trajectory) -> list[dict[str, Any]]:
-    """Return pieces of a path of equal health, as x, y, x, y, ...; each starts where the last one ends."""
+def runs(poses: Trajectory, step_m: float) -> list[dict[str, Any]]:
+    """Return pieces of a path of equal health, as x, y, x, y, ...; each starts where the last one ends.
+
+    step_m : poses nearer to the last one drawn are left out; nearer than a cell they would not be visible.
+    """
     xy = poses.planar()[:, :2]
     health = [h.value for h in poses.health] or ["fine"] * len(xy)
     pieces: list[dict[str, Any]] = []
@@ -267,7 +266,7 @@ def runs(poses: Trajectory) -> list[dict[str, Any]]:
         indices = list(members)
         points = [] if k == 0 or last is None else [last]
         for i in indices:
-            if last is None or i == indices[-1] or np.hypot(*(xy[i] - last)) >= _STEP_M:
+            if last is None or i == indices[-1] or np.hypot(*(xy[i] - last)) >= step_m:
                 points.append(xy[i])
                 last = xy[i]
         pieces.append({"health": kind, "xy": _short(np.ravel(points), 2)})
@@ -280,31 +279,34 @@ def _loops(poses: Trajectory, loops: tuple[Loop, ...]) -> list[list[float]]:
     return [[*_short(xy[loop.older], 2), *_short(xy[loop.newer], 2), int(loop.accepted)] for loop in loops]
 
 
-def _contradicted(poses: Trajectory, consistency: Consistency | None) -> list[list[float]]:
+def _contradicted(poses: Trajectory, info: SessionInfo) -> list[list[float]]:
     """Return the parts of a path along which the scans do not agree with the map, as x, y, x, y, ..."""
     xy, parts = poses.planar()[:, :2], []
-    for stretch in () if consistency is None else consistency.stretches:
+    for stretch in () if info.consistency is None else info.consistency.stretches:
         first, last = np.searchsorted(poses.stamps_ns, (stretch.from_ns, stretch.to_ns))
         part = xy[first : last + 1]
         step_m = np.hypot(*np.diff(part, axis=0).T)
-        drawn = np.concatenate(([True], np.diff(np.floor(np.cumsum(step_m) / _STEP_M), prepend=0.0) > 0))
+        drawn = np.concatenate(
+            ([True], np.diff(np.floor(np.cumsum(step_m) / info.resolution_m), prepend=0.0) > 0)
+        )
         drawn[-1] = True
         parts.append(_short(np.ravel(part[drawn]), 2))
     return parts
 
 
-def _bands(poses: Trajectory, precision: Precision | None) -> list[list[float]]:
+def _bands(poses: Trajectory, info: SessionInfo) -> list[list[float]]:
     """Return pieces of a path with the standard deviation of the positions there: metres, x, y, x, y, ...
 
-    Pieces that are known better than a path is drawn wide are left out.
+    Pieces that are known better than to two cells of the map, as wide as a path is drawn, are left out.
     """
+    precision = info.precision
     if precision is None or len(precision.stamps_ns) < 2:
         return []
     xy, bands = poses.planar()[:, :2], []
     at = np.searchsorted(poses.stamps_ns, precision.stamps_ns)
     for first, last, *sigmas_m in zip(at, at[1:], precision.sigma_m, precision.sigma_m[1:], strict=False):
         sigma_m = sum(sigmas_m) / 2.0
-        if sigma_m >= _BAND_FROM_M:
+        if sigma_m >= 2.0 * info.resolution_m:
             kept = np.unique(np.linspace(first, last, 5).astype(np.int64))
             bands.append([round(sigma_m, 2), *_short(np.ravel(xy[kept]), 2)])
     return bands
@@ -340,7 +342,7 @@ def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dic
             {"path_m": m.path_m, "status": m.status, "confidence": m.confidence} for m in answer.history
         ],
         "why": why_here(answer, database),
-        "path": runs(answer.poses),
+        "path": runs(answer.poses, answer.local_map.resolution_m),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
     }
 

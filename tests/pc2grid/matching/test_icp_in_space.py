@@ -15,6 +15,7 @@ from pc2grid.geometry import (
 )
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, SpatialView, register_in_space
 from pc2grid.model import PointMap
+from signature.config import Config
 from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, twin_map
@@ -24,7 +25,7 @@ OFF = SE2(0.08, -0.06, math.radians(2.0))
 
 def asked(height_m: float) -> tuple[QueryInSpace, SE2, F64, F64]:
     """A query, the planar pose of its odom frame in the room, the last true pose, and the same in odom."""
-    query, scans = QueryInSpace(), drive(height_m)
+    query, scans = QueryInSpace(Config()), drive(height_m)
     for registered, _ in scans:
         query.add(registered)
     last, T_room_base = scans[-1]

@@ -381,7 +381,7 @@ def test_a_slow_look_holds_up_no_scan_and_looks_that_are_out_of_date_are_left_ou
 
 
 def test_what_waits_is_bounded_and_holds_no_points(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(follower_module, "_MOST_WAITING", 5)
+    monkeypatch.setattr(follower_module, "MOST_KEPT", 5)
     slow = Slow()
     with Follower[None](slow, beside=True) as follower:
         for registered, planar_scan in STEPS:

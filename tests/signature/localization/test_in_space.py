@@ -12,6 +12,7 @@ from pc2grid.geometry import SE2, invert_pose
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_space
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, PointMap
+from signature.config import Config
 from signature.database import Label
 from signature.localization.answer import Answer, Place
 from signature.localization.hypotheses import HYPOTHESES
@@ -32,7 +33,7 @@ def points() -> MapSurface:
 
 def ask(height_m: float, *rooms_x_m: float, cupboard: bool = False) -> tuple[QueryInSpace, Answer]:
     """A query, and the planar verdict that it lies in the rooms that begin at these x."""
-    query, scans = QueryInSpace(), drive(height_m, cupboard=cupboard)
+    query, scans = QueryInSpace(Config()), drive(height_m, cupboard=cupboard)
     for registered, _ in scans:
         query.add(registered)
     last, T_room_base = scans[-1]
@@ -221,11 +222,11 @@ def test_only_what_can_matter_is_compared(points: MapSurface) -> None:
 def test_without_points_on_a_side_nothing_changes(points: MapSurface) -> None:
     query, verdict = ask(HEIGHTS_M[0], 0.0)
     assert settle_in_space(verdict, query, lambda _: None, accept=0.9) is verdict
-    assert settle_in_space(verdict, QueryInSpace(), lambda _: points, accept=0.9) is verdict
+    assert settle_in_space(verdict, QueryInSpace(Config()), lambda _: points, accept=0.9) is verdict
 
 
 def test_what_was_seen_before_tracking_was_lost_is_forgotten() -> None:
-    query, scans = QueryInSpace(), drive(HEIGHTS_M[0])
+    query, scans = QueryInSpace(Config()), drive(HEIGHTS_M[0])
     for registered, _ in scans[:3]:
         query.add(registered)
     assert len(query.views) == 3

@@ -142,7 +142,7 @@ def pairs_of(
         if not query.views:
             continue
         path_m = np.array([view.center_m for view in query.views])
-        views_m = np.array(best_observed(query.grid, path_m, sight_m, closer))
+        views_m = np.array(best_observed(query.grid, path_m, config.partition, closer))
         views = described(query.grid, views_m)
         for grid, T_plan_map in maps:
             there = (T_plan_map.inverse() @ T_plan_query).apply(views_m)
