@@ -24,8 +24,8 @@ from pc2grid.geometry import F64, I64, SE2, frozen_arrays, lever_arm, wrap_angle
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.hypotheses import HYPOTHESES
-from signature.localization.prior import PRIOR
+from signature.localization.hypotheses import HYPOTHESES, SAME, is_inside
+from signature.localization.prior import drifted
 
 Status = Literal["located", "ambiguous", "not_found"]
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]
@@ -454,11 +454,11 @@ def _through(bases: Sequence[SE2], masses: Sequence[float], other: int) -> Ambig
     poses = np.array([(base.x, base.y, base.yaw) for base in bases])
     away_m, turned = poses[:, :2] - poses[0, :2], np.abs(wrap_angle(poses[:, 2] - poses[0, 2]))
     length_m = math.hypot(*away_m[other])
-    if turned[other] >= HYPOTHESES.same_rad or not length_m:
+    if turned[other] >= HYPOTHESES.around_rad or not length_m:
         return None
     along = away_m[other] / length_m
     across_m = np.abs(away_m @ np.array((-along[1], along[0])))
-    on_line = np.flatnonzero((turned < HYPOTHESES.same_rad) & (across_m < HYPOTHESES.same_m))
+    on_line = np.flatnonzero((turned < HYPOTHESES.around_rad) & (across_m < HYPOTHESES.around_m))
     at_m = away_m[on_line] @ along
     ends = on_line[[at_m.argmin(), at_m.argmax()]]
     begin, end = (Point(*xy) for xy in poses[ends, :2].tolist())
@@ -583,9 +583,7 @@ def _located_moments(poses: Trajectory, travel_m: F64, part: I64, answer: Answer
         if part[a[0]] != part[b[0]]:
             return False
         expected = a[1] @ SE2(*planar[a[0]]).inverse() @ SE2(*planar[b[0]])
-        apart_m = math.hypot(expected.x - b[1].x, expected.y - b[1].y)
-        limit_m = HYPOTHESES.same_m + PRIOR.drift * (travel_m[b[0]] - travel_m[a[0]])
-        return apart_m <= limit_m and abs(wrap_angle(expected.yaw - b[1].yaw)) <= HYPOTHESES.same_rad
+        return is_inside(expected, b[1], SAME + drifted(travel_m[b[0]] - travel_m[a[0]]))
 
     agrees = [agree(a, b) for a, b in itertools.pairwise(found)]
     kept = [

@@ -37,10 +37,10 @@ class HypothesisParameters:
         lidar were found with the walls between 8 and 20 m and not without them.
     refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
     around_m, around_rad : each place that may be the answer is searched so far around itself: by a square of
-        the coarse search to each side, which may have found the shoulder of a peak. Two hypotheses that are
-        nearer are one peak. By their covariances they are not: of 21 windows of a laser in a lidar's map, two
-        were ambiguous with their own shoulder, .12 and .16 m off, which is six standard deviations.
-    same_m, same_rad : two hypotheses nearer than this are one.
+        the coarse search to each side, which may have found the shoulder of a peak. Two poses that are nearer
+        are one place: a search around one has seen the other. By their covariances they are not: of 21
+        windows of a laser in a lidar's map, two were ambiguous with their own shoulder, .12 and .16 m off,
+        which is six standard deviations.
     map_m, map_rad : standard deviations of where a map shows what is around a place: half a cell, and over
         the range of a laser as an angle. They are added to those of the alignment, in the plane and in space,
         which are of some millimetres: without them the errors of 148 right answers to real recordings in the
@@ -55,8 +55,6 @@ class HypothesisParameters:
     refined: int = 2
     around_m: float = SQUARE_M
     around_rad: float = math.radians(5.0)
-    same_m: float = 0.5
-    same_rad: float = math.radians(10.0)
     map_m: float = 0.025
     map_rad: float = 0.002
 
@@ -66,8 +64,11 @@ HYPOTHESES = HypothesisParameters()
 MAP_COVARIANCE = hand_over(np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m, HYPOTHESES.map_rad))))
 """(3, 3) of x, y, yaw of what a map shows, added to that of an alignment."""
 
-ONE_PLACE = float(chdtri(3, 1.0 - 0.999))
-"""Squared Mahalanobis distance of x, y, yaw within which 99.9 % of all poses of one place lie."""
+SAME = hand_over(np.diag(np.square((HYPOTHESES.around_m, HYPOTHESES.around_m, HYPOTHESES.around_rad))))
+"""(3, 3) region of x, y, yaw around a pose: poses in it are one place."""
+
+SIGMAS = math.sqrt(chdtri(2, 1.0 - 0.99))
+"""Mahalanobis distance within which 99 % of positions in the plane lie."""
 
 
 def look_up(
@@ -210,8 +211,9 @@ def distinct(query: QueryMap, hypotheses: Iterable[Fit]) -> tuple[Fit, ...]:
     The best one takes over the `submap_id` of the others if it has none.
     """
     kept: list[Fit] = []
+    center = SE2(*query.center_m, 0.0)
     for candidate in sorted(hypotheses, key=lambda h: -h.score):
-        better = next((i for i, other in enumerate(kept) if _one_peak(query, candidate, other)), None)
+        better = next((i for i, other in enumerate(kept) if agree(center, candidate, other)), None)
         if better is None:
             kept.append(candidate)
         elif kept[better].submap_id < 0:
@@ -219,36 +221,37 @@ def distinct(query: QueryMap, hypotheses: Iterable[Fit]) -> tuple[Fit, ...]:
     return tuple(kept)
 
 
-def _one_peak(query: QueryMap, a: Fit, b: Fit) -> bool:
-    """Return whether a search around one of two hypotheses has seen the other."""
-    here, there = _at(query, a), _at(query, b)
-    p, off_m = HYPOTHESES, max(abs(here.x - there.x), abs(here.y - there.y))
-    turned = abs(wrap_angle(here.yaw - there.yaw))
-    return a.session_index == b.session_index and off_m <= p.around_m and turned <= p.around_rad
-
-
 def _at(query: QueryMap, h: Fit) -> SE2:
     """Return where a hypothesis puts `QueryMap.center_m`, to which its covariance refers."""
     return h.T_map_query @ SE2(*query.center_m, 0.0)
 
 
-def agree(T_odom_base: SE2, a: Fit, b: Fit) -> bool:
-    """Return whether two hypotheses put the base at one place, by the covariances of both."""
-    one, other = (h.T_map_query @ T_odom_base for h in (a, b))
-    off = np.array([one.x - other.x, one.y - other.y, wrap_angle(one.yaw - other.yaw)])
-    squared = float(off @ np.linalg.solve(a.covariance + b.covariance, off))
-    return a.session_index == b.session_index and squared <= ONE_PLACE
+def is_inside(a: SE2, b: SE2, shape: F64) -> bool:
+    """Return whether a pose lies in the region around another one.
+
+    shape : (3, 3) of x, y, yaw. The position is inside if it is off by d and d' shape^-1 d <= 1; the heading
+    by itself.
+    """
+    off = np.array((a.x - b.x, a.y - b.y))
+    near = float(off @ np.linalg.solve(shape[:2, :2], off)) <= 1.0
+    return near and wrap_angle(a.yaw - b.yaw) ** 2 <= float(shape[2, 2])
+
+
+def one_place(a: SE2, b: SE2, covariance: F64 | float = 0.0) -> bool:
+    """Return whether two poses are one place. covariance : (3, 3) of x, y, yaw, how exactly they are known
+    beside each other, if not by walls."""
+    return is_inside(a, b, SAME + SIGMAS**2 * np.asarray(covariance))
+
+
+def agree(at: SE2, a: Fit, b: Fit, covariance: F64 | float = 0.0) -> bool:
+    """Return whether two fits put one point `at` of the query at one place of one map."""
+    here, there = a.T_map_query @ at, b.T_map_query @ at
+    return a.session_index == b.session_index and one_place(here, there, covariance)
 
 
 def more_exact(a: Fit, b: Fit) -> bool:
     """Return whether one hypothesis has the smaller covariance of the base than another."""
     return bool(np.trace(a.covariance[:2, :2]) < np.trace(b.covariance[:2, :2]))
-
-
-def same_pose(a: SE2, b: SE2) -> bool:
-    """Return whether two poses are so near that hypotheses there are one."""
-    near = math.hypot(a.x - b.x, a.y - b.y) < HYPOTHESES.same_m
-    return near and abs(wrap_angle(a.yaw - b.yaw)) < HYPOTHESES.same_rad
 
 
 def moved_to_origin(covariance: F64, T_map_query: SE2, at: SE2) -> F64:

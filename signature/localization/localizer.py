@@ -139,7 +139,7 @@ class Localizer:
             return False
         path_m = self.query.path_m
         waited = registered.scan.stamp_ns - (self.query.first_ns or 0) > _STANDING_S * 1e9
-        stands = waited and not self._stood and path_m < HYPOTHESES.same_m
+        stands = waited and not self._stood and path_m < HYPOTHESES.around_m
         self._stood = self._stood or waited
         is_time = stands or path_m - self._last_m >= self.index.config.step_m
         if is_time:
@@ -184,21 +184,26 @@ class Localizer:
         last metres. index : where to look, if not where the localizer does. Raises NoScans if no scan could
         be used.
         """
-        seen, index, clock = query.map(), index or self.index, self._clock
+        index, clock = index or self.index, self._clock
+        # The local map, described as the database is.
+        seen = query.map()
         clock.lap("describe")
+        # Places selected by signatures, aligned by walls, and their masses; the prior is what was before.
         before, off_map = self._belief.before(index, seen)
         answer, found = decide(index, seen, (*self._known, *known), prior_of or before)
-        clock.lap("search")
         answer = _with_prior(index, seen, answer, found)
+        clock.lap("search")
+        # What contradicts the likeliest place since some scan, and what these scans say alone.
         slipped, since = slip_of(index, seen, answer)
         later = self.search(query.since(since), index=index) if since and query is self.query else None
         if later is not None:
             slipped *= elsewhere(later[1], answer)
-        answer = weighed(answer, off_map, slipped, index.config.accept)
-        if later is not None and slipped * answer.places[0].mass >= LIKELY:
+        answer, slipped = weighed(answer, off_map, slipped, index.config.accept)
+        if later is not None and slipped >= LIKELY:
             return later
         answer = self._belief.in_its_map(answer)
         clock.lap("decide")
+        # The points.
         if query.in_space is not None:
             answer = settle_in_space(answer, query.in_space, index.surface, index.config.accept)
             clock.lap("in_space")

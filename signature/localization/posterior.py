@@ -83,9 +83,9 @@ from pc2grid.matching.evidence import EVIDENCE, LEFT, evidence_of, masses, tempe
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, Unfit, register_in_space
 from pc2grid.matching.score import Fit, score_fit
 from signature.localization.answer import LIKELY, Answer, Place, PoseInSpace, SpaceStatus, State, Status
-from signature.localization.hypotheses import HYPOTHESES, agree, more_exact, same_pose
+from signature.localization.hypotheses import HYPOTHESES, SIGMAS, agree, more_exact, one_place
 from signature.localization.map_index import MapIndex
-from signature.localization.prior import PRIOR
+from signature.localization.prior import drifted
 from signature.localization.query import QueryInSpace, QueryMap
 
 
@@ -197,9 +197,10 @@ def by_place(index: MapIndex, query: QueryMap, hypotheses: Iterable[Fit]) -> lis
 def _one_place(index: MapIndex, query: QueryMap, a: Fit, b: Fit) -> bool:
     """Return whether two hypotheses in the maps of two sessions are one pose of the building of both."""
     frames = index.joined(a.session_index, b.session_index)
-    return frames is not None and same_pose(
-        *(at.placed(h.T_map_query @ query.T_odom_base) for at, h in zip(frames, (a, b), strict=True))
-    )
+    if frames is None:
+        return False
+    here, there = (at.placed(h.T_map_query @ query.T_odom_base) for at, h in zip(frames, (a, b), strict=True))
+    return one_place(here, there)
 
 
 # --- Slips, and what is beside the map ---
@@ -240,29 +241,32 @@ def elsewhere(alone: Answer, place: Answer) -> float:
     return (1.0 - here) / max(1.0 - alone.mass, np.finfo(float).tiny)
 
 
-def weighed(answer: Answer, off_map: Iterable[Place], slipped: float, accept: float) -> Answer:
+def weighed(answer: Answer, off_map: Iterable[Place], slipped: float, accept: float) -> tuple[Answer, float]:
     """Return the answer weighed against what else may be: places that the map does not show, and that the
-    robot was carried away or tracking slipped. A place beside the map that the map puts where the query lies
-    by its walls, more exactly, is one with the first place.
+    robot was carried away or tracking slipped; and the mass of this. A place beside the map is one with the
+    place where walls put the query more exactly, with the masses of both.
 
     off_map : with masses relative to "nowhere". slipped : relative to the first place.
     """
+    slip = slipped * answer.confidence
     nowhere = 1.0 - answer.mass
-    share = 1.0 / (1.0 + slipped * answer.confidence + nowhere * sum(away.mass for away in off_map))
+    share = 1.0 / (1.0 + slip + nowhere * sum(away.mass for away in off_map))
     places = [replace(place, mass=share * place.mass) for place in answer.places]
     beside = []
     for away in sorted(off_map, key=lambda away: -away.mass):
-        scaled = replace(away, mass=share * nowhere * away.mass)
-        walls = places[0].fits if places else ()
+        away = replace(away, mass=share * nowhere * away.mass)
         here, at = away.fits[0], answer.T_odom_base
-        if any(agree(at, here, h) and more_exact(h, here) for h in walls):
-            places[0] = replace(places[0], mass=places[0].mass + scaled.mass, beside=scaled)
+        for k, place in enumerate(places):
+            if any(more_exact(h, here) and _is_beside(h, away, at) for h in place.fits):
+                places[k] = replace(place, mass=place.mass + away.mass, beside=place.beside or away)
+                break
         else:
-            beside.append(scaled)
+            beside.append(away)
+    places.sort(key=lambda place: -place.mass)
     status: Status = "ambiguous" if answer.located else answer.status
     if sum(place.mass for place in places[:1]) >= accept:
         status = "located"
-    return replace(answer, status=status, places=tuple(places), off_map=tuple(beside))
+    return replace(answer, status=status, places=tuple(places), off_map=tuple(beside)), share * slip
 
 
 # --- Over time ---
@@ -271,16 +275,25 @@ def weighed(answer: Answer, off_map: Iterable[Place], slipped: float, accept: fl
 def with_mass(answer: Answer) -> tuple[Place, ...]:
     """Return the places that an answer gives mass to, first place first, with when a map showed each last. A
     place of which the map shows too little to align it stays where odometry has carried the robot."""
+    off_map, places = list(answer.off_map), list[Place]()
+    for place in answer.places:
+        first, beside = place.fits[0], place.beside
+        here = [k for k, away in enumerate(off_map) if _is_beside(first, away, answer.T_odom_base)]
+        if beside is None and here:
+            beside = off_map.pop(here[0])
+            place = replace(place, mass=place.mass + beside.mass)
+        if beside is not None and first.overlap < POSTERIOR.shown:
+            places.append(replace(beside, mass=place.mass))
+        else:
+            covariances = tuple(fit.covariance for fit in place.fits)
+            at = answer.T_odom_base
+            places.append(replace(place, beside=None, seen_m=answer.path_m, T_odom_seen=at, seen=covariances))
+    return (*places, *off_map)
 
-    def seen_now(place: Place) -> Place:
-        if place.beside is not None and place.fits[0].overlap < POSTERIOR.shown:
-            return replace(place.beside, mass=place.mass)
-        covariances = tuple(fit.covariance for fit in place.fits)
-        return replace(
-            place, beside=None, seen_m=answer.path_m, T_odom_seen=answer.T_odom_base, seen=covariances
-        )
 
-    return (*map(seen_now, answer.places), *answer.off_map)
+def _is_beside(fit: Fit, away: Place, T_odom_base: SE2) -> bool:
+    """Return whether a fit puts the base where odometry has carried it beside the map."""
+    return agree(T_odom_base, away.fits[0], fit, away.fits[0].covariance)
 
 
 def mass_at(fits: Sequence[Fit], places: Iterable[Place], T_odom_base: SE2) -> float:
@@ -288,19 +301,18 @@ def mass_at(fits: Sequence[Fit], places: Iterable[Place], T_odom_base: SE2) -> f
     return sum(
         place.mass
         for place in places
-        if any(agree(T_odom_base, known, fit) for known in place.fits for fit in fits)
+        if any(agree(T_odom_base, h, fit, h.covariance) for h in place.fits for fit in fits)
     )
 
 
 def _carried(place: Place, now: QueryMap | Answer, odds: float = 1.0) -> Place:
     """Return the place with the covariances of the base now, by the odometry since the map showed it, and
     with `odds` times its mass."""
-    way_m = (now.path_m - place.seen_m) / PRIOR.sigmas
-    drift = np.array([PRIOR.drift, PRIOR.drift, PRIOR.drift_rad_m]) * way_m
+    drift = drifted(now.path_m - place.seen_m) / SIGMAS**2
     fits = []
     for fit, seen in zip(place.fits, place.seen, strict=True):
         J = lever_arm(fit.T_map_query @ place.T_odom_seen, fit.T_map_query @ now.T_odom_base)
-        fits.append(replace(fit, covariance=np.asarray(J @ seen @ J.T + np.diag(drift**2))))
+        fits.append(replace(fit, covariance=np.asarray(J @ seen @ J.T + drift)))
     return replace(place, fits=tuple(fits), mass=odds * place.mass)
 
 

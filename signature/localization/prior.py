@@ -15,11 +15,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.special import chdtri
 
 from pc2grid.errors import ConfigError
-from pc2grid.geometry import F64, SE2, BoolGrid, wrap_angle
-from signature.localization.hypotheses import HYPOTHESES
+from pc2grid.geometry import F64, SE2
+from signature.localization.hypotheses import HYPOTHESES, SAME, SIGMAS, is_inside
 from signature.localization.query import QueryMap
 
 
@@ -27,17 +26,14 @@ from signature.localization.query import QueryMap
 class PriorParameters:
     """How a covariance becomes a region, and how the region grows with travel.
 
-    A region is at least as wide on each side as the distance within which two hypotheses are one. A smaller
+    A region is at least as wide on each side as the distance within which two poses are one place. A smaller
     one would exclude right places that are drawn a little off.
 
-    sigmas : the region of a normal distribution holds the positions within this Mahalanobis distance, 99 % of
-        them (the root of the quantile of chi-square with two degrees of freedom), and the headings.
     drift, drift_rad_m : a region for an earlier time grows by this share of the way since, and turns by this
         much a metre. Tracking without loops is off, in four real logs with true poses, by at most 2.9 % of
         50 m and 2.0 % of 200 m, and by 0.07 and 0.03 degrees a metre.
     """
 
-    sigmas: float = math.sqrt(chdtri(2, 1.0 - 0.99))
     drift: float = 0.03
     drift_rad_m: float = math.radians(0.3)
 
@@ -45,12 +41,16 @@ class PriorParameters:
 PRIOR = PriorParameters()
 
 
+def drifted(way_m: float) -> F64:
+    """Return the (3, 3) region of x, y, yaw that odometry adds over a way."""
+    return np.diag(np.square((PRIOR.drift, PRIOR.drift, PRIOR.drift_rad_m))) * way_m**2
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prior:
     """The base is in an ellipse around (x, y) of the map frame of a session, with a heading near `yaw`.
 
-    T_map_base : the centre of the region. shape_m2 : (2, 2), positions at d from the centre are inside if
-    d' shape_m2^-1 d <= 1. half_yaw_rad : headings differ by at most this; pi: any.
+    T_map_base : the centre of the region. shape : (3, 3), see `is_inside`.
     stamp_ns : when; of the scans of a query the nearest one is meant. From then on the region is carried by
     the motion; before, it says nothing. None: the newest scan when `Localizer.answer` is asked.
     session : whose map frame; None if there is only one session.
@@ -61,8 +61,7 @@ class Prior:
     """
 
     T_map_base: SE2
-    shape_m2: F64
-    half_yaw_rad: float = math.pi
+    shape: F64
     stamp_ns: int | None = None
     session: str | None = None
 
@@ -84,13 +83,9 @@ class Prior:
             raise ConfigError(
                 f"near: expected x and y in metres and a radius > 0, found {x_m:g} {y_m:g} {radius_m:g}"
             )
-        radius_m = max(radius_m, HYPOTHESES.same_m)
-        return Prior(
-            T_map_base=SE2(x_m, y_m, yaw_rad),
-            shape_m2=radius_m**2 * np.eye(2),
-            half_yaw_rad=half_yaw_rad,
-            session=session,
-        )
+        radius_m = max(radius_m, HYPOTHESES.around_m)
+        shape = np.diag(np.square((radius_m, radius_m, half_yaw_rad)))
+        return Prior(T_map_base=SE2(x_m, y_m, yaw_rad), shape=shape, session=session)
 
     @staticmethod
     def of_pose(
@@ -112,39 +107,20 @@ class Prior:
                 hint="--near X Y RADIUS names one",
             )
         # Added, not a lower bound of the axes, so that the shape of the ellipse stays.
-        shape = PRIOR.sigmas**2 * position + HYPOTHESES.same_m**2 * np.eye(2)
-        half_yaw = PRIOR.sigmas * math.sqrt(full[2, 2]) + HYPOTHESES.same_rad
-        return Prior(
-            T_map_base=T_map_base,
-            shape_m2=shape,
-            # A variance of zero beside a position that is uncertain means that the heading is not known.
-            half_yaw_rad=min(half_yaw, math.pi) if full[2, 2] else math.pi,
-            stamp_ns=stamp_ns,
-            session=session,
-        )
+        shape = SIGMAS**2 * full + SAME
+        if not full[2, 2]:  # beside a position that is uncertain: the heading is not known
+            shape[2, 2] = math.pi**2
+        return Prior(T_map_base=T_map_base, shape=shape, stamp_ns=stamp_ns, session=session)
 
     @property
     def radius_m(self) -> float:
         """Return the distance of the farthest position in the region from its centre."""
-        return math.sqrt(float(np.linalg.eigvalsh(self.shape_m2)[1]))
+        return math.sqrt(float(np.linalg.eigvalsh(self.shape[:2, :2])[1]))
 
     def allows(self, T_map_base: SE2, since_m: float = 0.0) -> bool:
         """Return whether the base can be there. since_m : way driven since `stamp_ns`, by which the region
         grows."""
-        grown = self.shape_m2 + (PRIOR.drift * since_m) ** 2 * np.eye(2)
-        off = np.array([T_map_base.x - self.T_map_base.x, T_map_base.y - self.T_map_base.y])
-        turn = abs(wrap_angle(T_map_base.yaw - self.T_map_base.yaw))
-        inside = float(off @ np.linalg.solve(grown, off)) <= 1.0
-        return inside and turn <= self.half_yaw_rad + PRIOR.drift_rad_m * since_m
-
-    def may_hold(self, squares_m: F64, side_m: float, moved_m: float, since_m: float) -> BoolGrid:
-        """Return which of the squares of `side_m` around (K, 2) may hold the base now, (K,).
-
-        moved_m : distance from where it was at `stamp_ns`, whatever its heading was. since_m : way driven.
-        """
-        reach = self.radius_m + moved_m + PRIOR.drift * since_m + side_m * math.sqrt(0.5)
-        center = (self.T_map_base.x, self.T_map_base.y)
-        return np.asarray(np.hypot(*(squares_m - center).T) <= reach)
+        return is_inside(T_map_base, self.T_map_base, self.shape + drifted(since_m))
 
     def of_one(self, sessions: Sequence[str]) -> Prior:
         """Return the prior with the name of its session. Raises ConfigError if it does not name one where
@@ -173,10 +149,11 @@ class Prior:
         return None if self.is_ahead(query) else query.T_odom_prior
 
     def squares(self, query: QueryMap, free_m: F64, side_m: float) -> F64:
-        """Return those of the squares of `side_m` around (K, 2) that may hold the base now. The motion since
-        the time of the prior must be known."""
+        """Return those of the squares of `side_m` around (K, 2) that may hold the base now, whatever its
+        heading was. The motion since the time of the prior must be known."""
         T_odom_prior = self.T_odom_prior(query)
         assert T_odom_prior is not None
         step = T_odom_prior.inverse() @ query.T_odom_base
-        moved_m = math.hypot(step.x, step.y)
-        return np.asarray(free_m[self.may_hold(free_m, side_m, moved_m, query.since_prior_m)])
+        reach_m = self.radius_m + math.hypot(step.x, step.y) + PRIOR.drift * query.since_prior_m
+        center = (self.T_map_base.x, self.T_map_base.y)
+        return np.asarray(free_m[np.hypot(*(free_m - center).T) <= reach_m + side_m * math.sqrt(0.5)])

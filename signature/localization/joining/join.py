@@ -33,7 +33,7 @@ from pc2grid.matching.walls import LIKELIHOOD, Walls
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.observer import Observer
 from signature.database.protocol import SessionInfo
-from signature.localization.hypotheses import MAP_COVARIANCE, moved_to_origin, same_pose
+from signature.localization.hypotheses import MAP_COVARIANCE, moved_to_origin, one_place
 from signature.localization.map_index import MapIndex
 from signature.localization.query import QueryMap, map_as_query
 
@@ -402,7 +402,7 @@ def _distinct(transforms: Iterable[_TransformT]) -> Iterator[_TransformT]:
     found: list[_TransformT] = []
     for one in transforms:
         at = SE2(*one.at_m)
-        if not any(same_pose(one.T_target_source @ at, other.T_target_source @ at) for other in found):
+        if not any(one_place(one.T_target_source @ at, other.T_target_source @ at) for other in found):
             found.append(one)
             yield one
 

@@ -285,10 +285,8 @@ def _contradicted(poses: Trajectory, info: SessionInfo) -> list[list[float]]:
     for stretch in () if info.consistency is None else info.consistency.stretches:
         first, last = np.searchsorted(poses.stamps_ns, (stretch.from_ns, stretch.to_ns))
         part = xy[first : last + 1]
-        step_m = np.hypot(*np.diff(part, axis=0).T)
-        drawn = np.concatenate(
-            ([True], np.diff(np.floor(np.cumsum(step_m) / info.resolution_m), prepend=0.0) > 0)
-        )
+        cells = np.floor(np.cumsum(np.hypot(*np.diff(part, axis=0).T)) / info.resolution_m)
+        drawn = np.concatenate(([True], np.diff(cells, prepend=0.0) > 0))
         drawn[-1] = True
         parts.append(_short(np.ravel(part[drawn]), 2))
     return parts

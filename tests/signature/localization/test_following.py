@@ -81,14 +81,14 @@ def test_what_odometry_says_counts_for_the_place_where_walls_say_it_more_exactly
         seen=(moved.covariance,),
     )
     assert verdict.status == "located"
-    told = weighed(verdict, [away], 0.0, 0.75)
+    told, _ = weighed(verdict, [away], 0.0, 0.75)
     assert (told.status == "located") == counts == (told.confidence > 0.75)
 
 
 def test_a_place_is_the_less_certain_the_likelier_tracking_slipped() -> None:
     query = query_of(office(), np.array([(2.0, 7.0), (7.0, 7.0)]), Config(), Config().relocalize)
     verdict, _ = decide(OFFICE, query)
-    told = weighed(verdict, [], 2.0, 0.75)
+    told, _ = weighed(verdict, [], 2.0, 0.75)
     assert verdict.status == "located" and told.status == "ambiguous"
     assert (
         told.confidence

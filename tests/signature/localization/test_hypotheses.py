@@ -13,7 +13,7 @@ from pc2grid.matching.search import SearchMap
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config, RelocalizeConfig, ShortlistBy
 from signature.localization import map_index
-from signature.localization.answer import ambiguous_line
+from signature.localization.answer import Place, ambiguous_line
 from signature.localization.hypotheses import (
     HYPOTHESES,
     best_around,
@@ -22,7 +22,8 @@ from signature.localization.hypotheses import (
     fitted,
 )
 from signature.localization.place_recognition import RecognitionParameters, SessionRecognizer
-from signature.localization.posterior import decide
+from signature.localization.posterior import by_place, decide, mass_at
+from signature.localization.prior import Prior
 from signature.localization.query import query_of
 from tests.helpers.simulated_drives import building, office, office_part, with_tables
 
@@ -91,6 +92,25 @@ def test_a_shoulder_is_led_to_its_peak_and_is_no_place_of_its_own() -> None:
     farther = replace(shoulder, T_map_query=SE2(0.9, 0.0, 0.0))
     for other in (elsewhere, farther):
         assert len(distinct(query, (other, peak))) == 2
+
+
+@pytest.mark.parametrize(
+    ("off", "one"),
+    [((0.6, -0.5, 0.06), True), ((0.9, 0.0, 0.0), False), ((0.0, 0.0, math.radians(7.0)), False)],
+)
+def test_what_is_one_place_is_so_in_a_map_in_two_over_time_and_for_a_prior(
+    off: tuple[float, float, float], one: bool
+) -> None:
+    """What a search around one of two poses has seen."""
+    joined = building({"a": office(), "b": office()}, joined={"a": SE2(), "b": SE2()})
+    query = query_of(office(), np.empty((0, 2)), Config(), Config().relocalize)
+    here = fitted(query, 0, -1, SearchMap.of(office()), SE2())
+    there = replace(here, T_map_query=SE2(*off))
+    assert (len(distinct(query, (here, there))) == 1) is one
+    assert (len(by_place(joined, query, (here, replace(there, session_index=1)))) == 1) is one
+    known = Place(fits=(here,), mass=0.5)
+    assert (mass_at([there], [known], query.T_odom_base) == 0.5) is one
+    assert Prior.of_pose(SE2(), 1e-6 * np.eye(3)).allows(SE2(*off)) is one
 
 
 @pytest.mark.parametrize("by", ["signatures", "random"])

@@ -18,7 +18,7 @@ from signature.localization.answer import Answer, Place
 from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.localizer import Follower, Localizer
 from signature.localization.map_index import MapIndex
-from signature.localization.posterior import SPACE, log_odds_in_space, masses_of, settle_in_space
+from signature.localization.posterior import SPACE, log_odds_in_space, masses_of, settle_in_space, weighed
 from signature.localization.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
 from tests.helpers.simulated_drives import building, office
@@ -171,6 +171,23 @@ def test_a_place_that_is_not_compared_keeps_its_odds(points: MapSurface) -> None
     factor = math.exp(log_odds_in_space(fit))
     assert best == 1 and masses[1] / masses[0] == pytest.approx(factor)
     assert masses[0] / (1.0 - masses.sum()) == pytest.approx(0.3 / 0.4)
+
+
+def test_points_count_for_the_place_as_odometry_and_walls_know_it_together(points: MapSurface) -> None:
+    """At the edge of the map, where walls alone hardly tell. Another place beside the map becomes less likely
+    with "nowhere"."""
+    query, verdict = ask(HEIGHTS_M[0], 0.0)
+    (first,) = verdict.hypotheses
+    fit = register_in_space(query.views, points, first.T_map_query)
+    drifted = replace(first, covariance=0.01 * np.eye(3))
+    elsewhere = replace(drifted, T_map_query=SE2(9.0, 9.0, 0.0) @ first.T_map_query)
+    beside = [Place(fits=(one,), mass=mass) for one, mass in ((drifted, 2.0), (elsewhere, 1.0))]
+    told, _ = weighed(with_masses(verdict, 0.2), beside, 0.0, accept=0.9)
+    settled = settle_in_space(told, query, lambda _: points, accept=0.9)
+    # Odds beside "nowhere", by the walls, by odometry, and by the points.
+    odds = (0.2 / 0.8 + 2.0) * math.exp(log_odds_in_space(fit))
+    assert told.status == "ambiguous" and told.confidence == pytest.approx(2.25 / (1.0 + 2.25 + 1.0))
+    assert settled.status == "located" and settled.confidence / settled.off_map[0].mass == pytest.approx(odds)
 
 
 def test_a_place_that_icp_leaves_is_turned_down(points: MapSurface) -> None:
