@@ -3,11 +3,10 @@
 Consistency. Where a trajectory is bent, the robot draws a place a second time beside the first. Scans of one
 visit then put walls on ground that scans of other visits observed as free. A map of several scans keeps the
 majority, so the measure is, for each scan, the share of its wall hits on free ground of the final map, away
-from every wall. A place that was visited only once cannot contradict itself. Only hits that end the view are
-taken as walls. People put hits on free ground as well, but they walk on: a hit counts only if the keyframe
-before or after has it too. Doors and moved chairs stay for a while, in one corner of the view, whereas a bent
-trajectory shifts whole walls for metres of travel. So the share is averaged over a few metres of travel, and
-only a large share counts.
+from every wall. A place that was visited only once cannot contradict itself. People put hits on free ground
+as well, but they walk on: a hit counts only if the keyframe before or after has it too, within a cell. Doors
+and moved chairs stay for a while, in one corner of the view, whereas a bent trajectory shifts whole walls for
+metres of travel. So the share is averaged over a few metres of travel, and only a large share counts.
 
 Precision. A corridor that was driven once cannot contradict anything, but the covariance of the pose graph
 grows along it, and shrinks wherever a loop ties it to the rest. The covariance of the poses is the inverse of
@@ -33,6 +32,7 @@ from scipy.spatial import cKDTree
 from pc2grid.geometry import F64, I64, SE2, BoolGrid, wrap_angle
 from pc2grid.mapping.graph import Edge, WallDirection, information_matrix
 from pc2grid.mapping.keyframes import TURN_M_PER_RAD, Keyframe
+from pc2grid.mapping.local_maps import LOCAL_MAPS
 from pc2grid.mapping.parts import PARTS
 from pc2grid.model import (
     MOST_LISTED,
@@ -49,15 +49,8 @@ from pc2grid.model import (
 class ConsistencyParameters:
     """Numbers of the check.
 
-    reach_m : hits farther from the sensor are left out: there a small error of yaw moves them far. From the
-        first trial on real logs.
     wall_m : a hit on free ground counts if it is farther than this from every wall; three cells of the
-        default resolution. From the same trial.
-    sectors, behind_m : a hit counts if no other hit in its sector of the view lies more than `behind_m`
-        behind it: an obstacle below the view of a lidar, or a floor taken for an obstacle, is no wall. Half a
-        degree.
-    same_m : a neighbouring keyframe confirms a hit if it has a hit within this distance; two cells of the
-        default resolution.
+        default resolution. From the first trial on real logs.
     window_m : travel over which the share of contradicting hits is averaged.
     fewest_hits : of a window; with fewer, the share is computed as if there were so many.
     contradicted_from : share of the hits of a window from which its middle contradicts the map.
@@ -69,11 +62,7 @@ class ConsistencyParameters:
     (`examples/recordings.md`).
     """
 
-    reach_m: float = 12.0
     wall_m: float = 0.15
-    sectors: int = 720
-    behind_m: float = 0.3
-    same_m: float = 0.1
     window_m: float = 5.0
     fewest_hits: int = 30
     contradicted_from: float = 0.2
@@ -104,7 +93,7 @@ def measure_consistency(
     next(after, None)
     with_neighbours = zip(chain((None,), before), here, chain(after, (None,)), strict=False)
     counts = [
-        (scan.index, len(scan.hits_m), _confirmed(earlier, scan, later, parameters.same_m))
+        (scan.index, len(scan.hits_m), _confirmed(earlier, scan, later, grid.resolution_m))
         for earlier, scan, later in with_neighbours
     ]
     if not counts:
@@ -175,21 +164,14 @@ class _Drawn:
 def _drawn(
     keyframe: Keyframe, pose: SE2, grid: OccupancyGrid, clear: BoolGrid, parameters: ConsistencyParameters
 ) -> _Drawn:
-    """Return the hits that end the view, and which of them lie on clear ground."""
-    rays_m = keyframe.planar_scan.hits_m - keyframe.planar_scan.origin_m
-    range_m, bearing_rad = np.hypot(*rays_m.T), np.arctan2(rays_m[:, 1], rays_m[:, 0])
-    sector = (
-        np.floor(bearing_rad / (2.0 * math.pi) * parameters.sectors).astype(np.int64) % parameters.sectors
-    )
-    farthest_m = np.zeros(parameters.sectors)
-    np.maximum.at(farthest_m, sector, range_m)
-    ends_view = range_m > farthest_m[sector] - parameters.behind_m
-    hits_m = pose.apply(keyframe.planar_scan.hits_m[ends_view & (range_m < parameters.reach_m)])
+    """Return the hits within reach, and which of them lie on clear ground."""
+    scan = keyframe.planar_scan
+    hits_m = pose.apply(scan.hits_m[np.hypot(*(scan.hits_m - scan.origin_m).T) < LOCAL_MAPS.range_m])
     return _Drawn(keyframe.index, hits_m, grid.look_up(clear, hits_m, outside=False))
 
 
-def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m: float) -> int:
-    """Count the hits on clear ground that a neighbouring scan confirms within `same_m`.
+def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, cell_m: float) -> int:
+    """Count the hits on clear ground that a neighbouring scan confirms within a cell.
 
     A moving object is elsewhere in the next keyframe; a wall in the wrong place is not.
     """
@@ -197,8 +179,8 @@ def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, same_m
     seen_again = np.zeros(len(doubtful_m), np.bool_)
     for neighbour in (before, after):
         if neighbour is not None and len(doubtful_m) and len(neighbour.hits_m):
-            distance_m, _ = cKDTree(neighbour.hits_m).query(doubtful_m, distance_upper_bound=same_m)
-            seen_again |= distance_m < same_m
+            distance_m, _ = cKDTree(neighbour.hits_m).query(doubtful_m, distance_upper_bound=cell_m)
+            seen_again |= distance_m < cell_m
     return int(np.count_nonzero(seen_again))
 
 
