@@ -16,7 +16,7 @@ from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread, one_blas_thread_each
 from pc2grid.mapping.keyframes import Keyframe, KeyframePoints, Keyframes, Track, TrackRecord
 from pc2grid.mapping.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
-from pc2grid.mapping.loops import EXACT_TRACKING, LOOPS, LoopCloser
+from pc2grid.mapping.loops import LoopCloser
 from pc2grid.mapping.part_maps import (
     check_followed,
     draw_parts,
@@ -239,7 +239,6 @@ def _map(
             keyframes,
             recognizer=recognizer,
             projection=projection,
-            parameters=EXACT_TRACKING if narrow or beginning.in_hand else LOOPS,
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
         tracker = Tracker(config.registration, config.projection, in_hand=beginning.in_hand)

@@ -54,29 +54,22 @@ class LoopParameters:
     Which pairs are compared:
 
     near_m : older local maps within this distance may overlap the newest one.
-    compared : older local maps that the newest is compared with.
+    compared : older local maps that the newest is compared with, and pairs of local maps of two place maps.
 
-    How far is searched: as far as tracking may have drifted since the pose was last certain.
+    How tracking drifts: the standard deviation of a tracked step, and how far a loop is searched.
 
-    certain_m, certain_rad : the window directly after a loop.
-    drift_per_m, drift_rad_per_m : growth of the window per metre of travel.
+    drift_m, drift_rad : standard deviations of position and yaw on a metre of travel: 0.4 degrees over 4 m
+        (`docs/method.md`).
+    certain_m, certain_rad : the window directly after a loop; it grows by two standard deviations.
     max_window_m, max_window_rad : its largest size.
 
-    Their information in the pose graph:
-
-    information_share : of the information that a match reports: the errors of points on one wall are
-        correlated.
-    tracking_sigma_m, tracking_sigma_per_m : standard deviation of a tracked step, constant and per metre.
-    tracking_sigma_rad, tracking_sigma_rad_per_m : the same of its yaw: 0.45 degrees over 4 m, chosen on
-        killian (`docs/method.md`).
-    lost_sigma_m, lost_sigma_rad : the same where tracking was lost in between.
+    information_share : in the pose graph, of the information that a match reports: the errors of points on
+        one wall are correlated.
 
     Place recognition:
 
     maps_per_place : consecutive local maps that make a place map: 12 m of travel, chosen on aces, csail and
         killian.
-    recognized_m : window of the comparison that confirms a recognition; its yaw is within `certain_rad`.
-    compared_pairs : pairs of local maps of the two place maps that are compared at most.
     """
 
     travel_m: float = 4.0
@@ -84,56 +77,34 @@ class LoopParameters:
     compared: int = 10
     certain_m: float = 0.3
     certain_rad: float = math.radians(4.0)
-    drift_per_m: float = 0.02
-    drift_rad_per_m: float = 0.006
+    drift_m: float = 0.01
+    drift_rad: float = 0.0018
     max_window_m: float = 3.0
     max_window_rad: float = math.radians(20.0)
     information_share: float = 0.1
-    tracking_sigma_m: float = 0.02
-    tracking_sigma_per_m: float = 0.01
-    tracking_sigma_rad: float = math.radians(0.25)
-    tracking_sigma_rad_per_m: float = math.radians(0.05)
-    lost_sigma_m: float = 1.5
-    lost_sigma_rad: float = math.radians(60.0)
     maps_per_place: int = 3
-    recognized_m: float = 0.4
-    compared_pairs: int = 4
 
-    def window(self, drift_m: float) -> tuple[float, float]:
-        """Return the half widths of the search window, metres and radians, after `drift_m` of travel."""
+    def window(self, travel_m: float) -> tuple[float, float]:
+        """Return the half widths of the search window, metres and radians, after so much travel."""
         return (
-            min(self.certain_m + self.drift_per_m * drift_m, self.max_window_m),
-            min(self.certain_rad + self.drift_rad_per_m * drift_m, self.max_window_rad),
+            min(self.certain_m + 2 * self.drift_m * travel_m, self.max_window_m),
+            min(self.certain_rad + 2 * self.drift_rad * travel_m, self.max_window_rad),
         )
 
     @property
     def lost_m(self) -> float:
         """Return the travel that a lost part of the session counts as: that of the largest window."""
-        return self.max_window_m / self.drift_per_m
+        return self.max_window_m / (2 * self.drift_m)
 
-    def tracked_information(self, length_m: float, restart: bool) -> F64:
-        """Return the information (3, 3) of a tracked step between anchors. restart : tracking was lost in
-        between."""
-        sigma_m = self.tracking_sigma_m + self.tracking_sigma_per_m * length_m
-        sigma_rad = self.tracking_sigma_rad + self.tracking_sigma_rad_per_m * length_m
-        if restart:
-            sigma_m, sigma_rad = self.lost_sigma_m, self.lost_sigma_rad
-        return np.diag([sigma_m**-2, sigma_m**-2, sigma_rad**-2])
+    def tracked_information(self, restart: bool) -> F64:
+        """Return the information (3, 3) of the step from a local map to the next. restart : tracking was lost
+        in between."""
+        travel_m = self.lost_m if restart else self.travel_m
+        sigma = travel_m * np.array((self.drift_m, self.drift_m, self.drift_rad))
+        return np.diag(sigma**-2)
 
 
 LOOPS = LoopParameters()
-EXACT_TRACKING = LoopParameters(
-    tracking_sigma_m=0.01,
-    tracking_sigma_per_m=0.003,
-    tracking_sigma_rad=math.radians(0.15),
-    tracking_sigma_rad_per_m=math.radians(0.04),
-)
-"""For a depth camera, and for a sensor in the hand, which is tracked in space.
-
-Two local maps of a camera often show a place from two sides, so that its loops are less exact than its
-tracking. So are those of a sensor in the hand, whose local maps are drawn in cells of 5 cm. About twice the
-errors of tracking by a camera in simulated csail (`docs/method.md`); checked on lidar/hall.
-"""
 
 
 class LoopCloser:
@@ -256,8 +227,8 @@ class LoopCloser:
             # Places a short way apart show nothing but that tracking is smooth.
             if mass < LEFT or self._way_m(place) < 2 * p.maps_per_place * p.travel_m:
                 continue
-            for older, newer, guess in self._place_maps.guesses(place)[: p.compared_pairs]:
-                loops += self._compare(older, newer, guess, (p.recognized_m, p.certain_rad), float(mass))
+            for older, newer, guess in self._place_maps.guesses(place)[: p.compared]:
+                loops += self._compare(older, newer, guess, p.window(0.0), float(mass))
         self._close(loops)
         if loops:
             # The newest place map is where it belongs now: loops that the search near the tracked pose missed
@@ -329,8 +300,7 @@ class LoopCloser:
         """Measure an overlap again on the present local maps; return the old one if they no longer
         overlap."""
         guess = self._graph.relative(edge.first, edge.second)
-        window = self._parameters.certain_m, self._parameters.certain_rad
-        return next(iter(self._compare(edge.first, edge.second, guess, window)), edge)
+        return next(iter(self._compare(edge.first, edge.second, guess, self._parameters.window(0.0))), edge)
 
     def _optimised(self) -> F64:
         """Return keyframe poses (K, 3) that follow the anchors of their local maps.
@@ -410,7 +380,7 @@ class SessionGraph:
         shown : information (3, 3) on the step by surfaces of both local maps; None: tracking was lost.
         """
         newest = len(self)
-        information = self._parameters.tracked_information(math.hypot(step.x, step.y), shown is None)
+        information = self._parameters.tracked_information(shown is None)
         self.edges.append(Edge(newest - 1, newest, step, information))
         if shown is not None:
             self._step_information[newest - 1, newest] = shown

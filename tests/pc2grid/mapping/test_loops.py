@@ -211,13 +211,16 @@ def farthest(settled: F64, truth: list[SE2]) -> float:
     return float(np.linalg.norm(T_truth_session.apply(settled[:, :2]) - array(truth)[:, :2], axis=1).max())
 
 
+APART = LoopParameters(near_m=-100.0)
+"""No local maps are near."""
+
+
 def test_a_recognizer_closes_loops_where_no_local_maps_are_near() -> None:
     truth = square(100) * 2
     poses, _ = drifting(truth, veer=0.004)
     planar_scans = [scan_of(pose, BLOCK) for pose in truth]
-    apart = LoopParameters(compared=0)
-    alone, _ = closed(poses, planar_scans, parameters=apart)
-    settled, found = closed(poses, planar_scans, parameters=apart, recognizer=KnowsTheTruth(truth))
+    alone, _ = closed(poses, planar_scans, parameters=APART)
+    settled, found = closed(poses, planar_scans, parameters=APART, recognizer=KnowsTheTruth(truth))
     assert farthest(alone, truth) > 1.0
     assert farthest(settled, truth) < 0.2 and sum(loop.accepted for loop in found.loops) > 3
 
@@ -240,16 +243,12 @@ def counts(monkeypatch: pytest.MonkeyPatch, *off: tuple[SE2, Evidence], side: fl
 
     off : so far from the tracked poses, which are true. All local maps match where they are told to be.
     """
-    p = LoopParameters(compared=0)
-
-    def overlap(self: LocalMap, newer: LocalMap, guess: SE2, window_m: float, _: float) -> Overlap | None:
-        return Overlap(guess, INFORMATION, 1.0) if window_m == p.recognized_m else None
-
-    monkeypatch.setattr(LocalMap, "overlap", overlap)
+    monkeypatch.setattr(LocalMap, "overlap", lambda self, newer, guess, *_: Overlap(guess, INFORMATION, 1.0))
+    monkeypatch.setattr(LoopCloser, "_again", lambda self, edge: edge)
     truth = square(100, side) * 2
     scans = [scan_of(pose, BLOCK) for pose in truth]
-    _, found = closed(truth, scans, parameters=p, recognizer=KnowsTheTruth(truth, *off))
-    full = p.information_share * INFORMATION[0, 0]
+    _, found = closed(truth, scans, parameters=APART, recognizer=KnowsTheTruth(truth, *off))
+    full = APART.information_share * INFORMATION[0, 0]
     return float(found.loops[0].information[0, 0] / full) if found.loops else 0.0
 
 
@@ -283,7 +282,6 @@ def test_a_recognised_place_ties_what_was_lost_to_the_rest() -> None:
     beside = truth[100] @ SE2(1.6, -1.2, math.radians(40.0)) @ truth[100].inverse()
     poses = truth[:100] + [beside @ pose for pose in truth[100:]]
     scans = [scan_of(pose, BLOCK) for pose in truth]
-    apart = LoopParameters(compared=0)
-    alone, _ = closed(poses, scans, restart=100, parameters=apart)
-    settled, _ = closed(poses, scans, restart=100, parameters=apart, recognizer=KnowsTheTruth(truth))
+    alone, _ = closed(poses, scans, restart=100, parameters=APART)
+    settled, _ = closed(poses, scans, restart=100, parameters=APART, recognizer=KnowsTheTruth(truth))
     assert farthest(alone, truth) > 1.0 and farthest(settled, truth) < 0.2
