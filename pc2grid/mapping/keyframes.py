@@ -107,8 +107,7 @@ def grid_of(keyframes: Iterable[tuple[Keyframe, SE2]], projection: ProjectionCon
     return builder.grid()
 
 
-_STEPS = np.iinfo(np.int16).max  # from the origin of the base to the farthest point
-_MOUNTED_M = 3.0  # farthest place of a sensor on its base
+_STEPS = np.iinfo(np.int16).max  # from the origin of the base to the farthest point of a keyframe
 
 
 class KeyframePoints:
@@ -119,7 +118,6 @@ class KeyframePoints:
 
     def __init__(self, voxel_m: float, max_range_m: float) -> None:
         self._voxel_m, self._max_range_m = voxel_m, max_range_m
-        self._step_m = (max_range_m + _MOUNTED_M) / _STEPS
         self._clouds = Spool("points")
         self._scans = array("q")
 
@@ -131,15 +129,16 @@ class KeyframePoints:
         near = np.einsum("ij,ij->i", away, away) < range_m**2
         cloud = VoxelCloud(self._voxel_m)
         cloud.add(scan.points_m[near])
-        steps = np.rint(cloud.points_m() / self._step_m)
-        within = (np.abs(steps) <= _STEPS).all(axis=1)
-        self._clouds.append(steps[within].astype("<i2").tobytes())
+        points_m = cloud.points_m()
+        step_m = np.float32(max(np.abs(points_m).max(initial=0.0), self._voxel_m) / _STEPS)
+        self._clouds.append(step_m.tobytes() + np.rint(points_m / step_m).astype("<i2").tobytes())
         self._scans.append(index)
 
     def __getitem__(self, number: int) -> tuple[int, F32]:
         """Return the number of a scan in the session, and its points (N, 3) in the base frame."""
-        steps = np.frombuffer(self._clouds[number], "<i2").reshape(-1, 3)
-        return self._scans[number], steps * np.float32(self._step_m)
+        record = self._clouds[number]
+        steps = np.frombuffer(record, "<i2", offset=np.float32().itemsize).reshape(-1, 3)
+        return self._scans[number], steps * np.frombuffer(record, np.float32, count=1)
 
     def __iter__(self) -> Iterator[tuple[int, F32]]:
         return (self[number] for number in range(len(self._scans)))
