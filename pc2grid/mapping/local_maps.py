@@ -26,8 +26,8 @@ class LocalMapParameters:
 
     range_m : hits farther from the sensor are left out: they are too sparse to match.
     cell_m : edge of a cell.
-    margin_m : free border around the points, at least the widest neighbourhood of `radii_cells`.
-    radii_cells : neighbourhoods of the refinement, see `PointGrid.match`.
+    radii_cells : neighbourhoods of the refinement, see `PointGrid.match`. The free border around the points
+        is twice as wide as the widest.
     every_keyframe : every n-th keyframe is drawn; they are 0.2 m apart, so more of them add no new walls.
     cached : local maps that stay in memory.
     search_points : points of a local map that are compared with another one.
@@ -35,7 +35,6 @@ class LocalMapParameters:
 
     range_m: float = 12.0
     cell_m: float = 0.1
-    margin_m: float = 0.6
     radii_cells: tuple[int, ...] = (3, 2, 2, 1, 1, 1, 1, 1)
     every_keyframe: int = 2
     cached: int = 24
@@ -89,8 +88,9 @@ class LocalMap:
         points, normal_rad = np.concatenate(hits), np.concatenate(normals)
         everything = np.concatenate((points, *outlines))
         self._parameters = parameters
-        self._low_m = everything.min(axis=0) - parameters.margin_m
-        self._grid = PointGrid(self._low_m, everything.max(axis=0) + parameters.margin_m, parameters.cell_m)
+        margin_m = 2 * max(parameters.radii_cells) * parameters.cell_m
+        self._low_m = everything.min(axis=0) - margin_m
+        self._grid = PointGrid(self._low_m, everything.max(axis=0) + margin_m, parameters.cell_m)
         self._grid.add(points, normal_rad)
         cells: I64 = np.floor((points - self._low_m) / parameters.cell_m).astype(np.int64)[:, ::-1]
         self.walls = Walls.of(self._drawn(cells, outlines))
