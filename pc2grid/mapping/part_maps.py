@@ -223,11 +223,9 @@ def _of_scans(trajectory: Trajectory, scans: I64) -> Trajectory:
 
 # --- reports and warnings -----------------------------------------------------------------------------
 
-_WARN_DEGENERATE = 0.1
-"""Share of degenerate scans above which there is a warning; chosen by hand."""
-_MOST_LOST = 0.2
-"""Share of lost scans above which a laser gives no map without odometry: its parts are not connected.
-Chosen by hand."""
+_MANY = 0.2
+"""Share of degenerate scans above which there is a warning, and of lost ones above which a laser gives no map
+without odometry, as its parts are not connected; chosen by hand."""
 _STOREY_M = 2.0
 """A hand lifts a sensor by less than this, and storeys are at least 2.4 m high; chosen by hand."""
 
@@ -244,7 +242,7 @@ def _report(trajectory: Trajectory, of_map: Sequence[str]) -> ReadReport:
             f"registration was lost for {len(lost)} of {total} scans, first {seconds:.1f} s after the first "
             "scan; they are not in the map"
         )
-    if weak > _WARN_DEGENERATE * total:
+    if weak > _MANY * total:
         warnings.append(
             f"{weak} of {total} scans did not fix the pose in every direction: there it rests on odometry "
             "or on the motion before"
@@ -319,7 +317,7 @@ def division_warning(
 def check_followed(trajectory: Trajectory, name: str) -> None:
     """Raise TrackingLost if more than a fifth of the scans of the log `name` are lost."""
     lost = [health is Health.LOST for health in trajectory.health]
-    if sum(lost) <= _MOST_LOST * len(lost):
+    if sum(lost) <= _MANY * len(lost):
         return
     first_s = (trajectory.stamps_ns[lost.index(True)] - trajectory.stamps_ns[0]) * 1e-9
     raise TrackingLost(
