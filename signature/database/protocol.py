@@ -55,10 +55,6 @@ class Label:
         pairs = ((self.building, other.building), (self.floor, other.floor))
         return any(a is not None and b is not None and a != b for a, b in pairs)
 
-    def agrees(self, other: Label) -> bool:
-        """Return True if the two name the same building, and the same floor or none."""
-        return self.building is not None and self == other
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Provenance:

@@ -50,10 +50,7 @@ class JoinParameters:
     least_agreement : a piece that agrees less than this does not show where its neighbours begin, and a whole
         map that does is not joined; wrong places agree by 0.6, see `pc2grid.matching.evidence`.
     proposed : transforms that are compared at most: a building of equal rooms has as many.
-    least_m2 : free ground that both sessions know at least. Smaller rooms are alike in many buildings.
     accept : least probability. A wrong answer is one, a wrong join makes all later answers wrong.
-    labelled : prior odds that two sessions show one floor if their labels agree, relative to those of other
-        sessions, which the posterior begins with.
     wall_m : the ground that a session knows is widened by this, so that the walls at its edge count.
     """
 
@@ -61,9 +58,7 @@ class JoinParameters:
     least_walls: float = 20.0
     least_agreement: float = 0.6
     proposed: int = 20
-    least_m2: float = 20.0
     accept: float = 0.99
-    labelled: float = 10.0
     wall_m: float = 0.4
 
 
@@ -116,8 +111,7 @@ def compare_pairs(
 
     with observer.step(f"compare {len(pairs)} pairs of sessions"):
         for done, (a, b) in enumerate(pairs, start=1):
-            labelled = infos[a].provenance.label.agrees(infos[b].provenance.label)
-            join = join_maps(prepared(a), prepared(b), labelled=labelled)
+            join = join_maps(prepared(a), prepared(b))
             yield SessionPair(target=a, source=b, join=join)
             observer.on_progress(done / len(pairs))
 
@@ -199,21 +193,15 @@ UNJOINED = Join(
 """Two sessions of which no piece proposes a transform."""
 
 
-def join_maps(
-    target: JoinableMap, source: JoinableMap, *, labelled: bool = False, parameters: JoinParameters = JOIN
-) -> Join:
-    """Decide whether two sessions show one building, and how the source lies in the target.
-
-    labelled : labels say that both are of one floor of one building.
-    """
+def join_maps(target: JoinableMap, source: JoinableMap) -> Join:
+    """Decide whether two sessions show one building, and how the source lies in the target."""
     points_m = source.walls.facing(target.walls).points_m
-    prior = parameters.labelled if labelled else 1.0
     candidates = _candidates(target, points_m, source.pieces)
-    join = _best(target, source, candidates, (), prior, parameters)
+    join = _best(target, source, candidates, ())
     if join.status == "different":
         return join  # decoys are further rivals, which tell against it at most
     decoys = _candidates(target, points_m * _MIRROR, source.mirrored_pieces)
-    return _best(target, source, candidates, decoys, prior, parameters)
+    return _best(target, source, candidates, decoys)
 
 
 def _candidates(target: JoinableMap, points_m: F32, pieces: Sequence[Piece]) -> list[_ExactTransform]:
@@ -260,21 +248,19 @@ def _best(
     source: JoinableMap,
     candidates: Sequence[_ExactTransform],
     decoys: Sequence[_ExactTransform],
-    prior: float,
-    parameters: JoinParameters,
 ) -> Join:
-    """Return the most probable of some transforms, all others being its rivals. prior : odds of one building.
+    """Return the most probable of some transforms, all others being its rivals.
 
     By branch and bound: what is not judged is neither joined nor more probable than the best.
     """
     fits = PieceFits.of([candidate.fits for candidate in (*candidates, *decoys)])
     found = [_evidence(source, k, fits) for k in range(len(candidates))]
-    bounds = [_bound(evidence, prior) for evidence in found]
+    bounds = [_bound(evidence) for evidence in found]
     best = UNJOINED
     for k in sorted(range(len(candidates)), key=lambda k: -bounds[k]):
-        if bounds[k] < min(best.probability, parameters.accept):
+        if bounds[k] < min(best.probability, JOIN.accept):
             break
-        join = _judged(target, source, candidates[k], k, fits, found[k], prior, parameters)
+        join = _judged(target, source, candidates[k], k, fits, found[k])
         best = max(best, join, key=lambda join: (join.status == "joined", join.probability))
     return best
 
@@ -296,13 +282,13 @@ def _evidence(source: JoinableMap, number: int, fits: PieceFits) -> Evidence:
     return with_leads([part] * len(scores), scores.tolist())[number]
 
 
-def _bound(evidence: Evidence, prior: float) -> float:
+def _bound(evidence: Evidence) -> float:
     """Return the probability of a transform if its part of the source is unlike itself, and is all of it.
 
     It is never lower than the true one.
     """
     highest = replace(evidence, lead=max(evidence.lead, 0.0), likeness=0.0)
-    return float(masses([highest], prior)[0])
+    return float(masses([highest])[0])
 
 
 def _judged(
@@ -312,13 +298,10 @@ def _judged(
     number: int,
     fits: PieceFits,
     evidence: Evidence,
-    prior: float,
-    parameters: JoinParameters,
 ) -> Join:
     """Judge a transform by the part of the source that lies in the target.
 
-    number : its row in `fits`; the other rows are of its rivals. evidence : see `_evidence`. prior : odds of
-    one building.
+    number : its row in `fits`; the other rows are of its rivals. evidence : see `_evidence`.
     """
     part = known_part(source.grid, target.grid, candidate.T_target_source)
     common_m2 = free_in_both(part, target.grid, candidate.T_target_source)
@@ -326,16 +309,16 @@ def _judged(
     evidence = replace(evidence, likeness=self_similarity(Walls.of(part)))
     # The part was chosen: of so many parts of the smaller session, this one fits best.
     share = min(common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9), 1.0)
-    odds = prior * max(share, 1e-9)
+    odds = max(share, 1e-9)
     # Transforms that fit equally well share the mass.
     equal = int(np.count_nonzero(np.abs(scores - scores[number]) <= EVIDENCE.alike))
     probability = float(masses([evidence] * equal, odds)[0])
     # Of thousands of wall points a small lead is much, even where walls fit as wrong places do.
-    enough = common_m2 >= parameters.least_m2 and min(forward, backward) >= JOIN.least_agreement
+    enough = min(forward, backward) >= JOIN.least_agreement
     # That the source lies here, or at a place that fits equally well, is more probable than not.
     doubt: JoinStatus = "ambiguous" if evidence.log_odds() + math.log(odds) > 0.0 else "different"
     return Join(
-        status="joined" if enough and probability >= parameters.accept else doubt,
+        status="joined" if enough and probability >= JOIN.accept else doubt,
         T_target_source=candidate.T_target_source,
         covariance=moved_to_origin(candidate.covariance, candidate.T_target_source, SE2(*candidate.at_m)),
         probability=probability,
