@@ -52,7 +52,6 @@ class ConsistencyParameters:
     wall_m : a hit on free ground counts if it is farther than this from every wall; three cells of the
         default resolution. From the first trial on real logs.
     window_m : travel over which the share of contradicting hits is averaged.
-    fewest_hits : of a window; with fewer, the share is computed as if there were so many.
     contradicted_from : share of the hits of a window from which its middle contradicts the map.
     bent_from : share of the travel that contradicts a map from which the map is called bent.
     shown : contradictions that are kept, the longest first.
@@ -64,7 +63,6 @@ class ConsistencyParameters:
 
     wall_m: float = 0.15
     window_m: float = 5.0
-    fewest_hits: int = 30
     contradicted_from: float = 0.2
     bent_from: float = 0.005
     shown: int = MOST_LISTED
@@ -193,7 +191,7 @@ def _window_shares(poses: F64, hits: I64, contradicting: I64, parameters: Consis
     last = np.searchsorted(travel_m, travel_m + 0.5 * parameters.window_m, side="right")
     in_window = [np.concatenate(([0], np.cumsum(counts))) for counts in (hits, contradicting)]
     all_hits, all_contradicting = (total[last] - total[first] for total in in_window)
-    return np.asarray(all_contradicting / np.maximum(all_hits, parameters.fewest_hits))
+    return np.asarray(all_contradicting / np.maximum(all_hits, 1))
 
 
 def _contradictions(
