@@ -122,11 +122,6 @@ class LocalMap:
         chosen = evenly(len(self.points_m), self._parameters.search_points)
         return self.points_m[chosen], self.normal_rad[chosen]
 
-    def information(self, newer: LocalMap, T_self_newer: SE2) -> F64:
-        """Return the information (3, 3) on the pose of a newer local map by surfaces of both; none along a
-        bare wall."""
-        return self.match(*newer.sample(), T_self_newer).information
-
     def overlap(self, newer: LocalMap, guess: SE2, window_m: float, window_rad: float) -> Overlap | None:
         """Match a newer local map with this one near a guess; None if they hardly show one place.
 

@@ -179,8 +179,7 @@ class LoopCloser:
         drift_m = self._parameters.lost_m if restart else math.hypot(step.x, step.y)
         self._drift_m += drift_m
         self._travelled_m.append(self._travelled_m[-1] + drift_m)
-        shown = None if restart else self._local_maps[newest - 1].information(self._local_maps[newest], step)
-        self._graph.extend(step, walls, shown)
+        self._graph.extend(step, walls, restart=restart)
 
     def _tracked(self, number: int) -> SE2:
         """Return the pose of a local map as tracked."""
@@ -363,8 +362,6 @@ class SessionGraph:
         self.nodes: F64 = np.empty((0, 3))
         self.edges: list[Edge] = []
         self._walls: list[WallDirection] = []  # of each local map
-        # Of each tracked step, by its local maps: how exactly these determine it.
-        self._step_information: dict[tuple[int, int], F64] = {}
 
     def __len__(self) -> int:
         return len(self.nodes)
@@ -374,16 +371,11 @@ class SessionGraph:
         self.nodes = np.vstack((self.nodes, (pose.x, pose.y, pose.yaw)))
         self._walls.append(walls)
 
-    def extend(self, step: SE2, walls: WallDirection, shown: F64 | None) -> None:
-        """Add the next local map, a tracked step from the last one.
-
-        shown : information (3, 3) on the step by surfaces of both local maps; None: tracking was lost.
-        """
+    def extend(self, step: SE2, walls: WallDirection, *, restart: bool) -> None:
+        """Add the next local map, a tracked step from the last one. restart : tracking was lost before it."""
         newest = len(self)
-        information = self._parameters.tracked_information(shown is None)
+        information = self._parameters.tracked_information(restart)
         self.edges.append(Edge(newest - 1, newest, step, information))
-        if shown is not None:
-            self._step_information[newest - 1, newest] = shown
         self.add(pose_at(self.nodes, newest - 1) @ step, walls)
 
     def relative(self, first: int, second: int) -> SE2:
@@ -398,22 +390,13 @@ class SessionGraph:
 
     def sigmas(self, solution: Solution, part: I64) -> F64:
         """Return the standard deviation (N,) in metres of the position of each local map within its part
-        (N,).
-
-        In the pose graph the information of a tracked step is that of tracking where it works at all. The
-        information of the surfaces that its two local maps share is added here.
-        """
+        (N,)."""
         sigma_m = np.zeros(len(part))
         number = np.empty(len(part), np.int64)  # of each local map within its part
         for own in (np.flatnonzero(part == k) for k in range(int(part.max(initial=-1)) + 1)):
             number[own] = np.arange(len(own))
             within = [
-                replace(
-                    edge,
-                    first=int(number[edge.first]),
-                    second=int(number[edge.second]),
-                    information=edge.information + self._step_information.get((edge.first, edge.second), 0.0),
-                )
+                replace(edge, first=int(number[edge.first]), second=int(number[edge.second]))
                 for edge in compress(self.edges, solution.accepted)
                 if part[edge.first] == part[edge.second] == part[own[0]]
             ]

@@ -276,7 +276,7 @@ def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision 
     """Return the graph of a session over the local maps whose precision is known.
 
     Its steps and loops say how stiff its parts are to each other. As a whole it is as stiff as its precision
-    says, which knows also what the local maps show of each step.
+    says.
     """
     if precision is None or len(precision.stamps_ns) < 2 or len(trajectory) < 2:
         return RIGID
