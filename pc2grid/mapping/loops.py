@@ -199,8 +199,9 @@ class LoopCloser:
         # The local map before the newest is left out: tracking matched both against the same walls.
         before = nodes[: max(newest - 1, 0), :2]
         distance_m = np.hypot(*(before - nodes[newest, :2]).T)
-        near_m = self._parameters.near_m + window[0]
-        for older in spread_over_visits(distance_m, near_m, self._parameters.compared):
+        near = np.flatnonzero(distance_m < self._parameters.near_m + window[0]).tolist()
+        # A robot that drives up and down passes a place dozens of times: some of all visits are chosen.
+        for older in (near[k] for k in evenly(len(near), self._parameters.compared)):
             yield from self._compare(older, newest, self._graph.relative(older, newest), window)
 
     def _compare(
@@ -332,22 +333,6 @@ class LoopCloser:
         """Return the number (N,) of the part of each local map."""
         loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
         return connected(self._segments(), loops)
-
-
-def spread_over_visits(distance_m: F64, near_m: float, count: int) -> list[int]:
-    """Choose older local maps, `distance_m` (N,) away from the newest, to compare it with; `count` at most.
-
-    A robot that drives up and down passes a place dozens of times. The nearest local map of the first visit,
-    of the last and of some in between are chosen, so that the newest is connected to all visits.
-    """
-    near = np.flatnonzero(distance_m < near_m)
-    if not len(near):
-        return []
-    visits = np.split(near, np.flatnonzero(np.diff(near) > 1) + 1)
-    chosen = [visits[k] for k in evenly(len(visits), count)]
-    nearest = [int(visit[np.argmin(distance_m[visit])]) for visit in chosen]
-    others = [int(k) for k in near[np.argsort(distance_m[near], kind="stable")] if k not in nearest]
-    return nearest + others[: count - len(nearest)]
 
 
 class SessionGraph:
