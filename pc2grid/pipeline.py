@@ -121,7 +121,7 @@ def build_maps(
     """Turn a recording into a map, or into several if its parts cannot be placed to each other.
 
     A part ends where tracking was lost, unless a loop joins the scans before and after
-    (`pc2grid.mapping.parts`). The first map has the name `session`, the others `session#2`, `session#3`, ...;
+    (`pc2grid.mapping.loops`). The first map has the name `session`, the others `session#2`, `session#3`, ...;
     each has its own frame, the base at its first scan. The first map's report also holds the counts of the
     whole recording.
 

@@ -1,4 +1,4 @@
-"""The pose graph in the plane, with two more sources of evidence: the axes of the building, and level floors.
+"""The pose graph in the plane, with one more source of evidence: the axes of the building.
 
 `optimise` is sparse least squares over planar poses with robust edges: the manifold Gauss-Newton of Grisetti
 et al., "A tutorial on graph-based SLAM" (2010), section IV. Cauchy weights decide which of the edges that may
@@ -13,11 +13,6 @@ walls give the heading (the Manhattan world of Coughlan and Yuille, 1999; in a p
 direction of its walls modulo 90 degrees, weakly and robustly: walls of other directions are either not
 concentrated (curved walls) or farther from the axes than the robust scale (a wing at another angle), and lose
 their weight. Loops and tracked steps are ten times as exact and decide wherever there are any.
-
-The heights of keyframes drift as their positions do. For gravity-aligned poses height is independent of x, y
-and yaw, so `optimised_heights` is a linear least-squares problem of its own: steps of tracking between
-keyframes, and the height above the floor where it is visible. One recording is one floor, and a floor is
-level.
 """
 
 from __future__ import annotations
@@ -28,11 +23,10 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import coo_matrix, csc_matrix, identity, vstack
+from scipy.sparse import coo_matrix, csc_matrix, identity
 from scipy.sparse.linalg import splu
 
-from pc2grid.clouds.ground import LEVEL
-from pc2grid.geometry import F64, I64, SE2, wrap_angle
+from pc2grid.geometry import F64, SE2, wrap_angle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -297,63 +291,3 @@ def pull_to_axes(
 def _from_axis(direction_rad: F64, axis_rad: float) -> F64:
     """Return directions (N,) relative to the nearest axis, from -45 to 45 degrees."""
     return wrap_angle(4.0 * (direction_rad - axis_rad)) / 4.0
-
-
-_LOST_M = 1.0
-"""Standard deviation of the height of a step where tracking was lost; chosen by hand."""
-
-
-def optimised_heights(
-    tracked_m: F64, travel_m: F64, above_floor_m: F64, restarts: Sequence[int] | I64
-) -> F64:
-    """Return the heights (K,) of keyframes above their one floor, by robust least squares.
-
-    tracked_m : (K,) z as tracked. travel_m : (K,) metres of travel at each. above_floor_m : (K,) as measured,
-    NaN where no floor is visible; it is visible somewhere. restarts : the keyframes before which tracking was
-    lost.
-
-    The robust scale begins so wide that the worst has half of its weight (Cauchy), and shrinks as that of
-    `optimise`.
-    """
-    seen, steps = np.flatnonzero(np.isfinite(above_floor_m)), len(tracked_m) - 1
-    sigma_m = np.full(steps + len(seen), LEVEL.seen_m)
-    sigma_m[:steps] = np.sqrt(LEVEL.drift_per_m * np.maximum(np.diff(travel_m), 1e-3))
-    sigma_m[np.asarray(restarts, np.int64) - 1] = _LOST_M
-    rise_m = np.concatenate((np.diff(tracked_m), above_floor_m[seen]))
-    # One row for each observation: the steps of tracking, then the floors.
-    heights = identity(steps + 1, format="csr")
-    A = vstack((heights[1:] - heights[:-1], heights[seen]))
-    weight, scale, robust_sigmas = sigma_m**-2, np.inf, POSE_GRAPH.robust_sigmas
-    for _ in range(POSE_GRAPH.iterations):
-        heights_m = splu((A.T @ A.multiply(weight[:, None])).tocsc()).solve(A.T @ (weight * rise_m))
-        off = np.abs(A @ heights_m - rise_m) / sigma_m
-        scale = max(min(scale / POSE_GRAPH.annealing, off[steps:].max()), robust_sigmas)
-        weight[steps:] = 1.0 / (sigma_m**2 * (1.0 + (off / scale) ** 2))[steps:]
-    return np.asarray(heights_m)
-
-
-def floors_apart_m(heights_m: F64, above_floor_m: F64) -> float | None:
-    """Return the spread of the heights of the floor below keyframes at heights (K,), without the outer
-    twentieths.
-
-    None if no floor is visible.
-    """
-    floor_m = (heights_m - above_floor_m)[np.isfinite(above_floor_m)]
-    if not len(floor_m):
-        return None
-    low_m, high_m = np.percentile(floor_m, (5.0, 95.0))
-    return float(high_m - low_m)
-
-
-def floor_warning(apart_m: float | None, obstacle_m: float) -> str | None:
-    """Return a warning with the spread of the floors of a map and what to do; None if there is none.
-
-    obstacle_m : height above the floor from which anything is an obstacle.
-    """
-    if apart_m is None or apart_m < obstacle_m:
-        return None
-    return (
-        f"a floor is level, but what was seen of it lies over {apart_m:.2f} m of height: where it was passed "
-        "twice, one floor may stand on the other as an obstacle; hold the sensor so that it sees the floor, "
-        "or cut the recording at a step or ramp, with --start and --duration"
-    )

@@ -16,6 +16,10 @@ they are turned by 180 degrees. What the recognizer does not know is that the dr
 its evidence is that of an answer, and the tracked pose the prior: one equation tells how likely each place is
 (`pc2grid.matching.evidence.masses`), and its loops count as much. Loops that contradict each other and the
 travel between them are told by the pose graph.
+
+Where tracking was lost and started again, the pose relative to earlier scans is unknown: a new segment
+begins. Loops that were accepted between two segments join them again. A component of joined segments is a
+part, and becomes a session of its own (`connected`).
 """
 
 from __future__ import annotations
@@ -29,6 +33,8 @@ from itertools import compress
 from typing import Protocol
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from pc2grid.estimation.line_map import evenly
 from pc2grid.geometry import F64, I64, SE2, frozen_arrays
@@ -36,7 +42,6 @@ from pc2grid.mapping.graph import Edge, Solution, WallDirection, optimise, wall_
 from pc2grid.mapping.keyframes import TURN_M_PER_RAD, Keyframe, Keyframes, grid_of
 from pc2grid.mapping.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps, pose_at
 from pc2grid.mapping.part_maps import OptimisedKeyframes, interpolate_corrections
-from pc2grid.mapping.parts import connected
 from pc2grid.mapping.quality import position_sigmas
 from pc2grid.matching.evidence import LEFT, Evidence, masses
 from pc2grid.model import Loop, OccupancyGrid
@@ -333,6 +338,34 @@ class LoopCloser:
         """Return the number (N,) of the part of each local map."""
         loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
         return connected(self._segments(), loops)
+
+
+_JOINING = 2
+"""Different local maps on each of the two sides that must be in agreeing loops, to join two segments; a
+single room may look like another one. Chosen by hand."""
+
+
+def connected(segment: I64, loops: Sequence[Edge]) -> I64:
+    """Return the number (N,) of the part of each local map, in the order in which the parts begin.
+
+    segment : (N,) number of the segment of each, from 0. loops : accepted ones. Two segments are joined if
+    enough different local maps of the one overlap enough different ones of the other.
+    """
+    ends: dict[tuple[int, int], list[Edge]] = {}
+    for loop in loops:
+        ends.setdefault((int(segment[loop.first]), int(segment[loop.second])), []).append(loop)
+    joined = [
+        pair
+        for pair, between in ends.items()
+        if len({loop.first for loop in between}) >= _JOINING
+        and len({loop.second for loop in between}) >= _JOINING
+    ]
+    count = int(segment.max(initial=-1)) + 1
+    rows, columns = np.array(joined, dtype=np.int64).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    _, first, part = np.unique(label[segment], return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[part], dtype=np.int64)
 
 
 class SessionGraph:

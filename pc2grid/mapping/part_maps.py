@@ -1,27 +1,40 @@
-"""The end of a session: its poses after loop closure, the map of each part, and its report with warnings."""
+"""The end of a session: its poses after loop closure, the map of each part, and its report with warnings.
+
+The heights of keyframes drift as their positions do. For gravity-aligned poses height is independent of x, y
+and yaw, so `optimised_heights` is a linear least-squares problem of its own: steps of tracking between
+keyframes, and the height above the floor where it is visible. One recording is one floor, and a floor is
+level.
+
+Odometry that reports the opposite motion all the time, or none, does not merely slip: the sensor is mounted
+upside down, or turned by half a turn, and tf does not contain it; or the odometry has a wrong sign, stands
+still, or measures no turns. A map of such a recording may be mirrored (`odometry_warnings`).
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.sparse import identity, vstack
+from scipy.sparse.linalg import splu
 
+from pc2grid.clouds.ground import LEVEL
 from pc2grid.errors import TrackingLost
 from pc2grid.estimation.tracker import check_odometry
-from pc2grid.geometry import F64, I64, SE2, wrap_angle
-from pc2grid.mapping.graph import (
-    between,
-    compose,
-    floor_warning,
-    floors_apart_m,
-    optimised_heights,
-)
+from pc2grid.geometry import F64, I64, SE2, invert_pose, rotation_vector, wrap_angle
+from pc2grid.mapping.graph import POSE_GRAPH, between, compose
 from pc2grid.mapping.keyframes import KeyframePoints, Keyframes, Track, grid_of
-from pc2grid.mapping.parts import PARTS, odometry_warnings
-from pc2grid.mapping.quality import consistency_warning, measure_consistency, precision_of, precision_warning
+from pc2grid.mapping.quality import (
+    LEAST_TRAVEL_M,
+    consistency_warning,
+    measure_consistency,
+    precision_of,
+    precision_warning,
+)
 from pc2grid.model import Health, Loop, ReadReport, SessionMap, Trajectory, part_name
 from pc2grid.settings import ProjectionConfig
 
@@ -34,7 +47,7 @@ class OptimisedKeyframes:
     loops : between the scans at the anchors of local maps that overlap.
     segments : (K,) number of the segment of each; a new one begins where the pose relative to the keyframe
         before is unknown. parts : (K,) number of the part of each: segments that loops join. Poses of
-        different parts are unrelated; see `pc2grid.mapping.parts`.
+        different parts are unrelated; see `pc2grid.mapping.loops`.
     anchors : (N,) numbers, in `scans`, of the keyframes at the anchors of the local maps.
     sigma_m : (N,) standard deviation of the position of each of these within its part, in the least certain
         direction; see `pc2grid.mapping.quality`.
@@ -140,7 +153,7 @@ def draw_parts(
 
 def long_enough(parts: Sequence[SessionMap]) -> list[SessionMap]:
     """Return the parts that are long enough to be recognised, or the longest one if none is."""
-    kept = [part for part in parts if part.trajectory.length_m >= PARTS.least_travel_m]
+    kept = [part for part in parts if part.trajectory.length_m >= LEAST_TRAVEL_M]
     return kept or [max(parts, key=lambda part: part.trajectory.length_m)]
 
 
@@ -200,6 +213,66 @@ def _level(T_part_base: F64, part: I64, closed: OptimisedKeyframes, above_floor_
         of_part = np.flatnonzero(part == number)
         T_part_base[of_part, 2, 3] += np.interp(of_part, scans, raised_m - raised_m[0])
     return apart_m
+
+
+_LOST_M = 1.0
+"""Standard deviation of the height of a step where tracking was lost; chosen by hand."""
+
+
+def optimised_heights(
+    tracked_m: F64, travel_m: F64, above_floor_m: F64, restarts: Sequence[int] | I64
+) -> F64:
+    """Return the heights (K,) of keyframes above their one floor, by robust least squares.
+
+    tracked_m : (K,) z as tracked. travel_m : (K,) metres of travel at each. above_floor_m : (K,) as measured,
+    NaN where no floor is visible; it is visible somewhere. restarts : the keyframes before which tracking was
+    lost.
+
+    The robust scale begins so wide that the worst has half of its weight (Cauchy), and shrinks as that of
+    `optimise`.
+    """
+    seen, steps = np.flatnonzero(np.isfinite(above_floor_m)), len(tracked_m) - 1
+    sigma_m = np.full(steps + len(seen), LEVEL.seen_m)
+    sigma_m[:steps] = np.sqrt(LEVEL.drift_per_m * np.maximum(np.diff(travel_m), 1e-3))
+    sigma_m[np.asarray(restarts, np.int64) - 1] = _LOST_M
+    rise_m = np.concatenate((np.diff(tracked_m), above_floor_m[seen]))
+    # One row for each observation: the steps of tracking, then the floors.
+    heights = identity(steps + 1, format="csr")
+    A = vstack((heights[1:] - heights[:-1], heights[seen]))
+    weight, scale, robust_sigmas = sigma_m**-2, np.inf, POSE_GRAPH.robust_sigmas
+    for _ in range(POSE_GRAPH.iterations):
+        heights_m = splu((A.T @ A.multiply(weight[:, None])).tocsc()).solve(A.T @ (weight * rise_m))
+        off = np.abs(A @ heights_m - rise_m) / sigma_m
+        scale = max(min(scale / POSE_GRAPH.annealing, off[steps:].max()), robust_sigmas)
+        weight[steps:] = 1.0 / (sigma_m**2 * (1.0 + (off / scale) ** 2))[steps:]
+    return np.asarray(heights_m)
+
+
+def floors_apart_m(heights_m: F64, above_floor_m: F64) -> float | None:
+    """Return the spread of the heights of the floor below keyframes at heights (K,), without the outer
+    twentieths.
+
+    None if no floor is visible.
+    """
+    floor_m = (heights_m - above_floor_m)[np.isfinite(above_floor_m)]
+    if not len(floor_m):
+        return None
+    low_m, high_m = np.percentile(floor_m, (5.0, 95.0))
+    return float(high_m - low_m)
+
+
+def floor_warning(apart_m: float | None, obstacle_m: float) -> str | None:
+    """Return a warning with the spread of the floors of a map and what to do; None if there is none.
+
+    obstacle_m : height above the floor from which anything is an obstacle.
+    """
+    if apart_m is None or apart_m < obstacle_m:
+        return None
+    return (
+        f"a floor is level, but what was seen of it lies over {apart_m:.2f} m of height: where it was passed "
+        "twice, one floor may stand on the other as an obstacle; hold the sensor so that it sees the floor, "
+        "or cut the recording at a step or ramp, with --start and --duration"
+    )
 
 
 def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
@@ -291,7 +364,7 @@ def division_warning(
         return (int(part.trajectory.stamps_ns[0]) - start_ns) * 1e-9
 
     short = len(parts) - len(kept)
-    dropped = f"; {short} shorter than {PARTS.least_travel_m:.0f} m left out" if short else ""
+    dropped = f"; {short} shorter than {LEAST_TRAVEL_M:.0f} m left out" if short else ""
     named = ", ".join(
         f"{part_name(session, k)} from {begin_s(part):.0f} s ({part.trajectory.length_m:.0f} m)"
         for k, part in enumerate(kept)
@@ -366,3 +439,113 @@ def height_warnings(heights_m: F64, trajectory: Trajectory) -> list[str]:
         f"more than {_STOREY_M:.1f} m: a map is one floor, and this one shows several as one; cut the "
         "recording there, with --start and --duration, and name each floor with --floor"
     ]
+
+
+# --- odometry against the scans -----------------------------------------------------------------------
+
+_APART_NS = 10**9
+"""Motions are compared over this time at least: late or bunched odometry has caught up by then; by hand."""
+_LEAST_MOTION = 0.1
+"""Motions of less than this, in metres or radians, are noise; chosen by hand."""
+_OPPOSITE, _LEAST, _MOST = -0.5, 0.25, 1.75
+"""Shares of what the scans show. Odometry that reports less than the first has the sign wrong; what is not
+between the others is no measure of it. In eight real recordings it reports .93 to 1.15."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Kind:
+    """A kind of motion.
+
+    columns : of motions (M, 6). least : with less in all, metres or radians, odometry is not judged; chosen
+    by hand. opposite, otherwise : warnings for odometry that reports the opposite, and for odometry that does
+    not measure it.
+    """
+
+    columns: slice
+    least: float
+    opposite: str
+    otherwise: str
+
+
+_KINDS = (
+    _Kind(
+        slice(3),
+        2.0,
+        "odometry reports travel the other way than the scans show: the sensor is mounted turned by half "
+        "a turn and tf does not say so, or odometry counts backwards",
+        "odometry reports {reported:.1f} m where the scans show {shown:.1f} m of travel, "
+        "or in another direction: it stands still, has another unit, or the sensor is mounted otherwise "
+        "than tf says; --odometry none ignores it",
+    ),
+    _Kind(
+        slice(3, 6),
+        1.5,
+        "odometry turns the other way than the scans: the sensor is mounted upside down and tf does not "
+        "say so, which mirrors the map, or odometry has left and right exchanged",
+        "odometry reports {reported:.1f} rad where the scans show turns of {shown:.1f} rad "
+        "in all, or about another axis; --odometry none ignores it",
+    ),
+)
+
+
+def odometry_warnings(trajectory: Trajectory, readings: F64) -> list[str]:
+    """Return at most two sentences for the user, on the travel and on the turns.
+
+    readings : (N, 4, 4) T_odom_base at each scan, not finite where there is none.
+    """
+    motions = _motions(trajectory, readings)
+    warnings = []
+    for kind in _KINDS:
+        shown, reported, share = _compared(*(motion[:, kind.columns] for motion in motions))
+        if shown < kind.least or _LEAST <= share <= _MOST:
+            continue
+        text = kind.opposite if share < _OPPOSITE else kind.otherwise
+        warnings.append(text.format(shown=shown, reported=reported))
+    return warnings
+
+
+def _motions(trajectory: Trajectory, readings: F64) -> tuple[F64, F64]:
+    """Return motions (M, 6) by the scans and by odometry, in metres and as rotation vectors.
+
+    They are between scans that fix the pose.
+    """
+    fixed = np.array([health in (Health.FINE, Health.OVERRULED) for health in trajectory.health], bool)
+    lost = np.cumsum([health is Health.LOST for health in trajectory.health])
+    usable = np.flatnonzero(fixed & np.isfinite(readings).all(axis=(1, 2)))
+    ends = itertools.pairwise(_apart(trajectory.stamps_ns, usable))
+    pairs = [(a, b) for a, b in ends if lost[a] == lost[b]]
+    shown, reported = (
+        np.array([_step(poses[a], poses[b]) for a, b in pairs]).reshape(-1, 6)
+        for poses in (trajectory.T_session_base, readings)
+    )
+    return shown, reported
+
+
+def _apart(stamps_ns: NDArray[np.int64], scans: NDArray[np.intp]) -> list[int]:
+    """Select scans of which consecutive ones are at least `_APART_NS` apart."""
+    chosen: list[int] = []
+    for scan in scans.tolist():
+        if not chosen or stamps_ns[scan] - stamps_ns[chosen[-1]] >= _APART_NS:
+            chosen.append(scan)
+    return chosen
+
+
+def _step(a: F64, b: F64) -> F64:
+    """Return the motion (6,) from a pose (4, 4) to another one."""
+    motion = invert_pose(a) @ b
+    return np.concatenate((motion[:3, 3], rotation_vector(motion)))
+
+
+def _compared(shown: F64, reported: F64) -> tuple[float, float, float]:
+    """Compare motions (M, 3) by the scans with reported ones (M, 3).
+
+    Returns the sums of their lengths, and the reported share of the motion by the scans; a jump counts no
+    more than twice.
+    """
+    lengths = np.linalg.norm(shown, axis=1)
+    moves = lengths >= _LEAST_MOTION
+    shown, reported, lengths = shown[moves], reported[moves], lengths[moves]
+    shares = np.clip(np.einsum("nk,nk->n", shown, reported) / lengths**2, -2.0, 2.0)
+    total = float(lengths.sum())
+    share = float((lengths * shares).sum()) / total if total else 1.0
+    return total, float(np.linalg.norm(reported, axis=1).sum()), share

@@ -33,7 +33,6 @@ from pc2grid.geometry import F64, I64, SE2, BoolGrid, wrap_angle
 from pc2grid.mapping.graph import Edge, WallDirection, information_matrix
 from pc2grid.mapping.keyframes import TURN_M_PER_RAD, Keyframe
 from pc2grid.mapping.local_maps import LOCAL_MAPS
-from pc2grid.mapping.parts import PARTS
 from pc2grid.model import (
     MOST_LISTED,
     Consistency,
@@ -221,6 +220,11 @@ PROMISED_M = 0.5
 to the walls around it is off in the map by more than that as often as one in three."""
 
 
+LEAST_TRAVEL_M = 8.0
+"""A part, or a loose stretch, with less travel is left out: later recordings are recognised by so much and
+more."""
+
+
 def position_sigmas(poses: F64, edges: Sequence[Edge], walls: Sequence[WallDirection] | None = None) -> F64:
     """Return the standard deviation (N,) of each position in metres, in its least certain direction.
 
@@ -251,7 +255,7 @@ def position_sigmas(poses: F64, edges: Sequence[Edge], walls: Sequence[WallDirec
     across = with_errors.reshape(-1, 3, 3)[:, :2] @ moved.transpose(0, 2, 1)
     covariance = blocks - across - across.transpose(0, 2, 1)
     covariance += moved @ (placement.T @ with_errors) @ moved.transpose(0, 2, 1)
-    return np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0))
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[:, -1], 0.0)))
 
 
 def _moved_by_whole(poses: F64) -> F64:
@@ -278,7 +282,7 @@ def precision_of(trajectory: Trajectory, scans: I64, sigma_m: F64) -> Precision:
         first, last = int(begins[begin]), int(ends[end - 1])
         worst = begin + int(np.argmax(sigma_m[begin:end]))
         length_m = float(travel_m[last] - travel_m[first])
-        if length_m >= PARTS.least_travel_m:
+        if length_m >= LEAST_TRAVEL_M:
             found.append(
                 UncertainSegment(
                     from_ns=int(stamps_ns[first]),

@@ -55,7 +55,7 @@ class SqliteRows(Rows):
         if not damaged:
             with contextlib.ExitStack() as undo:
                 undo.callback(rows.close)
-                rows._inspect_tables()
+                inspect_tables(rows.connection, path)
                 undo.pop_all()
         return rows
 
@@ -108,14 +108,11 @@ class SqliteRows(Rows):
         itself."""
         try:
             inspect_header(local(self.source))
-            self._inspect_tables()
+            inspect_tables(self.connection, local(self.source))
         except DatabaseCorrupt as error:
             yield Problem("file", error.message)
         for (message,) in self.select("PRAGMA integrity_check"):
             yield from (Problem("file", line) for line in str(message).splitlines() if line != "ok")
-
-    def _inspect_tables(self) -> None:
-        inspect_tables(self.connection, local(self.source))
 
 
 def local(place: Location) -> Path:
@@ -259,7 +256,14 @@ def inspect_header(path: Path) -> None:
     header, size = _header(path)
     if len(header) < 100:
         raise DatabaseCorrupt(f"{path}: truncated to {size} bytes, not even the header is whole")
-    _check_format(path, *(int.from_bytes(header[at : at + 4], "big") for at in (68, 60)))
+    application_id, version = (int.from_bytes(header[at : at + 4], "big") for at in (68, 60))
+    if application_id != APPLICATION_ID:
+        raise NotADatabase(
+            f"{path}: not a pc2grid database, but another program's SQLite file (application id"
+            f" {application_id:#x})",
+            hint=CONVERT,
+        )
+    refuse_other_format(path, version)
     page_size = int.from_bytes(header[16:18], "big")
     promised = (65536 if page_size == 1 else page_size) * int.from_bytes(header[28:32], "big")
     if size != promised:
@@ -292,17 +296,6 @@ def _header(path: Path) -> tuple[bytes, int]:
             else CONVERT,
         )
     return header, size
-
-
-def _check_format(path: Path, application_id: int, version: int) -> None:
-    """Raise NotADatabase or DatabaseVersion unless both are those of this format."""
-    if application_id != APPLICATION_ID:
-        raise NotADatabase(
-            f"{path}: not a pc2grid database, but another program's SQLite file (application id"
-            f" {application_id:#x})",
-            hint=CONVERT,
-        )
-    refuse_other_format(path, version)
 
 
 def inspect_tables(connection: sqlite3.Connection, path: Path) -> None:

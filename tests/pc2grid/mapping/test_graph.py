@@ -9,17 +9,16 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import F64, SE2, wrap_angle
-from pc2grid.mapping.graph import (
-    Edge,
-    WallDirection,
-    floor_warning,
-    floors_apart_m,
-    optimise,
-    optimised_heights,
-)
+from pc2grid.mapping.graph import Edge, WallDirection, optimise
 from pc2grid.mapping.keyframes import Keyframe, Keyframes, Track
 from pc2grid.mapping.loops import LOOPS
-from pc2grid.mapping.part_maps import OptimisedKeyframes, draw_parts
+from pc2grid.mapping.part_maps import (
+    OptimisedKeyframes,
+    draw_parts,
+    floor_warning,
+    floors_apart_m,
+    optimised_heights,
+)
 from pc2grid.mapping.quality import position_sigmas
 from pc2grid.model import Health, SessionMap, Trajectory
 from pc2grid.settings import ProjectionConfig

@@ -10,7 +10,7 @@ from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.geometry import SE2
 from pc2grid.mapping.graph import Edge
 from pc2grid.mapping.keyframes import Keyframe, Keyframes, Track
-from pc2grid.mapping.loops import LoopCloser, LoopParameters
+from pc2grid.mapping.loops import LoopCloser, LoopParameters, connected
 from pc2grid.mapping.part_maps import (
     OptimisedKeyframes,
     draw_parts,
@@ -19,7 +19,6 @@ from pc2grid.mapping.part_maps import (
     part_reports,
     with_track_warnings,
 )
-from pc2grid.mapping.parts import connected
 from pc2grid.model import Health, ReadReport, RegisteredScan, SessionMap, Trajectory
 from pc2grid.settings import ProjectionConfig
 from tests.helpers.rooms import RESOLUTION_M
