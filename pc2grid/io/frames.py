@@ -28,7 +28,7 @@ from pc2grid.geometry import (
     pose_from_xyz_quat,
     quat_xyzw_from_pose,
 )
-from pc2grid.io.messages.types import Imu, Seven, Transform, valid_pose
+from pc2grid.io.messages.types import MOST_PARTS, Imu, Seven, Transform, valid_pose
 from pc2grid.io.source import LIDAR_PERIOD_NS
 
 
@@ -40,13 +40,11 @@ class FrameParameters:
     hold_ns : time before the first and after the last sample for which that sample is used,
         the time between two scans.
     kept_samples : samples of one track; a multiple of a minute at any usual rate.
-    max_frames : frames of one tree, against hostile files.
     """
 
     max_gap_ns: int = 2_000_000_000
     hold_ns: int = LIDAR_PERIOD_NS
     kept_samples: int = 20_000
-    max_frames: int = 10_000
 
 
 PARAMETERS = FrameParameters()
@@ -160,8 +158,8 @@ class FrameTree:
                 f"a transform {parent or '?'} -> {child or '?'} of the log makes no sense and is ignored"
             )
             return
-        if child not in self._parent and len(self._parent) >= PARAMETERS.max_frames:
-            self._warn(f"the log has more than {PARAMETERS.max_frames} frames; the others are ignored")
+        if child not in self._parent and len(self._parent) >= MOST_PARTS:
+            self._warn(f"the log has more than {MOST_PARTS} frames; the others are ignored")
             return
         before = self._static.get(child)
         self._set_parent(child, parent)

@@ -93,7 +93,7 @@ def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> P
     motion = motions.odometry(candidates)
     imu, gravity = motions.imu(motion)
     needs_tf = motion.frame is not None or bases.sensor_moves(base)
-    stamps_ns = [scan.content.header.stamp_ns for scan in found.first_scans]
+    stampless, period_ns = _stamps(found.first_scans)
     return Plan(
         choice=Choice(
             topic=found.topic.topic,
@@ -112,11 +112,18 @@ def make_plan(source: MessageSource, config: ReadConfig, frames: FrameTree) -> P
         imu=imu,
         moving_tf=tuple(tf.moving) if needs_tf else (),
         sensor_is_base=base is None,
-        stampless=bool(stamps_ns) and not any(stamps_ns),
+        stampless=stampless,
         mounted=bases.mounted(base),
-        period_ns=max((b - a for a, b in itertools.pairwise(stamps_ns)), default=0),
+        period_ns=period_ns,
         depth_unit_m=config.depth_unit_m or _recorded_depth_unit_m(source),
     )
+
+
+def _stamps(scans: Sequence[First]) -> tuple[bool, int]:
+    """Return whether all stamps of the first scans are zero, and the longest time between two of them."""
+    stamps_ns = [scan.content.header.stamp_ns for scan in scans]
+    longest_ns = max((b - a for a, b in itertools.pairwise(stamps_ns)), default=0)
+    return bool(stamps_ns) and not any(stamps_ns), longest_ns
 
 
 def _recorded_depth_unit_m(source: MessageSource) -> float | None:

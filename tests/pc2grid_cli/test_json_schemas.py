@@ -30,10 +30,10 @@ from pc2grid.model import (
 from pc2grid.settings import dump_settings
 from pc2grid.simulate import SimulatedSession
 from pc2grid_cli.console import print_result
-from pc2grid_cli.documents import DOCUMENTS, schema
 from pc2grid_cli.info import ChosenTopics, Info
 from pc2grid_cli.main import app
 from pc2grid_cli.options import Export, Simulate
+from pc2grid_cli.output import DOCUMENTS, schema
 from signature.config import Config
 from signature.database import Problem
 from signature.localization.answer import AmbiguousLine, Point

@@ -17,9 +17,9 @@ from pc2grid.geometry import SE2
 from pc2grid.io.map_pose import initialpose, read_pose
 from pc2grid.io.maps import save_map
 from pc2grid_cli.console import Console
-from pc2grid_cli.documents import schema
 from pc2grid_cli.known_pose import as_text
 from pc2grid_cli.main import app
+from pc2grid_cli.output import schema
 from signature.localization.pose_check import CheckStatus, PoseCheck
 from tests.helpers.field import field_log
 from tests.helpers.json_schema import closed

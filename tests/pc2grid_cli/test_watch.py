@@ -17,8 +17,8 @@ from pc2grid.io.maps import save_map
 from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
-from pc2grid_cli.documents import schema
 from pc2grid_cli.main import app, main
+from pc2grid_cli.output import schema
 from pc2grid_lab.recordings.run import McapPart, write_joined
 from signature.localization.localizer import ResetPolicy
 from tests.helpers.interruptible import interruptible

@@ -20,8 +20,8 @@ from pc2grid.geometry import SE2
 from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum, stamp_ns_from_text
 from pc2grid.simulate import SimulationConfig, simulate_session
-from pc2grid_cli.documents import schema
 from pc2grid_cli.main import app
+from pc2grid_cli.output import schema
 from pc2grid_cli.relocalize import write_places
 from signature.localization.map_index import MapIndex
 from tests.helpers.interruptible import interruptible

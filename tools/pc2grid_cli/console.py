@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from pc2grid.errors import one_line
-from pc2grid.observer import Observer, bars_on_stderr, seldom
+from pc2grid.observer import ProgressBars, bars_on_stderr, seldom
 
 if TYPE_CHECKING:
     from rich.progress import Task
@@ -33,7 +33,7 @@ _SENT_AGAIN_S = 0.05
 _COMPILING = "compiling what runs for the first time here; later runs do not wait for it"
 
 
-class Console(Observer):
+class Console(ProgressBars):
     """The terminal of one run of the program, with what the global options say.
 
     As an observer it shows the news of some work on stderr: progress, warnings, and notes with -v.
@@ -43,11 +43,11 @@ class Console(Observer):
     """
 
     def __init__(self) -> None:
+        super().__init__()
         self.verbose = 0
         self.quiet = False
         self.debug = bool(os.environ.get("PC2GRID_DEBUG"))
         self.compiling = False
-        self._update: Callable[[float], None] | None = None
 
     def note(self, message: str, *, level: int = 0) -> None:
         """Print a line for the user, unless -q is given; one of level 1 only with -v."""
@@ -93,11 +93,6 @@ class Console(Observer):
         with self.progress(what, recorded_s) as self._update, _compiling_noted(self):
             yield
         self._update = None
-
-    def on_progress(self, share: float) -> None:
-        """See `Observer.on_progress`."""
-        if self._update is not None:
-            self._update(share)
 
     def on_note(self, text: str) -> None:
         """See `Observer.on_note`."""

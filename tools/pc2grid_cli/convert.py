@@ -18,7 +18,7 @@ from pc2grid.errors import ConfigError, DatabaseError, OutputError, Pc2GridError
 from pc2grid.model import is_part_of
 from pc2grid.observer import Observer
 from pc2grid_cli import console, options, output
-from pc2grid_cli.documents import Document, joined_document, session_document
+from pc2grid_cli.output import Document, joined_document, session_document
 from signature import conversion_jobs
 from signature.conversion_jobs import Job
 from signature.database import Label, Provenance, maintenance, open_database

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from pc2grid.display import counted, plain, probability
 from pc2grid.errors import ConfigError, DatabaseError, one_line
 from pc2grid_cli import console, options, output
-from pc2grid_cli.documents import Document, joined_document, stored_document
+from pc2grid_cli.output import Document, joined_document, stored_document
 from signature.database import Problem, SessionInfo, SubmapDatabase, maintenance, open_database
 from signature.database.maintenance import shown
 from signature.database.protocol import by_building, largest_m

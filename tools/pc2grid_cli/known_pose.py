@@ -18,8 +18,8 @@ from pc2grid.io.recording import Log, open_log
 from pc2grid.model import Health, RegisteredScan
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console, options
-from pc2grid_cli.documents import Document
 from pc2grid_cli.options import KnownPose
+from pc2grid_cli.output import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.localization.answer import pose_text

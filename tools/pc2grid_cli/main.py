@@ -179,8 +179,8 @@ DB = {
     "remove": _command("Remove sessions from a database.", "DbRemove", "db:remove"),
 }
 CONFIG = {
-    "dump": _command("Print every setting as TOML.", "ConfigDump", "documents:dump"),
-    "schema": _command("Print the JSON Schema of a document.", "ConfigSchema", "documents:print_schema"),
+    "dump": _command("Print every setting as TOML.", "ConfigDump", "output:dump"),
+    "schema": _command("Print the JSON Schema of a document.", "ConfigSchema", "output:print_schema"),
 }
 COMPARE = {
     "recordings": _experiment(

@@ -31,8 +31,8 @@ from pc2grid.matching.score import Fit
 from pc2grid.model import SENSOR_MODELS, Trajectory
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console, known_pose, options, output
-from pc2grid_cli.documents import Document
 from pc2grid_cli.export import write_answer, write_located_map
+from pc2grid_cli.output import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.maintenance import is_database

@@ -28,7 +28,7 @@ from pc2grid.model import RegisteredScan
 from pc2grid.observer import Observer
 from pc2grid.pipeline import follow
 from pc2grid_cli import console, known_pose, options
-from pc2grid_cli.documents import Document
+from pc2grid_cli.output import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.localization.answer import Answer, answer_in_building, pose_text

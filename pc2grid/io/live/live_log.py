@@ -54,7 +54,7 @@ class LiveParameters:
     """
 
     most_lag_s: float = LIDAR_PERIOD_NS * 1e-9
-    catch_up_s: float = 10.0
+    catch_up_s: float = _MOST_S
     most_bytes: int = PARAMETERS.max_waiting_bytes
     most_messages: int = 100_000
     poll_s: float = 0.2

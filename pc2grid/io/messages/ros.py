@@ -24,6 +24,7 @@ from rosbags.typesys.store import Typestore
 from pc2grid.errors import PointCloudError, UnsupportedSchema
 from pc2grid.io.messages.types import (
     HEADER_BYTES,
+    MOST_PARTS,
     Bytes,
     CameraInfo,
     CompressedImage,
@@ -38,10 +39,6 @@ from pc2grid.io.messages.types import (
     valid_pose,
 )
 from pc2grid.io.source import TopicInfo
-
-_MOST_FIELDS = 1000
-"""Fields of a message and of a cloud, and numbers of distortion, that no real message reaches. The known
-types flatten to some tens of fields; the limit bounds the time for a crafted text to half a second."""
 
 
 def decoder_for(channel: TopicInfo) -> Callable[[Bytes], Any]:
@@ -110,7 +107,7 @@ def _store_of(channel: TopicInfo, ros1: bool, needed: str) -> tuple[str, Any]:
 
 
 def _point_cloud(m: Any) -> PointCloud2:
-    if len(m.fields) > _MOST_FIELDS:
+    if len(m.fields) > MOST_PARTS:
         raise PointCloudError(f"a cloud with {len(m.fields)} fields")
     fields = tuple((f.name, f.offset, f.datatype, f.count) for f in m.fields)
     big = bool(m.is_bigendian)
@@ -135,7 +132,7 @@ def _compressed_image(m: Any) -> CompressedImage:
 
 
 def _camera_info(m: Any) -> CameraInfo:
-    if len(m.d) > _MOST_FIELDS:
+    if len(m.d) > MOST_PARTS:
         raise PointCloudError(f"a CameraInfo with {len(m.d)} numbers of distortion")
     d, k, p = (tuple(values.tolist()) for values in (m.d, m.k, m.p))
     return CameraInfo(_header(m.header), m.height, m.width, m.distortion_model, d, k, p)
@@ -300,8 +297,8 @@ def _needed(top: str, types: Typesdict) -> Typesdict:
                 node, content = content[0]
             todo += [content] if node == Nodetype.NAME else []
             count += 1
-        if count + len(todo) > _MOST_FIELDS:
+        if count + len(todo) > MOST_PARTS:
             raise ValueError(
-                f"{top}: its definitions nest without end, or into more than {_MOST_FIELDS} fields"
+                f"{top}: its definitions nest without end, or into more than {MOST_PARTS} fields"
             )
     return needed

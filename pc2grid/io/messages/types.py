@@ -21,6 +21,10 @@ Seven = tuple[float, float, float, float, float, float, float]
 HEADER_BYTES = 1 << 16
 """No text that describes data is longer: the header of a cloud, a map.yaml, the definition of a message (of
 those known up to 15,000 characters, with all comments)."""
+MOST_PARTS = 1000
+"""No real message has so many fields, cloud so many columns, camera so many numbers of distortion, and
+recording so many frames. The known types flatten to some tens of fields; the limit bounds the time for a
+crafted text to half a second."""
 # Coordinates beyond this are a mistake: it is twice the circumference of the earth, and floats are far from
 # overflowing.
 FARTHEST_M = 1e8

@@ -442,19 +442,19 @@ def test_a_mount_that_is_nowhere_or_turned_nowhere_is_refused_by_name(
 def test_a_chain_of_very_many_frames() -> None:
     links = [
         Transform(Header(T0, f"f{i}"), f"f{i + 1}", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-        for i in range(10_100)
+        for i in range(1_100)
     ]
     tree = FrameTree()
     tree.add_all(tuple(links), static=True)
-    tree.add_all(tuple(links[9_990:]), static=True)
-    assert len(tree.frames) == 10_001
-    assert any("more than 10000 frames" in w for w in tree.warnings)
-    assert len(tree.chain("f10000")) == 10_001
-    tree.add(Transform(Header(T0, "f9000"), "f0", links[0].pose), static=True)
-    assert len(tree.chain("f10000")) == 10_001  # f0 had no parent before, and there is no room for it
-    tree.add(Transform(Header(T0, "f9000"), "f1", links[0].pose), static=True)
-    with pytest.raises(FrameError, match=r"tf goes in a circle: .* -> f1 -> f9000$"):
-        tree.chain("f10000")
+    tree.add_all(tuple(links[990:]), static=True)
+    assert len(tree.frames) == 1_001
+    assert any("more than 1000 frames" in w for w in tree.warnings)
+    assert len(tree.chain("f1000")) == 1_001
+    tree.add(Transform(Header(T0, "f900"), "f0", links[0].pose), static=True)
+    assert len(tree.chain("f1000")) == 1_001  # f0 had no parent before, and there is no room for it
+    tree.add(Transform(Header(T0, "f900"), "f1", links[0].pose), static=True)
+    with pytest.raises(FrameError, match=r"tf goes in a circle: .* -> f1 -> f900$"):
+        tree.chain("f1000")
 
 
 def test_an_unreadable_tf_message_is_not_taken_for_no_tf(tmp_path: Path) -> None:
