@@ -25,7 +25,7 @@ from pc2grid.io.messages.clouds import parser
 from pc2grid.io.messages.types import HEADER_BYTES, Header
 from pc2grid.io.sensors.decode import decode_cloud
 from pc2grid.io.source import LFS_HINT, is_lfs_pointer
-from pc2grid.settings import ReadConfig
+from pc2grid.settings import ProjectionConfig, ReadConfig
 
 CLOUD_SUFFIXES = (".pcd", ".ply")
 MESH_SUFFIXES = (".ply", ".obj", ".stl", ".off", ".glb", ".gltf")
@@ -36,7 +36,7 @@ _SPACING_SAMPLE = 2000
 _SAMPLES_PER_M2 = 1600.0  # of the surface of a mesh: one every 2.5 cm
 _DIGEST_BYTES = 1 << 20
 _LOCAL_MAPS = Path("local_maps", "plys")
-_ROUNDED_M = 0.1
+_ROUNDED_M = 2.0 * ProjectionConfig().resolution_m
 """Steps of coordinates above which walls are not drawn: two cells. Rounded to 0.06 m a building keeps 94 to
 99 % of its free area, to 0.12 m 64 to 97 %, to 0.5 m none."""
 # Rotations of the axis that points up to z.

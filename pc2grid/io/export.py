@@ -19,10 +19,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import math
-from collections.abc import Iterable, Sequence
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal
 
 import mcap
@@ -167,45 +167,30 @@ class Marker:
 
 
 class LogWriter:
-    """Writes one MCAP. The file gets its name only when the `with` block ends without an error.
-
-    path : file to write; an existing one is refused with OutputError unless `overwrite` is set.
+    """Writes messages into one MCAP, which `LogWriter.to` opens.
 
     Log time and publish time of every message are its stamp. Messages may be written in any order of time.
     """
 
-    def __init__(self, path: Path, *, overwrite: bool = False) -> None:
-        self._target = Path(path)
-        refuse_existing(self._target, overwrite)
-        self._stack = contextlib.ExitStack()
-        self._writer: Writer | None = None
+    def __init__(self, writer: Writer) -> None:
+        self._writer = writer
         self._channels: dict[tuple[str, str], int] = {}
         self._schemas: dict[str, int] = {}
-        self._sequence: dict[int, int] = {}
+        self._sequence: Counter[int] = Counter()
 
-    def __enter__(self) -> LogWriter:
-        with contextlib.ExitStack() as stack:
-            temporary = stack.enter_context(replace_file(self._target))
-            stream = stack.enter_context(temporary.open("wb"))
-            self._writer = Writer(
-                stream, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_crcs=True
-            )
-            self._writer.start(
-                profile="ros2", library=f"pc2grid/{__version__} mcap-python/{mcap.__version__}"
-            )
-            self._stack = stack.pop_all()
-        return self
+    @classmethod
+    @contextlib.contextmanager
+    def to(cls, path: Path, *, overwrite: bool = False) -> Iterator[LogWriter]:
+        """Open a file, which gets its name when the `with` block ends without an error.
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if kind is None and self._writer is not None:
-            # An error of `finish`, such as a full disk, must pass through replace_file, which cleans up.
-            with self._stack:
-                self._writer.finish()  # type: ignore[no-untyped-call]
-        else:
-            self._stack.__exit__(kind, error, trace)
-        self._writer = None
+        Raises OutputError if it cannot be written, or exists, unless `overwrite` is set.
+        """
+        refuse_existing(path, overwrite)
+        with replace_file(path) as temporary, temporary.open("wb") as stream:
+            writer = Writer(stream, chunk_size=1 << 20, compression=CompressionType.ZSTD, enable_crcs=True)
+            writer.start(profile="ros2", library=f"pc2grid/{__version__} mcap-python/{mcap.__version__}")
+            yield cls(writer)
+            writer.finish()  # type: ignore[no-untyped-call]
 
     # --- sensors --------------------------------------------------------------------------------------
 
@@ -316,16 +301,11 @@ class LogWriter:
 
     def metadata(self, name: str, values: dict[str, str]) -> None:
         """Write an MCAP metadata record: the configuration, the digest of the input, and the like."""
-        self._open().add_metadata(name, values)
-
-    def _open(self) -> Writer:
-        if self._writer is None:
-            raise RuntimeError("LogWriter is used outside of its with block")
-        return self._writer
+        self._writer.add_metadata(name, values)
 
     def write(self, topic: str, stamp_ns: int, message: Any) -> None:
         """Write a message, such as `pose_with_covariance` makes."""
-        writer = self._open()
+        writer = self._writer
         type_name: str = message.__msgtype__
         if type_name not in self._schemas:
             self._schemas[type_name] = writer.register_schema(
@@ -337,15 +317,14 @@ class LogWriter:
                 topic=topic, message_encoding="cdr", schema_id=self._schemas[type_name]
             )
         channel = self._channels[key]
-        sequence = self._sequence.get(channel, 0)
-        self._sequence[channel] = sequence + 1
         writer.add_message(
             channel_id=channel,
             log_time=int(stamp_ns),
             publish_time=int(stamp_ns),
-            sequence=sequence,
+            sequence=self._sequence[channel],
             data=serialized(message),
         )
+        self._sequence[channel] += 1
 
 
 def _bytes_of(values: NDArray[Any], dtype: str) -> NDArray[np.uint8]:

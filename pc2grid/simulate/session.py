@@ -252,7 +252,7 @@ def simulate_session(
     session = prepare_session(sensor=sensor, grid=grid, config=config)
     count = session.scan_count
     stamps, poses = [], []
-    with LogWriter(out, overwrite=overwrite) as log:
+    with LogWriter.to(out, overwrite=overwrite) as log:
         about = {"sensor": session.sensor.kind, "config": session.config.model_dump_json()}
         log.metadata("pc2grid.simulation", about)
         log.tf_static(EPOCH_NS, BASE_FRAME, session.sensor.frame, session.sensor.T_base_sensor)

@@ -286,7 +286,7 @@ def write_clouds(path: Path, scans: int = 40, points: int = 4000) -> Path:
     rng = np.random.default_rng(7)
     mount = np.eye(4)
     mount[:3, 3] = 0.2, 0.0, 0.5
-    with LogWriter(path) as out:
+    with LogWriter.to(path) as out:
         out.tf_static(T0, "base_link", "lidar", mount)
         for i in range(scans):
             pose = np.eye(4)

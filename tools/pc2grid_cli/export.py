@@ -222,7 +222,7 @@ _GREEN, _GREY, _PURPLE = (0.0, 0.62, 0.45, 1.0), (0.4, 0.4, 0.4, 0.6), (0.8, 0.4
 def _write_mcap(path: Path, database: SubmapDatabase, session: str, given: options.Export) -> None:
     """Write a session's map, path and submaps, and the poses of its robot over time."""
     poses = database.trajectory(session)
-    with LogWriter(path, overwrite=given.force) as writer:
+    with LogWriter.to(path, overwrite=given.force) as writer:
         first_ns = int(poses.stamps_ns[0]) if len(poses) else 0
         _write_map_message(writer, database, session, first_ns, given.map_of or "everything")
         if len(poses):
@@ -240,7 +240,7 @@ def write_answer(
     assert answer.T_map_odom is not None
     assert answer.covariance is not None
     first, last = int(located.stamps_ns[0]), int(located.stamps_ns[-1])
-    with LogWriter(path, overwrite=force) as writer:
+    with LogWriter.to(path, overwrite=force) as writer:
         _write_map_message(writer, database, answer.session, first)
         way = database.trajectory(answer.session)
         if len(way):
@@ -264,7 +264,7 @@ def write_located_map(
     assert answer.session is not None
     assert answer.T_map_odom is not None
     assert answer.covariance is not None
-    with LogWriter(path, overwrite=force) as writer:
+    with LogWriter.to(path, overwrite=force) as writer:
         _write_map_message(writer, database, answer.session, 0)
         writer.write("/query_map", 0, export.occupancy_grid(0, query, "query_map"))
         writer.tf_static(0, "map", "query_map", answer.T_map_odom.lift())

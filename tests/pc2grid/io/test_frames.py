@@ -441,8 +441,7 @@ def test_a_mount_that_is_nowhere_or_turned_nowhere_is_refused_by_name(
 
 def test_a_chain_of_very_many_frames() -> None:
     links = [
-        Transform(Header(T0, f"f{i}"), f"f{i + 1}", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0))
-        for i in range(1_100)
+        Transform(Header(T0, f"f{i}"), f"f{i + 1}", (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0)) for i in range(1_100)
     ]
     tree = FrameTree()
     tree.add_all(tuple(links), static=True)

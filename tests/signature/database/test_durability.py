@@ -346,7 +346,7 @@ def test_disk_full_at_every_page_of_a_write(tmp_path: Path) -> None:
 
 
 def write_cloud_log(path: Path) -> None:
-    with LogWriter(path, overwrite=True) as out:
+    with LogWriter.to(path, overwrite=True) as out:
         out.point_cloud("/points", 10**18, "lidar", np.random.default_rng(1).random((500, 3), np.float32))
 
 

@@ -31,7 +31,7 @@ def test_every_message_survives_the_reference_decoder(tmp_path: Path) -> None:
     trajectory = Trajectory(
         stamps_ns=np.array([STAMP, STAMP + 1]), T_session_base=np.stack((np.eye(4), pose))
     )
-    with LogWriter(path) as out:
+    with LogWriter.to(path) as out:
         out.point_cloud("/points", STAMP, "lidar", points, np.linspace(0, 0.1, 5))
         out.laser_scan("/scan", STAMP, "laser", [1.0, np.inf, 2.5], -0.5, 0.5, 0.1, 30.0, 0.001)
         out.depth_image("/depth", STAMP, "camera", [[1.2345, 0.0], [np.nan, 2.0]])
@@ -91,7 +91,7 @@ def test_markers_are_read_by_another_decoder_too(tmp_path: Path) -> None:
     """rosbags has its own definitions: those of ROS 2 Humble, not ours."""
     path = tmp_path / "out.mcap"
     marker = Marker(name="m", kind="lines", points_m=np.eye(3)[:2], size_m=0.5, color=(1, 0.5, 0, 1))
-    with LogWriter(path) as out:
+    with LogWriter.to(path) as out:
         out.markers("/marks", STAMP, [marker, marker])
     with path.open("rb") as stream:
         ((_, _, message),) = make_reader(stream).iter_messages()
@@ -107,7 +107,7 @@ def test_markers_are_read_by_another_decoder_too(tmp_path: Path) -> None:
 
 def test_the_same_calls_give_the_same_bytes(tmp_path: Path) -> None:
     for name in ("a.mcap", "b.mcap"):
-        with LogWriter(tmp_path / name) as out:
+        with LogWriter.to(tmp_path / name) as out:
             out.point_cloud("/points", STAMP, "lidar", np.ones((10, 3), np.float32))
     assert (tmp_path / "a.mcap").read_bytes() == (tmp_path / "b.mcap").read_bytes()
 
@@ -115,7 +115,7 @@ def test_the_same_calls_give_the_same_bytes(tmp_path: Path) -> None:
 def test_an_existing_file_is_refused_and_kept(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     path.write_bytes(b"precious")
-    with pytest.raises(OutputError, match=r"exists already.*overwrite=True"), LogWriter(path):
+    with pytest.raises(OutputError, match=r"exists already.*overwrite=True"), LogWriter.to(path):
         pass
     assert path.read_bytes() == b"precious"
 
@@ -123,7 +123,7 @@ def test_an_existing_file_is_refused_and_kept(tmp_path: Path) -> None:
 def test_an_exception_leaves_the_old_file_and_no_temporary(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     path.write_bytes(b"precious")
-    with pytest.raises(ZeroDivisionError), LogWriter(path, overwrite=True) as out:
+    with pytest.raises(ZeroDivisionError), LogWriter.to(path, overwrite=True) as out:
         out.tf_static(STAMP, "a", "b", np.eye(4))
         _ = 1 / 0
     assert path.read_bytes() == b"precious"
@@ -131,5 +131,5 @@ def test_an_exception_leaves_the_old_file_and_no_temporary(tmp_path: Path) -> No
 
 
 def test_a_missing_folder_is_an_output_error(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="cannot write"), LogWriter(tmp_path / "no" / "out.mcap"):
+    with pytest.raises(OutputError, match="cannot write"), LogWriter.to(tmp_path / "no" / "out.mcap"):
         pass
