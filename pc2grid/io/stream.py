@@ -187,7 +187,8 @@ class Stream:
                 self._lead = sensor
             leads = sensor == self._lead
             stamp_ns = self._stamp_of(message, log_time_ns)
-            scan = Received(stamp_ns, 0, log_time_ns, len(data), message, sensor)
+            camera = self._decoder_of(sensor).camera
+            scan = Received(stamp_ns, 0, log_time_ns, len(data), message, sensor, camera)
             if leads:
                 self._queue(scan)
             else:
@@ -308,7 +309,7 @@ class Stream:
         stamp_ns, message = waiting.stamp_ns, waiting.message
         T_base_points = self.poses.sensor(message.header.frame, stamp_ns)
         decoder, T_odom_base = self._decoder_of(waiting.sensor), self.poses.odometry(stamp_ns)
-        scan = decoder.scan(message, stamp_ns, T_base_points, T_odom_base)
+        scan = decoder.scan(message, stamp_ns, T_base_points, T_odom_base, waiting.camera)
         if self._plan.mounted is not None:
             scan = self._measured(scan, self._plan.mounted)
         # Infinite before the first reading.
@@ -604,7 +605,7 @@ class Received(NamedTuple):
     """A scan as it was received; those that wait are sorted by stamp, equal ones by their number in the log.
 
     size_bytes : of the message as it was recorded; it takes at most four times that, if it is a text of
-    numbers.
+    numbers. camera : the calibration of an image when it was received: one that focuses changes it.
     """
 
     stamp_ns: int
@@ -613,6 +614,7 @@ class Received(NamedTuple):
     size_bytes: int
     message: ScanMessage
     sensor: _Of
+    camera: CameraInfo | None
 
 
 class FurtherScans:
@@ -659,8 +661,8 @@ class FurtherScans:
         while self._received[0] is not nearest:
             self._received.popleft()
         self._used_ns = own_ns = nearest.stamp_ns
-        message = nearest.message
-        return self.decoder.scan(message, own_ns, pose_of(message.header.frame, own_ns), odometry_at(own_ns))
+        T_base_sensor = pose_of(nearest.message.header.frame, own_ns)
+        return self.decoder.scan(nearest.message, own_ns, T_base_sensor, odometry_at(own_ns), nearest.camera)
 
 
 def together(first: Scan, further: Sequence[Scan]) -> Scan:

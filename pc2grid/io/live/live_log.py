@@ -199,7 +199,7 @@ class Feed:
 
     @property
     def held(self) -> deque[Arrived]:
-        """Return the messages that are held back, those that are published once first.
+        """Return the messages that are held back, in the order of their arrival.
 
         All of topics that may be published only once, of others the last seconds.
         """
@@ -207,13 +207,12 @@ class Feed:
 
     def hold(self, arrived: Arrived) -> None:
         """Hold a message back."""
-        topic = arrived.message.channel
-        if topic.type in topics.CAMERA_INFOS or (topic.type in topics.TF and topics.is_static(topic)):
-            self._once.append(arrived)  # it may be published only once, when the robot starts
-            return
         self._recent.append(arrived)
         while self._recent[0].arrived_s < arrived.arrived_s - 2 * _MOST_S:
-            self._recent.popleft()
+            old = self._recent.popleft()
+            topic = old.message.channel
+            if topic.type in topics.CAMERA_INFOS or (topic.type in topics.TF and topics.is_static(topic)):
+                self._once.append(old)  # it may be published only once, when the robot starts
 
     @property
     def info(self) -> LogInfo:

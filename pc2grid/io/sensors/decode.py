@@ -77,13 +77,21 @@ class ScanDecoder:
     def returns(self, message: ScanMessage) -> int:
         """Return the number of points of a message; 0 if it cannot be used."""
         try:
-            return len(self._points(message).xyz_m)
+            return len(self._points(message, self.camera).xyz_m)
         except (PointCloudError, LimitExceeded, UnsupportedSchema):
             return 0
 
-    def scan(self, message: ScanMessage, stamp_ns: int, T_base_sensor: F64, T_odom_base: F64 | None) -> Scan:
-        """Decode the whole scan. Raises PointCloudError, LimitExceeded or UnsupportedSchema."""
-        found = self._points(message)
+    def scan(
+        self,
+        message: ScanMessage,
+        stamp_ns: int,
+        T_base_sensor: F64,
+        T_odom_base: F64 | None,
+        camera: CameraInfo | None = None,
+    ) -> Scan:
+        """Decode the whole scan. camera : of an image. Raises PointCloudError, LimitExceeded or
+        UnsupportedSchema."""
+        found = self._points(message, camera)
         origin = getattr(message, "origin", None)
         if origin is not None:
             if not valid_pose(origin):
@@ -140,17 +148,17 @@ class ScanDecoder:
             check_metres(ranges[near], hint)
         return None if len(near) == len(xyz) else near
 
-    def _points(self, message: Any) -> Points:
+    def _points(self, message: Any, camera: CameraInfo | None) -> Points:
         limit = self._config.max_points
         if self._sensor == "lidar":
             return decode_cloud(message, unit=self._config.point_time, max_points=limit)
         if self._sensor == "laser":
             return decode_laser(message, max_points=limit, longest_s=self._longest_s)
-        if self.camera is None:
+        if camera is None:
             raise PointCloudError("no CameraInfo was recorded for the depth image")
         return depth.decode(
             message,
-            self.camera,
+            camera,
             rectified=self._rectified,
             stride=self._config.depth_stride,
             max_points=limit,

@@ -327,6 +327,21 @@ def test_a_robot_that_runs_gives_the_same(tmp_path: Path, one_topic: bool) -> No
             np.testing.assert_array_equal(a.points_m, b.points_m)
 
 
+def test_an_image_has_the_calibration_of_its_time_of_a_robot_too(tmp_path: Path) -> None:
+    """Of a camera that focuses, while images wait for odometry and a robot's first seconds are held back."""
+    to, pixels = ros(), np.full((2, 2), 1000, np.uint16)
+    messages = [to.tf(T0, "base_link", "optical", 1.0, topic="/tf_static")]
+    for i in range(6):
+        messages.append(to.camera("/depth/camera_info", T0 + i * STEP, 2, 2, 5.0 + i, frame="optical"))
+        messages.append(to.image("/depth/image", T0 + i * STEP, pixels, "16UC1", frame="optical"))
+    ordered = [m._replace(log_time_ns=m.log_time_ns + k) for k, m in enumerate(messages)]
+    path, config = write_mcap(tmp_path / "a.mcap", ordered), ReadConfig(depth_stride=1)
+    for opened in (open_log(path, config), open_live(str(path), config)):
+        with opened as log:
+            widths = [float(np.ptp(scan.points_m[:, 0])) for scan in log.scans()]
+        assert widths == pytest.approx([1.0 / (5.0 + i) for i in range(6)], abs=1e-3)
+
+
 def dead(scans: int, ranges: Sequence[float], frame: str, begin_ns: int | None = T0) -> list[Message]:
     """A second driver on /scan, ahead of the first one. begin_ns : its first stamp; None: all are zero."""
     stamps = [T0 + i * STEP for i in range(scans)]
