@@ -128,7 +128,8 @@ def padded_grid(grid: OccupancyGrid, margin_m: float) -> OccupancyGrid:
 class WallParameters:
     """How wall points are chosen and weighted.
 
-    spacing_m : one point is kept in each square of this side; chosen by hand, twice the usual cell.
+    spacing_m : one point is kept in each square of this side, the field's standard deviation: points that are
+        nearer to each other tell the same.
     grain_cells : low obstacles are smoothed by a median over squares of so many cells. Chosen by hand.
     plane_m : planes so far above each other show different objects, one for example a table that the other
         passes over. Chosen by hand.
@@ -138,7 +139,7 @@ class WallParameters:
         two windows less are located of a room whose chairs have been moved, and none is wrong.
     """
 
-    spacing_m: float = 0.1
+    spacing_m: float = LIKELIHOOD.sigma_m
     grain_cells: int = 5
     plane_m: float = 0.5
     fixed_m: float = 2.0
