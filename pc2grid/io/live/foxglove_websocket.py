@@ -105,32 +105,26 @@ class _Link:
 
     def _connect(self) -> ClientConnection:
         p = self._parameters
-        problem: Exception | None = None
-        for subprotocol in SUBPROTOCOLS:
-            try:
-                # As with `with`, which websockets 17 demands; `close` is all that leaving it does.
-                return connect(
-                    self._url,
-                    subprotocols=[Subprotocol(subprotocol)],
-                    open_timeout=p.open_s,
-                    close_timeout=1.0,
-                    ping_interval=p.ping_s,
-                    ping_timeout=p.ping_s,
-                    max_size=p.most_message_bytes,
-                    max_queue=4,
-                    compression=None,
-                ).__enter__()
-            except InvalidURI as error:
-                raise LiveError(f"{self._url}: not an address", hint="such as ws://robot:8765") from error
-            except InvalidHandshake as error:  # an older or newer bridge refuses the other subprotocol
-                problem = error
-            except (OSError, TimeoutError) as error:
-                problem = error
-                break
-        hint = "on the robot: ros2 launch foxglove_bridge foxglove_bridge_launch.xml"
-        if isinstance(problem, ssl.SSLCertVerificationError):
-            hint = "SSL_CERT_FILE=ROBOT.pem in the environment names the certificate that is trusted"
-        raise LiveError(f"{self._url}: no connection: {problem}", hint=hint)
+        try:
+            # As with `with`, which websockets 17 demands; `close` is all that leaving it does.
+            return connect(
+                self._url,
+                subprotocols=[Subprotocol(name) for name in SUBPROTOCOLS],
+                open_timeout=p.open_s,
+                close_timeout=1.0,
+                ping_interval=p.ping_s,
+                ping_timeout=p.ping_s,
+                max_size=p.most_message_bytes,
+                max_queue=4,
+                compression=None,
+            ).__enter__()
+        except InvalidURI as error:
+            raise LiveError(f"{self._url}: not an address", hint="such as ws://robot:8765") from error
+        except (InvalidHandshake, OSError, TimeoutError) as error:
+            hint = "on the robot: ros2 launch foxglove_bridge foxglove_bridge_launch.xml"
+            if isinstance(error, ssl.SSLCertVerificationError):
+                hint = "SSL_CERT_FILE=ROBOT.pem in the environment names the certificate that is trusted"
+            raise LiveError(f"{self._url}: no connection: {error}", hint=hint) from error
 
     def _run(self) -> None:
         pause_s = self._parameters.least_pause_s
