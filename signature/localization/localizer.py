@@ -31,7 +31,7 @@ from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.localization.answer import LIKELY, Answer, State, fits_changed
-from signature.localization.hypotheses import HYPOTHESES, moved_to_origin
+from signature.localization.hypotheses import moved_to_origin
 from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
     Belief,
@@ -51,8 +51,8 @@ memory is bounded: some kilometres, and 50 MB or two minutes of 40 scans a secon
 _LOST_SCANS = 20
 """A robot of which so many scans in a row cannot be registered is looked for by the last one; by hand."""
 _STANDING_S = 2.0
-"""A robot that has moved by less than hypotheses differ by is looked for once, after this time since the
-start, or since registration was lost; by hand."""
+"""A robot that has not driven half of a step is looked for once, after this time since the start, or since
+registration was lost; by hand."""
 
 
 class Localizer:
@@ -139,9 +139,10 @@ class Localizer:
             return False
         path_m = self.query.path_m
         waited = registered.scan.stamp_ns - (self.query.first_ns or 0) > _STANDING_S * 1e9
-        stands = waited and not self._stood and path_m < HYPOTHESES.around_m
+        step_m = self.index.config.step_m
+        stands = waited and not self._stood and path_m < 0.5 * step_m
         self._stood = self._stood or waited
-        is_time = stands or path_m - self._last_m >= self.index.config.step_m
+        is_time = stands or path_m - self._last_m >= step_m
         if is_time:
             self._last_m = path_m
         return is_time
