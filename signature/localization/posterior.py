@@ -241,7 +241,7 @@ def elsewhere(alone: Answer, place: Answer) -> float:
     return (1.0 - here) / max(1.0 - alone.mass, np.finfo(float).tiny)
 
 
-def weighed(answer: Answer, off_map: Iterable[Place], slipped: float, accept: float) -> tuple[Answer, float]:
+def weighed(answer: Answer, off_map: Sequence[Place], slipped: float, accept: float) -> tuple[Answer, float]:
     """Return the answer weighed against what else may be: places that the map does not show, and that the
     robot was carried away or tracking slipped; and the mass of this. A place beside the map is one with the
     place where walls put the query more exactly, with the masses of both.
@@ -251,22 +251,32 @@ def weighed(answer: Answer, off_map: Iterable[Place], slipped: float, accept: fl
     slip = slipped * answer.confidence
     nowhere = 1.0 - answer.mass
     share = 1.0 / (1.0 + slip + nowhere * sum(away.mass for away in off_map))
-    places = [replace(place, mass=share * place.mass) for place in answer.places]
-    beside = []
-    for away in sorted(off_map, key=lambda away: -away.mass):
-        away = replace(away, mass=share * nowhere * away.mass)
-        here, at = away.fits[0], answer.T_odom_base
-        for k, place in enumerate(places):
-            if any(more_exact(h, here) and _is_beside(h, away, at) for h in place.fits):
-                places[k] = replace(place, mass=place.mass + away.mass, beside=place.beside or away)
-                break
-        else:
-            beside.append(away)
-    places.sort(key=lambda place: -place.mass)
+    places, beside = _together(
+        [replace(place, mass=share * place.mass) for place in answer.places],
+        [replace(away, mass=share * nowhere * away.mass) for away in off_map],
+        answer.T_odom_base,
+    )
     status: Status = "ambiguous" if answer.located else answer.status
     if sum(place.mass for place in places[:1]) >= accept:
         status = "located"
     return replace(answer, status=status, places=tuple(places), off_map=tuple(beside)), share * slip
+
+
+def _together(
+    places: list[Place], off_map: Iterable[Place], T_odom_base: SE2
+) -> tuple[list[Place], list[Place]]:
+    """Return the places, each with what is beside the map and one with it, and the others beside the map;
+    both likeliest first."""
+    others = []
+    for away in sorted(off_map, key=lambda away: -away.mass):
+        here = away.fits[0]
+        for k, place in enumerate(places):
+            if any(more_exact(h, here) and _is_beside(h, away, T_odom_base) for h in place.fits):
+                places[k] = replace(place, mass=place.mass + away.mass, beside=place.beside or away)
+                break
+        else:
+            others.append(away)
+    return sorted(places, key=lambda place: -place.mass), others
 
 
 # --- Over time ---
