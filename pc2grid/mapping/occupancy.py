@@ -29,6 +29,7 @@ class OccupancyParameters:
     hit, miss, limit : log-odds in hundredths, as int16 adds them. One hit makes a cell occupied by nav2's
         threshold, two misses make it free. A hit weighs two misses, so a thin wall that passing rays graze
         stays; three misses clear a person who has left.
+    body_m : radius of the robot's body around the origin of the base, which is free of obstacles.
     lone_window, lone_cells : a cell that was hit once is noise if at least `lone_cells` cells in the square
         of `lone_window` around it were hit more often.
     """
@@ -36,6 +37,7 @@ class OccupancyParameters:
     hit: int = 150
     miss: int = -75
     limit: int = 500
+    body_m: float = 0.15
     lone_window: int = 3
     lone_cells: int = 3
 
@@ -104,8 +106,10 @@ class GridBuilder:
             np.floor(T_grid_base.apply(points_m) / resolution).astype(np.int64)
             for points_m in (planar_scan.hits_m, planar_scan.low_m)
         )
+        here = np.floor(np.array([T_grid_base.x, T_grid_base.y]) / resolution).astype(np.int64)
+        around = math.ceil(p.body_m / resolution) + 1
         edge = np.floor(outline).astype(np.int64)
-        covered = np.concatenate((edge - 1, edge + 1, hits, things))
+        covered = np.concatenate((edge - 1, edge + 1, here[None] - around, here[None] + around, hits, things))
         low = covered.min(axis=0)
         columns, rows = (covered.max(axis=0) + 1 - low).tolist()
         update = np.zeros((rows, columns), dtype=np.int16)
@@ -117,6 +121,7 @@ class GridBuilder:
         hits, things = hits - low, things - low
         update[things[:, 1], things[:, 0]] = p.miss
         update[hits[:, 1], hits[:, 0]] = p.hit
+        cv2.circle(update, (here - low).tolist(), round(p.body_m / resolution), 2 * p.miss, -1)
         return update, hits, things, low
 
     def _sum(self, evidence: NDArray[np.int16], more: NDArray[np.int16]) -> None:
