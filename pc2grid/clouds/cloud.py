@@ -55,8 +55,6 @@ def random_subset(length: int, count: int) -> NDArray[np.intp]:
 
 AXIS_BITS = 21
 HALF_VOXELS = 1 << (AXIS_BITS - 1)  # voxels on either side of the first point: 52 km with an edge of 5 cm
-_MERGED_POINTS = 1_000_000
-"""Voxels that are collected before each is reduced to one entry; chosen by hand: 40 MB."""
 MAX_VOXELS = 200_000_000
 """Voxels of the largest cloud: 100,000 m2 of floor at 5 cm with what stands on it; 4 GB of memory."""
 
@@ -103,7 +101,7 @@ class VoxelCloud:
         code = (index[:, 0] << 2 * AXIS_BITS) + (index[:, 1] << AXIS_BITS) + index[:, 2]
         within = (points - voxel * self.edge_m).astype(np.float32)
         self._new.append(_reduced(code, within, np.ones(len(code), np.int32)))
-        if sum(len(voxels.code) for voxels in self._new) > max(_MERGED_POINTS, len(self._merged.code) // 2):
+        if sum(len(voxels.code) for voxels in self._new) > len(self._merged.code) // 2:
             self._merge()
 
     def __len__(self) -> int:

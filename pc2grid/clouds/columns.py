@@ -29,37 +29,31 @@ from pc2grid.settings import ProjectionConfig
 class ColumnParameters:
     """Numbers of the columns. Chosen by hand, unless noted.
 
-    layer_m : height of a cell. layers : of the window, most of them below the sensor.
-    below : share of the layers that lie below the sensor.
+    layer_m : height of a cell; a ray ends so far before its point. layers : of the window, half of them below
+        the sensor.
     hit, miss : evidence of a scan for a surface in a cell, and against. limits : of the evidence, so that
         what has gone is forgotten after a few scans.
-    margin_m, margin_sigmas : a ray ends so far before its point, and this many standard deviations of it.
+    margin_sigmas : a ray ends this many standard deviations of its point earlier.
     wall_share, wall_layers : a wall is occupied in so large a share of the observed cells between
         `band_min_m` and `band_max_m`, and in so many at least.
     over : what rays pass over in so many layers is no wall but a thing. Walls reach up as far as they are
         observed: of the columns of a real room, walls have 0 or 1 such layers, chairs and persons 2 to 6.
     gap_m : unknown ground that free ground continues behind.
-    depth_m : thickness of a wall that becomes one line; the noise of the sensor comes on top.
     """
 
     layer_m: float = 0.1
-    layers: int = 48
-    below: float = 0.6
+    layers: int = 56
     hit: int = 2
     miss: int = 1
     limits: tuple[int, int] = (-6, 12)
-    margin_m: float = 0.1
     margin_sigmas: float = 2.0
     wall_share: float = 0.5
     wall_layers: int = 3
     over: int = 2
     gap_m: float = 0.3
-    depth_m: float = 0.1
 
 
 COLUMNS = ColumnParameters()
-_STAMPS = 250
-"""Scans after which the stamps of cells begin again; they are of one byte."""
 UNKNOWN, FREE, LOW, WALL = 0, 1, 2, 3
 """What a column is."""
 
@@ -99,11 +93,11 @@ class ColumnMap:
         p, edge_m = self._parameters, self._config.resolution_m
         self._center(sensor_m)
         self._stamp += 1
-        if self._stamp > _STAMPS:
+        if self._stamp > np.iinfo(self._seen.dtype).max:
             self._stamp = 1
             self._seen[:] = 0
             self._touched[:] = 0
-        cell, margin = (edge_m, p.layer_m), (p.margin_m, p.margin_sigmas * self._noise_per_m2)
+        cell, margin = (edge_m, p.layer_m), (p.layer_m, p.margin_sigmas * self._noise_per_m2)
         observe(
             self._evidence, self._seen, self._touched, self._sums, self._low, points_m, rays_m, sensor_m,
             cell, self._band_m(floor_m), margin, self._stamp, p.hit, p.miss, p.limits,
@@ -138,9 +132,10 @@ class ColumnMap:
                 free_m=np.zeros(BEARINGS, np.float32),
             )
         edge_m = self._config.resolution_m
+        # A wall on the border of two cells is in both.
         free_m, sums, low_m = view(
             self._columns[0], self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m, edge_m, p.gap_m,
-            (p.depth_m, 4.0 * self._noise_per_m2), BEARINGS,
+            (2.0 * edge_m, 4.0 * self._noise_per_m2), BEARINGS,
         )  # fmt: skip
         walls_m = mean_per_cell(sums, edge_m) if len(sums) else low_m[:0]
         hits: F32 = to_base.apply(walls_m).astype(np.float32)
@@ -190,7 +185,7 @@ class ColumnMap:
         p, edge_m = self._parameters, self._config.resolution_m
         size = self._columns.shape[1]
         cell = np.array([edge_m, edge_m, p.layer_m])
-        half = np.array([size // 2, size // 2, round(p.below * p.layers)])
+        half = np.array([size // 2, size // 2, p.layers // 2])
         low = np.floor(sensor_m / cell).astype(np.int64) - half
         if not self._stamp:
             self._low = low

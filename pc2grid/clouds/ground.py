@@ -215,15 +215,9 @@ class LevelParameters:
 
     flat : least information along the vertical of a voxel of a level surface.
     level : a surface is level if the cosine between its normal and the vertical is higher.
-    least_m2 : smallest floor.
-    share : least area of the floor, as a share of the largest level: smaller ones below it are reflections.
-    radius_m : of the search, around the sensor. bin_m : height of a slab. below_m : least distance of the
-    floor below the sensor.
-
-    To follow the floor:
-
-    near_m : largest distance of the floor from its predicted height, beside three standard deviations: a seat
-        lies higher.
+    least_m2 : smallest floor; smaller levels below it are reflections.
+    thick_m : heights within this are of one level. A floor lies farther below the sensor, and a seat higher
+        above the floor, beside three standard deviations of its height.
     seen_m : standard deviation of the height measured in one view.
     drift_per_m : variance that the height of a pose gains on a metre of travel, m2: 2 cm on the first, 10 cm
         on 25 m, where the odometry of a phone drifts by half a percent.
@@ -232,11 +226,7 @@ class LevelParameters:
     flat: float = 0.3
     level: float = 0.97
     least_m2: float = 0.4
-    share: float = 0.15
-    radius_m: float = 5.0
-    bin_m: float = 0.1
-    below_m: float = 0.3
-    near_m: float = 0.2
+    thick_m: float = 0.2
     seen_m: float = 0.03
     drift_per_m: float = 0.02**2
 
@@ -341,22 +331,19 @@ def vertical_held(shapes: F64, up: F64) -> tuple[F64, F64]:
     return information, information @ np.cross(vertical, up)
 
 
-def floor_height(
-    shapes: F64, edge_m: float, sensor_m: F64, parameters: LevelParameters = LEVEL
-) -> float | None:
+def floor_height(shapes: F64, edge_m: float, sensor_m: F64) -> float | None:
     """Return z of the floor below a sensor at (3,), in a map whose z axis is up; None if none is visible.
 
-    The floor is the lowest large level around the sensor: tables lie above it, reflections below are small.
+    The floor is the lowest large level: tables lie above it, reflections below are small.
     """
-    p = parameters
-    heights = shapes[_lying_below(shapes, sensor_m, p), 2]
+    heights = shapes[_lying_below(shapes, sensor_m), 2]
     if not len(heights):
         return None
-    slab = np.floor((heights - heights.min()) / p.bin_m).astype(np.int64)
+    slab = np.floor((heights - heights.min()) / (0.5 * LEVEL.thick_m)).astype(np.int64)
     counts = np.bincount(slab, minlength=2)
     # A floor on the border of two slabs is in both.
     pairs = np.append(counts[:-1] + counts[1:], counts[-1]) * edge_m**2
-    large = np.flatnonzero(pairs > max(p.least_m2, p.share * pairs.max()))
+    large = np.flatnonzero(pairs > LEVEL.least_m2)
     if not len(large):
         return None
     lowest = int(large[0])
@@ -365,13 +352,12 @@ def floor_height(
     return float(np.median(heights[(slab == lowest) | (slab == lowest + 1)]))
 
 
-def _lying_below(shapes: F64, sensor_m: F64, p: LevelParameters) -> BoolGrid:
-    """Select the shapes (V, 9) of level surfaces around and below a sensor at (3,); returns a mask (V,)."""
-    near = (np.abs(shapes[:, :2] - sensor_m[:2]) < p.radius_m).all(axis=1)
+def _lying_below(shapes: F64, sensor_m: F64) -> BoolGrid:
+    """Select the shapes (V, 9) of level surfaces below a sensor at (3,); returns a mask (V,)."""
     # Of a plane, each column of the information points along the normal.
     _, _, xz, _, yz, zz = shapes[:, 3:].T
-    lying = (zz > p.flat) & (zz > p.level * np.sqrt(xz**2 + yz**2 + zz**2))
-    return np.asarray(near & lying & (shapes[:, 2] < sensor_m[2] - p.below_m))
+    lying = (zz > LEVEL.flat) & (zz > LEVEL.level * np.sqrt(xz**2 + yz**2 + zz**2))
+    return np.asarray(lying & (shapes[:, 2] < sensor_m[2] - LEVEL.thick_m))
 
 
 class FloorBelow:
@@ -381,8 +367,7 @@ class FloorBelow:
     risen_m : drift of the height of the poses since then.
     """
 
-    def __init__(self, parameters: LevelParameters = LEVEL) -> None:
-        self._parameters = parameters
+    def __init__(self) -> None:
         self.z_m: float | None = None
         self.sigma_m = self.risen_m = 0.0
 
@@ -392,10 +377,10 @@ class FloorBelow:
 
         view : (V, 9) shapes of this view. surfaces : (W, 9) shapes of all views.
         """
-        p = self._parameters
+        p = LEVEL
         variance = self.sigma_m**2 + p.drift_per_m * travel_m
         self.sigma_m = math.sqrt(variance)
-        near_m = p.near_m + 3.0 * self.sigma_m
+        near_m = p.thick_m + 3.0 * self.sigma_m
         # A view may show a reflection, and all views the floor of another pass; a lower floor is in both.
         if self.z_m is None or self._lower(view, near_m, edge_m, sensor_m) is not None:
             lowest_m = self._lower(surfaces, near_m, edge_m, sensor_m)
@@ -403,7 +388,7 @@ class FloorBelow:
                 self.z_m, self.sigma_m = lowest_m, p.seen_m
         if self.z_m is None:
             return None
-        heights_m = view[_lying_below(view, sensor_m, p), 2]
+        heights_m = view[_lying_below(view, sensor_m), 2]
         heights_m = heights_m[np.abs(heights_m - self.z_m) < near_m]
         if len(heights_m) * edge_m**2 < p.least_m2:
             return None
@@ -420,7 +405,7 @@ class FloorBelow:
         A known floor is replaced only by one that lies far below it: what was taken for the floor may be a
         table.
         """
-        lowest_m = floor_height(surfaces, edge_m, sensor_m, self._parameters)
+        lowest_m = floor_height(surfaces, edge_m, sensor_m)
         if lowest_m is not None and self.z_m is not None and lowest_m > self.z_m - near_m:
             return None
         return lowest_m

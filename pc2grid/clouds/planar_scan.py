@@ -33,8 +33,6 @@ from pc2grid.settings import ProjectionConfig
 
 BEARINGS = 1440
 """Bearings of a planar scan: a quarter of a degree is one grid cell of 5 cm at a range of 12 m."""
-_BEARINGS = 720
-"""Bearings that the returns are sorted by; as many as are fast."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -199,10 +197,10 @@ def heights_seen(
     """
 
     away = points_m[:, :2] - sensor_m[:2]
-    bearing = np.floor(np.arctan2(away[:, 1], away[:, 0]) * (_BEARINGS / (2.0 * math.pi))).astype(np.int16)
-    bearing %= _BEARINGS
+    bearing = np.floor(np.arctan2(away[:, 1], away[:, 0]) * (BEARINGS / (2.0 * math.pi))).astype(np.int16)
+    bearing %= BEARINGS
     order = np.argsort(bearing, kind="stable")  # of numbers this short: by counting
-    starts = np.searchsorted(bearing[order], np.arange(_BEARINGS + 1))
+    starts = np.searchsorted(bearing[order], np.arange(BEARINGS + 1))
     ranges = np.hypot(away[:, 0], away[:, 1])
     return _compiled_heights(
         at_m, points_m, ranges, order, starts, sensor_m, plane, band_m, depths, SLICE_BORDERS_M

@@ -190,9 +190,8 @@ def test_walls_show_the_tilt_of_the_base(tilt_deg: float) -> None:
 
 def test_a_single_wall_does_not_show_it() -> None:
     y, z = np.meshgrid(np.linspace(-2, 2, 60), np.linspace(0, 2, 20))
-    assert (
-        vertical_of(np.column_stack((np.full(y.size, 2.0), y.ravel(), z.ravel())), UP, narrow=False) is None
-    )
+    wall = np.column_stack((np.full(y.size, 2.0), y.ravel(), z.ravel()))
+    assert vertical_of(wall, UP, narrow=False) is None
 
 
 def test_a_camera_sees_the_pitch_by_a_single_wall_ahead() -> None:

@@ -156,7 +156,7 @@ def test_the_compiled_form_is_the_plain_one(monkeypatch: pytest.MonkeyPatch) -> 
     sensor_m, borders = np.array([0.1, 0.2, 0.6]), np.array(SLICE_BORDERS_M)
     expected = heights_seen_plain(at, points, sensor_m, tilted, BAND_M, (0.05, 0.01), borders)
     for bearings in (90, 720):  # how the points are sorted does not matter
-        monkeypatch.setattr(planar_scan, "_BEARINGS", bearings)
+        monkeypatch.setattr(planar_scan, "BEARINGS", bearings)
         found = heights_seen(at, points, sensor_m, tilted, BAND_M, (0.05, 0.01))
         assert np.array_equal(found, expected)
     assert len(np.unique(expected)) > 20
