@@ -17,14 +17,9 @@ from numpy.typing import NDArray
 from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.libraries import compiled
 from pc2grid.model import Submap
-from pc2grid.submaps.junction_graph import sample_evenly, thin
+from pc2grid.submaps.junction_graph import ROUNDING, sample_evenly, thin
 from pc2grid.submaps.submaps import HIDDEN, OPEN, WALL, ray_ends
 from signature.config import SignatureConfig
-
-ROUNDING_BINS = 1e-6
-"""Added to a distance in bins before it is rounded down, so that a distance on the edge of two bins counts in
-the upper one: 0.6 m / 0.2 m is 2.9999999999999996. It exceeds the rounding of float64 and is less than what
-a distance of cells differs from an edge if it does not lie on it."""
 
 RANGE_BINS, PAIR_BINS = 20, 40
 """Bins of what is seen: of distances from the viewpoint, up to the limit of sight, and of distances of two
@@ -69,10 +64,11 @@ def bins_of_squares(cell_bins: float, bins: int) -> NDArray[np.int32]:
     """Return the bin of the distance of two cells by its square in cells: 0, 1, 2, ... up to that of the last
     bin.
 
-    cell_bins : width of a cell in bins.
+    cell_bins : width of a cell in bins. A distance on the edge of two bins counts in the upper one: 0.6 m /
+    0.2 m is 2.9999999999999996.
     """
     squares = np.arange(math.ceil((bins / cell_bins) ** 2) + 1)
-    at = np.minimum(np.sqrt(squares) * cell_bins + ROUNDING_BINS, bins - 1).astype(np.int32)
+    at = np.minimum(np.sqrt(squares) * cell_bins + ROUNDING, bins - 1).astype(np.int32)
     at.flags.writeable = False
     return at
 
@@ -170,7 +166,7 @@ def weighed_pairs(points: F64, walls: F64, opens: F64, counts: F64) -> None:
             for j in range(i + 1, points.shape[1]):
                 x = points[row, i, 0] - points[row, j, 0]
                 y = points[row, i, 1] - points[row, j, 1]
-                at = min(int(math.sqrt(x * x + y * y) + 1e-6), bins - 1)
+                at = min(int(math.sqrt(x * x + y * y) + ROUNDING), bins - 1)
                 for rim in range(walls.shape[1]):
                     counts[row, rim, at] += walls[row, rim, i] * walls[row, rim, j]
         for rim in range(walls.shape[1]):

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import functools
 import math
-from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -18,16 +17,16 @@ from numpy.typing import NDArray
 from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
 from pc2grid.libraries import compiled
 from pc2grid.model import OccupancyGrid, Submap
-from pc2grid.submaps.junction_graph import sample_evenly, skeleton_of
+from pc2grid.submaps.junction_graph import ROUNDING, sample_evenly, skeleton_of
 from pc2grid.submaps.submaps import HIDDEN, ray_ends
-from signature.boundary import ROUNDING_BINS, normalized, shares
+from signature.boundary import RANGE_BINS, normalized, shares
 from signature.config import SignatureConfig
 
 if TYPE_CHECKING:
     import networkx as nx
 
 
-PATH_BINS = 20
+PATH_BINS = RANGE_BINS
 """Bins of lengths of paths in what is seen, up to twice the limit of sight."""
 DETOUR_BINS, LARGEST_DETOUR = 6, 5.0 / 12.0
 """Bins of the share by which a path is longer than the straight line, and the share from which it counts in
@@ -78,34 +77,22 @@ def visibility_graph(
     longer than `config.freespace_join_m` are left out.
     """
     import networkx as nx
+    from scipy.spatial.distance import pdist
 
     graph = nx.Graph()
     graph.add_nodes_from(
         (node, {"center_m": (x, y)}) for node, (x, y) in enumerate(grid.to_point(cells).tolist())
     )
-    first, second, length_m = _edges(grid, cells, config)
-    graph.add_weighted_edges_from(
-        zip(first.tolist(), second.tolist(), length_m.tolist(), strict=True), weight="length_m"
-    )
-    return graph
-
-
-def _edges(
-    grid: OccupancyGrid, cells: I64, config: SignatureConfig
-) -> tuple[NDArray[np.intp], NDArray[np.intp], F64]:
-    """Return the edges of `visibility_graph`: their nodes i < j (E,) and (E,), and their lengths (E,) in
-    metres."""
-    from scipy.spatial.distance import pdist
-
     # Both list the pairs i < j in the same order.
     first, second = np.triu_indices(len(cells), 1)
     length_m = pdist(cells) * grid.resolution_m
     if config.freespace_join_m is not None:
         near = length_m <= config.freespace_join_m
         first, second, length_m = first[near], second[near], length_m[near]
-    occupied = np.ascontiguousarray(grid.occupied)
-    joined = in_sight(occupied, np.ascontiguousarray(cells), first, second)
-    return first[joined], second[joined], length_m[joined]
+    joined = in_sight(np.ascontiguousarray(grid.occupied), np.ascontiguousarray(cells), first, second)
+    edges = zip(first[joined].tolist(), second[joined].tolist(), length_m[joined].tolist(), strict=True)
+    graph.add_weighted_edges_from(edges, weight="length_m")
+    return graph
 
 
 def shortest_paths(graph: nx.Graph) -> F64:
@@ -116,34 +103,12 @@ def shortest_paths(graph: nx.Graph) -> F64:
     Warshall's finds the same lengths; with as many edges as a submap has, it takes half the time (2.3 against
     4.4 ms for 147 nodes and 1,624 edges, both by scipy).
     """
-    from scipy.sparse import csr_array
+    import networkx as nx
     from scipy.sparse.csgraph import floyd_warshall
 
     if not graph:
         return np.empty((0, 0))
-    neighbours = [edges for _, edges in graph.adjacency()]
-    lengths_m = [edge["length_m"] for edges in neighbours for edge in edges.values()]
-    ends = np.fromiter(chain.from_iterable(neighbours), np.int32, len(lengths_m))
-    starts = np.cumsum([0, *map(len, neighbours)], dtype=np.int32)
-    weights = csr_array((np.array(lengths_m, np.float64), ends, starts), shape=(len(graph), len(graph)))
-    return np.asarray(floyd_warshall(weights), np.float64)
-
-
-def freespace_paths(submap: Submap, config: SignatureConfig = SignatureConfig()) -> F64:
-    """Return lengths (N, N) as of `shortest_paths(freespace_graph(submap, config))`, from its edges alone.
-
-    For experiments that describe tens of thousands of submaps: the graph takes a quarter of the time.
-    """
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import floyd_warshall
-
-    cells = freespace_nodes(submap, config)
-    if not len(cells):
-        return np.empty((0, 0))
-    first, second, length_m = _edges(submap.grid, cells, config)
-    starts = np.searchsorted(first, np.arange(len(cells) + 1))
-    weights = csr_array((length_m, second, starts), shape=(len(cells), len(cells)))
-    return np.asarray(floyd_warshall(weights, directed=False), np.float64)
+    return np.asarray(floyd_warshall(nx.to_scipy_sparse_array(graph, weight="length_m")), np.float64)
 
 
 def freespace_bins(radius_m: float, config: SignatureConfig) -> int:
@@ -159,7 +124,7 @@ def freespace_histogram(lengths_m: F64, radius_m: float, config: SignatureConfig
     """
     bins = freespace_bins(radius_m, config)
     pairs = lengths_m[np.triu_indices(len(lengths_m), 1)]
-    length_bins = pairs[np.isfinite(pairs)] / config.freespace_bin_m + ROUNDING_BINS
+    length_bins = pairs[np.isfinite(pairs)] / config.freespace_bin_m + ROUNDING
     return normalized(np.bincount(np.minimum(length_bins.astype(np.int64), bins - 1), minlength=bins))
 
 
@@ -167,14 +132,14 @@ def freespace_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64
     """Return the free space of what is seen from N viewpoints: lengths of paths, detours, openings.
 
     ranges_m, ends : (N, B) of isovists. Returns (N, Kf) square roots of the shares of the path lengths of all
-    pairs of nodes of `seen_graph` (Eq. 3-4), of how much longer than the straight line these are, and of the
-    steps between the ranges of neighbouring rays: at a step, the free space goes on.
+    pairs of nodes of `path_lengths` (Eq. 3-4), of how much longer than the straight line these are, and of
+    the steps between the ranges of neighbouring rays: at a step, the free space goes on.
     """
     lengths_m, straight_m = path_lengths(ranges_m, ends)
     first, second = np.triu_indices(lengths_m.shape[1], 1)
     lengths, straight = lengths_m[:, first, second], straight_m[:, first, second]
     known = lengths < NO_PATH
-    at = np.minimum(lengths / (2.0 * sight_m) * PATH_BINS + ROUNDING_BINS, PATH_BINS - 1).astype(np.int64)
+    at = np.minimum(lengths / (2.0 * sight_m) * PATH_BINS + ROUNDING, PATH_BINS - 1).astype(np.int64)
     paths = shares(at, known, PATH_BINS)
     # From the viewpoint, node 0, every path is straight.
     detour = (lengths - straight) / np.maximum(lengths, 1e-6) * ((DETOUR_BINS - 1) / LARGEST_DETOUR)
@@ -187,31 +152,15 @@ def freespace_seen(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F64
     return np.sqrt(np.concatenate((paths, detours, steps), axis=1))
 
 
-def seen_graph(ranges_m: F32, ends: NDArray[np.int8]) -> nx.Graph:
-    """Return the free-space graph of one isovist (B,): node 0 is the viewpoint, node 1 + k the end of ray k
-    `EVERY`.
-
-    Nodes of rays whose ends are hidden are left out. Edges with `length_m` join nodes whose straight line
-    stays inside of what is seen (III-C 2).
-    """
-    import networkx as nx
-
-    points_m, known, visible = _nodes(ranges_m[None], ends[None])
-    graph = nx.Graph()
-    graph.add_nodes_from(np.flatnonzero(known[0]).tolist())
-    for a, b in np.argwhere(np.triu(visible[0], 1)).tolist():
-        graph.add_edge(a, b, length_m=math.dist(points_m[0, a], points_m[0, b]))
-    return graph
-
-
 def path_lengths(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, F64]:
-    """Return lengths (N, M, M) of the shortest paths and of the straight lines between the nodes of
-    `seen_graph`.
+    """Return lengths (N, M, M) of the shortest paths and of the straight lines between the nodes of isovists
+    (N, B): node 0 is the viewpoint, node 1 + k the end of ray k `EVERY`.
 
-    Of nodes that are left out, the paths are `NO_PATH` long. All isovists together, by Floyd and Warshall's
-    algorithm: 0.1 ms each, where networkx' Dijkstra takes 10.
+    Nodes are joined where their straight line stays inside of what is seen (III-C 2). Those of rays whose
+    ends are hidden are left out: their paths are `NO_PATH` long. All isovists together, by Floyd and
+    Warshall's algorithm: 0.1 ms each, where networkx' Dijkstra takes 10.
     """
-    points_m, _, visible = _nodes(ranges_m, ends)
+    points_m, _, visible = seen_nodes(ranges_m, ends)
     straight_m = np.hypot(*(points_m[:, :, None] - points_m[:, None]).transpose(3, 0, 1, 2))
     lengths_m = np.where(visible, straight_m, NO_PATH)
     for via in range(lengths_m.shape[1]):
@@ -219,9 +168,9 @@ def path_lengths(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, F64]:
     return np.minimum(lengths_m, NO_PATH), straight_m
 
 
-def _nodes(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return points (N, M, 2) of the nodes of `seen_graph`, which are known (N, M), and which pairs see each
-    other (N, M, M)."""
+def seen_nodes(ranges_m: F32, ends: NDArray[np.int8]) -> tuple[F64, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return points (N, M, 2) of the nodes of `path_lengths`, which are known (N, M), and which pairs
+    see each other (N, M, M)."""
     count, bearings = ranges_m.shape
     angles = 2.0 * math.pi * np.arange(bearings) / bearings
     at = np.arange(0, bearings, EVERY)

@@ -50,15 +50,10 @@ def describe(submap: Submap, config: SignatureConfig = SignatureConfig()) -> Sig
     >>> round(float(signature.boundary.sum()), 5)
     1.0
     """
-    return described(submap, shortest_paths(freespace_graph(submap, config)), config)
-
-
-def described(submap: Submap, paths_m: F64, config: SignatureConfig) -> Signature:
-    """Return the three signatures of a submap, given the lengths L^F (N, N) of the paths in its free
-    space."""
     radius_m, resolution_m = submap.radius_m, submap.grid.resolution_m
     edges = boundary_edges(submap, config)
     points = boundary_points(edges, resolution_m, config)
+    paths_m = shortest_paths(freespace_graph(submap, config))
     return Signature(
         boundary=boundary_histogram(points, radius_m, resolution_m, config),
         freespace=freespace_histogram(paths_m, radius_m, config),
@@ -71,11 +66,11 @@ I32 = NDArray[np.int32]
 FARTHEST = 20.0
 """Cap of -ln BC, chosen by hand: BC is below 2e-9 only if no bin is shared."""
 
-_BC_ROUNDING = 1e-7
+_BC_ROUNDING = np.finfo(np.float32).eps
 """Float32 histograms have rounding errors of this size; 1 - BC of equal ones is not more."""
 
-_LARGEST_EXPONENT = 300.0
-"""In Eq. 8, so that exp stays finite in float64 (limit 709) and so does the product of two factors."""
+_LARGEST_EXPONENT = 0.5 * np.log(np.finfo(np.float64).max)
+"""In Eq. 8, so that exp stays finite in float64 and so does the product of two factors."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

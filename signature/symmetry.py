@@ -14,14 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.submaps.junction_graph import ROUNDING
 from pc2grid.submaps.submaps import HIDDEN
 from signature.config import SignatureConfig
 
 _DIRECTIONS = 180
 """Bins of the vote on directions, one a degree."""
-
-_LEAST_VOTE = 1e-6
-"""A direction needs more than this share of alpha's vote to become beta: the blur's rounding is less."""
 
 MIRROR_M = 0.5
 """Two ranges that differ by this do not agree at all."""
@@ -83,7 +81,7 @@ def symmetry_axes(segments: F64, config: SignatureConfig) -> Axes | None:
     apart = np.abs((np.arange(_DIRECTIONS) - alpha + 90) % _DIRECTIONS - 90)
     others = np.where(apart >= config.axis_separation_deg, votes, 0.0)
     beta = int(np.argmax(others))
-    if others[beta] <= _LEAST_VOTE * votes[alpha]:
+    if others[beta] <= ROUNDING * votes[alpha]:  # which the blur leaves where no segment is
         beta = (alpha + 90) % _DIRECTIONS
     if plain:
         return Axes(math.radians(alpha), math.radians(beta))

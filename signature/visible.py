@@ -80,8 +80,8 @@ LATTICE_M = 0.4
 0.8 m a tenth fewer queries find their place after 1 m."""
 AROUND_M = 1.2
 """A viewpoint farther than this from every place is left out: places are 1 m apart by default."""
-CLEARANCE_M = 0.2
-"""A viewpoint is at least so far from walls and unknown cells."""
+CLEARANCE_M = 0.5 * LATTICE_M
+"""A viewpoint is at least so far from walls and unknown cells: what is nearest to it is free."""
 SIGNATURE_UNITS = np.iinfo(np.uint8).max
 """Units of a column of a signature up to 1."""
 SIGNATURE_COLUMNS = 1 + max(part.stop for part in parts().values())

@@ -362,8 +362,9 @@ def thin_in_place(flat: NDArray[np.uint8], steps: I64, border: I64, deletable: N
 # --- even sampling of points (III-B 3, III-C 1) -------------------------------------------------------
 
 Number = TypeVar("Number", np.int64, np.float64)
-_TOLERANCE = 1e-9
-"""Relative: points exactly one spacing apart are both kept, whatever the rounding of their distance."""
+ROUNDING = 1e-6
+"""By so much, as a share, a distance may be wrong by rounding: points exactly one spacing apart are both
+kept. It exceeds the rounding of float64 and is less than what unequal distances of cells differ by."""
 _CROWDED = 20.0
 """Points within the spacing of a point, from which on a search around each kept point is faster than all
 pairs at once (measured on boundaries and skeletons of the maps of Table I)."""
@@ -382,7 +383,7 @@ def sample_evenly(points: NDArray[Number], spacing: float) -> NDArray[Number]:
 
     # An unbalanced tree gives the same neighbours; balancing it takes longer than it saves here.
     tree = cKDTree(points, balanced_tree=False, compact_nodes=False)
-    reach = spacing * (1.0 - _TOLERANCE)
+    reach = spacing * (1.0 - ROUNDING)
     kept = [True] * len(points)
     some = points[:: 1 + len(points) // 32]
     if len(points) and tree.query_ball_point(some, reach, return_length=True).mean() > _CROWDED:

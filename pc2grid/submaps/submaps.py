@@ -132,38 +132,21 @@ class Isovist:
     ranges_m: F32
     ends: NDArray[np.int8]
 
-    @property
-    def observed(self) -> float:
-        """Return the share of the rays, 0..1, whose end is known (not HIDDEN)."""
-        return float(np.mean(self.ends != HIDDEN))
-
 
 def isovist(
-    grid: OccupancyGrid,
-    center_m: tuple[float, float],
-    sight_m: float,
-    *,
-    bearings: int = BEARINGS,
-    patience_m: float = PATIENCE_M,
+    grid: OccupancyGrid, center_m: tuple[float, float], sight_m: float, *, bearings: int = BEARINGS
 ) -> Isovist:
     """Cast `bearings` rays from a point of the map frame.
 
-    A ray ends at the first occupied cell, at `sight_m`, or after more than `patience_m` of unknown cells
+    A ray ends at the first occupied cell, at `sight_m`, or after more than `PATIENCE_M` of unknown cells
     (single unobserved cells between beams do not hide what lies behind them).
     """
-    ranges_m, ends = look_around(
-        grid, np.array([center_m]), sight_m, bearings=bearings, patience_m=patience_m
-    )
+    ranges_m, ends = look_around(grid, np.array([center_m]), sight_m, bearings=bearings)
     return Isovist(center_m=center_m, sight_m=sight_m, ranges_m=ranges_m[0], ends=ends[0])
 
 
 def look_around(
-    grid: OccupancyGrid,
-    centers_m: F64,
-    sight_m: float,
-    *,
-    bearings: int = BEARINGS,
-    patience_m: float = PATIENCE_M,
+    grid: OccupancyGrid, centers_m: F64, sight_m: float, *, bearings: int = BEARINGS
 ) -> tuple[F32, NDArray[np.int8]]:
     """Return ranges (N, B) in metres and ends (N, B) of the isovists of many points (N, 2); see `isovist`."""
     columns, rows = ((centers_m - np.asarray(grid.origin_m)) / grid.resolution_m).T
@@ -173,7 +156,7 @@ def look_around(
         np.ascontiguousarray(columns, np.float64),
         sight_m / grid.resolution_m,
         bearings,
-        int(patience_m / grid.resolution_m / _STEP_CELLS),
+        int(PATIENCE_M / grid.resolution_m / _STEP_CELLS),
     )
     return ranges * np.float32(grid.resolution_m), ends
 
@@ -188,12 +171,10 @@ def ray_ends(ranges_m: F32) -> F64:
 def polygon_mask(view: Isovist, grid: OccupancyGrid, *, margin_m: float = 0.0) -> NDArray[np.bool_]:
     """Return a mask (H, W) of the cells of `grid` inside the isovist's polygon; each ray is longer by
     `margin_m`."""
-    angles = 2 * np.pi * np.arange(len(view.ranges_m)) / len(view.ranges_m)
-    reach = np.minimum(view.ranges_m + margin_m, view.sight_m + margin_m)
-    x = (view.center_m[0] + reach * np.cos(angles) - grid.origin_m[0]) / grid.resolution_m
-    y = (view.center_m[1] + reach * np.sin(angles) - grid.origin_m[1]) / grid.resolution_m
+    reach_m = np.minimum(view.ranges_m, view.sight_m) + margin_m
+    corners = (view.center_m + ray_ends(reach_m[None])[0] - grid.origin_m) / grid.resolution_m
     mask = np.zeros(grid.cells.shape, dtype=np.uint8)
-    cv2.fillPoly(mask, [polygon_corners(np.column_stack((x, y)))], 1, shift=SUBPIXEL_BITS)
+    cv2.fillPoly(mask, [polygon_corners(corners)], 1, shift=SUBPIXEL_BITS)
     return mask.astype(bool)
 
 
@@ -206,10 +187,7 @@ def visible_submap(grid: OccupancyGrid, view: Isovist, submap_id: int) -> Submap
     crop = grid.crop(view.center_m, view.sight_m)
     inside = polygon_mask(view, crop, margin_m=WALL_MARGIN_M)
     cells = np.where(inside, crop.cells, np.int8(UNKNOWN)).astype(np.int8)
-    hit = view.ends == WALL
-    angles = 2 * np.pi * np.flatnonzero(hit) / len(view.ranges_m)
-    ends_m = view.ranges_m[hit, None] * np.column_stack((np.cos(angles), np.sin(angles))) + view.center_m
-    at = crop.to_cell(ends_m.astype(np.float64))
+    at = crop.to_cell(view.center_m + ray_ends(view.ranges_m[None])[0, view.ends == WALL])
     ok = ((at >= 0) & (at < np.array(cells.shape))).all(axis=1)
     cells[at[ok, 0], at[ok, 1]] = OCCUPIED
     return Submap(

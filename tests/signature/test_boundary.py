@@ -12,9 +12,8 @@ from scipy.spatial.distance import pdist
 
 from pc2grid.geometry import cells_of
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN
-from pc2grid.submaps.junction_graph import sample_evenly, thin
+from pc2grid.submaps.junction_graph import ROUNDING, sample_evenly, thin
 from signature.boundary import (
-    ROUNDING_BINS,
     boundary_bins,
     boundary_edges,
     boundary_histogram,
@@ -27,7 +26,6 @@ from signature.freespace import (
     freespace_graph,
     freespace_histogram,
     freespace_nodes,
-    freespace_paths,
     shortest_paths,
     visibility_graph,
 )
@@ -88,7 +86,7 @@ def test_the_compiled_counts_of_cells_are_those_of_their_distances(
     config = SignatureConfig(boundary_bin_m=bin_m)
     points = np.random.default_rng(seed).integers(0, 400, (count, 2))
     bins = boundary_bins(8.0, config)
-    at = (pdist(points * (cell_m / bin_m)) + ROUNDING_BINS).astype(np.int64)
+    at = (pdist(points * (cell_m / bin_m)) + ROUNDING).astype(np.int64)
     plain = np.bincount(np.minimum(at, bins - 1), minlength=bins)
     assert np.array_equal(boundary_histogram(points, 8.0, cell_m, config), normalized(plain))
 
@@ -132,20 +130,11 @@ def test_path_lengths_are_those_of_networkx_dijkstra(seed: int) -> None:
     np.testing.assert_allclose(shortest_paths(graph), np.reshape(expected, (len(graph),) * 2), rtol=1e-5)
 
 
-@given(seed=st.integers(0, 500), join_m=st.sampled_from([None, 1.5]))
-@settings(max_examples=12, deadline=None)
-def test_paths_without_a_graph_are_those_of_the_graph(seed: int, join_m: float | None) -> None:
-    submap, config = submap_of(random_rooms(seed)), SignatureConfig(freespace_join_m=join_m)
-    lengths = shortest_paths(freespace_graph(submap, config))
-    assert len(lengths) > 2 and np.array_equal(freespace_paths(submap, config), lengths)
-
-
 @pytest.mark.parametrize("size_m", [0.0, 0.8])
 def test_no_node_and_one_node_have_no_path(size_m: float) -> None:
     submap = submap_of(rectangle(size_m, size_m) if size_m else np.full((321, 321), UNKNOWN, np.int8))
-    lengths = freespace_paths(submap, CONFIG)
+    lengths = shortest_paths(freespace_graph(submap, CONFIG))
     assert lengths.shape == (int(size_m > 0),) * 2 and not lengths.any()
-    assert np.array_equal(lengths, shortest_paths(freespace_graph(submap, CONFIG)))
 
 
 def test_the_letter_erodes_no_free_space_and_has_two_thinnings() -> None:

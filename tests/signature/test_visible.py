@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pc2grid.geometry import F32
 from pc2grid.submaps.submaps import HIDDEN, OPEN, WALL, look_around
 from signature.boundary import PAIR_BINS, RANGE_BINS, RIMS, boundary_seen, rim_columns, within
-from signature.freespace import DETOUR_BINS, PATH_BINS, path_lengths, seen_graph
+from signature.freespace import DETOUR_BINS, PATH_BINS, path_lengths, seen_nodes
 from signature.visible import (
     AROUND_M,
     LATTICE_M,
@@ -95,6 +95,16 @@ def test_what_is_hidden_beyond_a_rim_does_not_change_the_pairs_within_it() -> No
     # Pairs of walls that are nearer than the rim's beginning count in full, those beyond its end not at all.
     assert within(np.array([0.0, RIMS[-1][0], RIMS[-1][1], 1.0]), *RIMS[-1]).tolist() == [1.0, 1.0, 0.0, 0.0]
     assert within(np.array([0.5, 1.0]), *RIMS[0]).tolist() == [1.0, 1.0]
+
+
+def seen_graph(ranges_m: F32, ends: NDArray[np.int8]) -> nx.Graph:
+    """The graph of one isovist (B,)."""
+    points_m, known, visible = seen_nodes(ranges_m[None], ends[None])
+    graph = nx.Graph()
+    graph.add_nodes_from(np.flatnonzero(known[0]).tolist())
+    for a, b in np.argwhere(np.triu(visible[0], 1)).tolist():
+        graph.add_edge(a, b, length_m=math.dist(points_m[0, a], points_m[0, b]))
+    return graph
 
 
 def test_path_lengths_are_those_of_the_free_space_graph() -> None:

@@ -10,7 +10,7 @@ from pc2grid.model import Submap
 from pc2grid_lab.paper.experiment import Matcher, rotated_submap
 from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods, submap_vector
 from pc2grid_lab.paper.rivals import DistanceFeatures, context
-from signature.freespace import freespace_paths
+from signature.freespace import shortest_paths
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 
 ALL = METHOD_NAMES + EXTRA_METHOD_NAMES
@@ -88,8 +88,7 @@ def test_methods_that_differ_in_comparing_share_the_description_of_a_query(
     matchers = [method(submaps) for method in make_methods(names).values()]
     described = []
     monkeypatch.setattr(
-        "pc2grid_lab.paper.methods.freespace_paths",
-        lambda *of: described.append(of) or freespace_paths(*of),
+        "signature.paper.shortest_paths", lambda *of: described.append(of) or shortest_paths(*of)
     )
     found = [matcher(query) for matcher in matchers]
     assert len(described) == 2

@@ -32,14 +32,8 @@ from pc2grid_lab.paper.rivals import (
 )
 from signature.boundary import boundary_edges, boundary_points, weighed_pairs
 from signature.config import SignatureConfig
-from signature.freespace import freespace_paths
-from signature.paper import Signature, SignatureTable, described, distances, similarity
+from signature.paper import Signature, SignatureTable, describe as signature_of, distances, similarity
 from signature.weights import shrunk
-
-
-def signature_of(submap: Submap, config: SignatureConfig) -> Signature:
-    """Return the signature that `signature.paper` gives, without a graph that would only be unpacked."""
-    return described(submap, freespace_paths(submap, config), config)
 
 
 def proposed(
