@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.clouds.cloud import VoxelCloud, random_subset
-from pc2grid.clouds.ground import CLOUD_PARAMETERS, Ground, find_ground
+from pc2grid.clouds.ground import CLOUD_PARAMETERS, LEVEL, Ground, find_ground
 from pc2grid.clouds.planar_scan import project_to_plane
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import (
@@ -206,12 +206,10 @@ class CloudMapParameters:
         gives the same grid as a thin one.
     floor_m : points this near to the floor plane are floor. A floor is uneven by some centimetres over a
         whole storey.
-    refine_m, refine_points : RANSAC tolerance when the plane is fitted to the points near the floor, and of
-        how many of them.
+    refine_m : RANSAC tolerance when the plane is fitted to the points near the floor.
     passage_m : lowest and highest height above the floor at which an obstacle blocks a robot.
     obstacle_voxels : a cell is occupied if at least this many voxels above it are; one alone may be noise.
     gap_m : gaps of the seen floor, and holes of walls, up to this wide are closed.
-    margin_m : width of the unknown border around the cloud.
     max_cells : larger grids are refused, since a few stray points would make them.
 
     Viewpoints:
@@ -231,11 +229,9 @@ class CloudMapParameters:
     resolution_m: float = PROJECTION.resolution_m
     floor_m: float = 0.15
     refine_m: float = resolution_m
-    refine_points: int = 20_000
     passage_m: tuple[float, float] = (0.2, 1.6)
     obstacle_voxels: int = 2
     gap_m: float = 0.2
-    margin_m: float = 0.5
     max_cells: int = MAX_CELLS
 
     spacing_m: float = 1.0
@@ -472,25 +468,24 @@ def drivable_plan(
         raise MapFileError("the cloud has no points near its floor")
     low = voxels[:, :2].min(axis=0)
     columns, rows = (int(v) for v in voxels[:, :2].max(axis=0) - low + 1)
-    margin = round(p.margin_m / p.resolution_m)
-    shape = (rows + 2 * margin, columns + 2 * margin)
-    if shape[0] * shape[1] > p.max_cells:
+    if rows * columns > p.max_cells:
         raise MapFileError(
             f"the cloud is {columns * p.resolution_m:.0f} x {rows * p.resolution_m:.0f} m large",
             hint="remove stray points from it",
         )
-    cell = (voxels[:, 1] - low[1] + margin) * shape[1] + voxels[:, 0] - low[0] + margin
+    shape = (rows, columns)
+    cell = (voxels[:, 1] - low[1]) * columns + voxels[:, 0] - low[0]
     height_m = (voxels[:, 2] + 0.5) * p.resolution_m
 
     def counts(chosen: NDArray[np.bool_]) -> I64:
-        return np.bincount(cell[chosen], minlength=shape[0] * shape[1]).reshape(shape)
+        return np.bincount(cell[chosen], minlength=rows * columns).reshape(shape)
 
     floor = _without_gaps(counts(np.abs(height_m) < p.floor_m) > 0, p.gap_m / p.resolution_m)
     obstacles = counts((height_m > p.passage_m[0]) & (height_m < p.passage_m[1]))
     cells = np.full(shape, UNKNOWN, np.int8)
     cells[floor > 0] = FREE
     cells[obstacles >= p.obstacle_voxels] = OCCUPIED
-    corner = (low - margin) * p.resolution_m
+    corner = low * p.resolution_m
     return OccupancyGrid(
         cells=cells, resolution_m=p.resolution_m, origin_m=(float(corner[0]), float(corner[1]))
     )
@@ -527,7 +522,7 @@ def check_plausible(points_m: NDArray[np.floating], parameters: CloudMapParamete
 _LEAST_UP = 0.99 / math.sqrt(3.0)
 """Of a floor's normal along the axis that points up. The farthest direction from all axes has 1 / sqrt(3)."""
 _TILTED = dataclasses.replace(CLOUD_PARAMETERS, max_tilt_rad=math.acos(_LEAST_UP))
-_NEARLY_DEG = 10.0
+_NEARLY_DEG = math.degrees(math.acos(LEVEL.level))
 """A plane that is tilted by less is level, and one that is nearer to upright may be a wall."""
 
 
@@ -643,7 +638,7 @@ def _refined(points: F64, ground: Ground, p: CloudMapParameters) -> Ground:
     from pc2grid.open3d_core import o3d
 
     near = points[np.abs(ground.heights(points)) < p.floor_m]
-    near = near[random_subset(len(near), p.refine_points)]
+    near = near[random_subset(len(near), CLOUD_PARAMETERS.sample)]
     o3d.utility.random.seed(0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
     model, _ = cloud.segment_plane(p.refine_m, 3, 1000, probability=1.0)
@@ -655,16 +650,14 @@ def _refined(points: F64, ground: Ground, p: CloudMapParameters) -> Ground:
 
 # --- is the right side up, and the right floor mapped? ------------------------------------------------
 
-_CELL_M = 0.2
+_CELL_M = CLOUD_MAP.gap_m
 """Edge of the cells and voxels in which a building is judged: a door is four of them wide."""
 _SLICE_M = CLOUD_MAP.resolution_m  # of heights, in which level surfaces are searched for
 _NEAR_M = CLOUD_MAP.floor_m  # points this near to a surface belong to it
 _BAND_M = 0.5  # what stands within this from a floor separates its rooms
-_LEAST_HEIGHT_M = 1.9  # of a ceiling, or of another floor, above the floor
-_PASSAGE_M = CLOUD_MAP.passage_m[1]  # free height above a floor on which nothing stands
+_PASSAGE_M = CLOUD_MAP.passage_m[1]  # free height above a floor on which nothing stands, below all others
 _AROUND_SLICES = round(_BAND_M / _SLICE_M)  # a level surface has more points than the heights around it
-_CEILING_SHARE = 0.4  # of the points of the floor, at least, that a ceiling has
-_FLOOR_SHARE = 0.25  # the same of another floor
+_SURFACE_SHARE = 0.25  # of the points of the floor, at least, that a ceiling or another floor has
 _OVERHEAD_SHARE = 0.02  # of the cells of a floor, at least, that have walls or a ceiling above head height
 _CERTAIN = 0.2
 """Evidence above which a cloud is taken to be upside down. Chosen by hand; tried on 20 made clouds and a real
@@ -723,7 +716,7 @@ def other_floors(level_points_m: NDArray[np.floating]) -> list[OtherFloor]:
     around."""
     points = np.asarray(level_points_m, np.float64)
     found = []
-    for height_m in _surfaces(points, _FLOOR_SHARE):
+    for height_m in _surfaces(points):
         heights, cells = points[:, 2] - height_m, _cells(points)
         on_it = np.abs(heights) < 0.5 * _NEAR_M
         seen = _mask(cells, on_it)
@@ -735,23 +728,22 @@ def other_floors(level_points_m: NDArray[np.floating]) -> list[OtherFloor]:
     return found
 
 
-def _surfaces(points: F64, least_share: float) -> list[float]:
-    """Return the heights of the level surfaces above the floor with at least a share of its points, from
-    below."""
-    edges = np.arange(-_NEAR_M, max(points[:, 2].max(), _LEAST_HEIGHT_M) + 1.0, _SLICE_M)
+def _surfaces(points: F64) -> list[float]:
+    """Return the heights of the large level surfaces above the floor, from below."""
+    edges = np.arange(-_NEAR_M, max(points[:, 2].max(), _PASSAGE_M) + 1.0, _SLICE_M)
     counts, _ = np.histogram(points[:, 2], edges)
     around = np.lib.stride_tricks.sliding_window_view(np.pad(counts, _AROUND_SLICES), 2 * _AROUND_SLICES + 1)
     level = np.convolve(counts, np.ones(3), "same") - 3.0 * np.median(around, axis=1)
     middle_m = edges[:-1] + 0.5 * _SLICE_M
     floor = level[np.abs(middle_m) < _NEAR_M].max()
     highest = np.lib.stride_tricks.sliding_window_view(np.pad(level, 2), 5).max(axis=1)
-    chosen = (middle_m > _LEAST_HEIGHT_M) & (level == highest) & (level > max(least_share * floor, 0.0))
+    chosen = (middle_m > _PASSAGE_M) & (level == highest) & (level > max(_SURFACE_SHARE * floor, 0.0))
     return [float(height_m) for height_m in middle_m[chosen]]
 
 
 def _ceiling_m(points: F64) -> float | None:
     """Return the height of the ceiling of the storey at z = 0; None if there is none."""
-    ceilings = [height_m for height_m in _surfaces(points, _CEILING_SHARE) if height_m < CLOUD_MAP.ceiling_m]
+    ceilings = [height_m for height_m in _surfaces(points) if height_m < CLOUD_MAP.ceiling_m]
     return ceilings[0] if ceilings else None
 
 

@@ -31,7 +31,7 @@ from pc2grid.io.building_file import (
     sampled,
 )
 from pc2grid.io.maps import is_map_file, load_map
-from pc2grid.mapping.drawn import check_plausible, drivable_plan, level_cloud, voxel_cloud
+from pc2grid.mapping.drawn import CLOUD_MAP, check_plausible, drivable_plan, level_cloud, voxel_cloud
 from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.settings import ReadConfig
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
@@ -145,9 +145,7 @@ class Scene:
 
 # --- buildings ----------------------------------------------------------------------------------------
 
-_VOXEL_M = 0.05  # smallest voxel of a cloud that rays hit
-
-
+_VOXEL_M = CLOUD_MAP.resolution_m  # smallest voxel of a cloud that rays hit
 # A voxel is at least this many median distances between neighbours wide, so that walls have few holes: if n
 # random points lie on a square metre, this distance is 0.47 / sqrt(n) and 3 % of such voxels stay empty.
 _SPACINGS = 4.0
