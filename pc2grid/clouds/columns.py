@@ -124,13 +124,6 @@ class ColumnMap:
         p, pose = self._parameters, T_session_base
         to_base = pose.inverse()
         origin = to_base.apply(sensor_m[None, :2])[0]
-        if not self._stamp:
-            return PlanarScan.of_hits(
-                stamp_ns=stamp_ns,
-                hits_m=np.empty((0, 2), np.float32),
-                origin_m=origin,
-                free_m=np.zeros(BEARINGS, np.float32),
-            )
         edge_m = self._config.resolution_m
         # A wall on the border of two cells is in both.
         free_m, sums, low_m = view(
@@ -155,8 +148,6 @@ class ColumnMap:
         It is the share of points on surfaces minus the share in free space: among the points in observed
         cells, and among all points in the window.
         """
-        if not self._stamp:
-            return 0.0, 0.0
         cell = self._config.resolution_m, self._parameters.layer_m
         met, against, inside = agreement_counts(self._evidence, self._low, points_m, cell)
         return (met - against) / max(met + against, 1), (met - against) / max(inside, 1)

@@ -25,7 +25,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.clouds.ground import CLOUD_PARAMETERS, CloudParameters, Ground
+from pc2grid.clouds.ground import CLOUD_PARAMETERS, Ground
 from pc2grid.geometry import F32, F64, U8, BoolGrid
 from pc2grid.libraries import compiled
 from pc2grid.model import SENSOR_MODELS, SLICE_BORDERS_M, SLICES, SensorKind
@@ -65,17 +65,6 @@ class PlanarScan:
     above_floor_m: float | None = None
     heights: U8 = field(default_factory=lambda: np.empty(0, np.uint8))
 
-    @staticmethod
-    def of_hits(*, stamp_ns: int, hits_m: F32, origin_m: F64, free_m: F32) -> PlanarScan:
-        """Return a planar scan whose normals are estimated from its hits."""
-        return PlanarScan(
-            stamp_ns=stamp_ns,
-            hits_m=hits_m,
-            normal_rad=planar_normals(hits_m, origin_m),
-            origin_m=origin_m,
-            free_m=free_m,
-        )
-
     def only(self, kept: BoolGrid) -> PlanarScan:
         """Return the scan with the hits (M,) that are `kept`."""
         things = np.ones(len(self.low_m), np.bool_)
@@ -110,7 +99,6 @@ def project_to_plane(
     ground: Ground | None,
     config: ProjectionConfig,
     sensor: SensorKind = "lidar",
-    parameters: CloudParameters = CLOUD_PARAMETERS,
 ) -> PlanarScan:
     """Reduce the points of a scan to the plane.
 
@@ -135,7 +123,7 @@ def project_to_plane(
     # Two standard deviations of the noise on either side of the mean.
     depths = (cell_m, 4.0 * model.noise_per_m2)
     free, surfaces = scan_bearings(
-        points, origin, plane, band, config.max_range_m, depths, BEARINGS, parameters.max_gap_bins
+        points, origin, plane, band, config.max_range_m, depths, BEARINGS, CLOUD_PARAMETERS.max_gap_bins
     )
     hits = mean_per_cell(surfaces, cell_m)
     seen_at = np.empty(0, np.uint8)
@@ -144,7 +132,7 @@ def project_to_plane(
     return PlanarScan(
         stamp_ns=stamp_ns,
         hits_m=hits,
-        normal_rad=planar_normals(hits, origin[:2], parameters),
+        normal_rad=planar_normals(hits, origin[:2]),
         origin_m=origin[:2].copy(),
         free_m=np.minimum(free, config.max_range_m).astype(np.float32),
         height_m=float(origin[2]) if ground is None else None,
@@ -164,7 +152,7 @@ def mean_per_cell(sums: F64, cell_m: float) -> F32:
     return means
 
 
-def planar_normals(hits_m: F32, origin_m: F64, parameters: CloudParameters = CLOUD_PARAMETERS) -> F32:
+def planar_normals(hits_m: F32, origin_m: F64) -> F32:
     """Return the direction (M,) in radians of the surface normal at hits (M, 2), on the sensor's side.
 
     origin_m : (2,) position of the sensor. The normal is the minor axis of the hits within a distance of
@@ -172,7 +160,7 @@ def planar_normals(hits_m: F32, origin_m: F64, parameters: CloudParameters = CLO
     direction to the sensor.
     """
 
-    p = parameters
+    p = CLOUD_PARAMETERS
     away = hits_m.astype(np.float64) - origin_m
     bearings = np.arctan2(away[:, 1], away[:, 0])
     order = np.argsort(bearings, kind="stable")
@@ -214,15 +202,14 @@ class DepthLimit:
     the mean of its thousands of pixels. So a hit, which is a mean, is not removed.
     """
 
-    def __init__(self, parameters: CloudParameters = CLOUD_PARAMETERS) -> None:
-        self._parameters = parameters
+    def __init__(self) -> None:
         self._farthest_m = 0.0
 
     @property
     def unbiased_m(self) -> float:
         """Return the depth up to which the limit cuts off less than one pixel in forty."""
         noise_per_m2 = SENSOR_MODELS["depth"].noise_per_m2
-        return self._farthest_m - self._parameters.limit_sigmas * noise_per_m2 * self._farthest_m**2
+        return self._farthest_m - CLOUD_PARAMETERS.limit_sigmas * noise_per_m2 * self._farthest_m**2
 
     def observe(self, points_m: NDArray[np.floating], T_base_sensor: F64) -> None:
         """Update the limit with the points (N, 3) of a scan, base frame, of a camera at `T_base_sensor` (4,

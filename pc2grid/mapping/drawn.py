@@ -18,6 +18,7 @@ import dataclasses
 import hashlib
 import math
 from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -108,7 +109,7 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
             warnings=tuple(warnings),
         )
     kind = kind_of(path)
-    try:
+    with named(path):
         points = voxel_cloud(building_points(path, config.read, check_plausible), config.projection)
         T_map_file = level_cloud(points, floor_z=config.read.floor_z, up=config.read.up)
         level = transform_points(T_map_file, points)
@@ -119,10 +120,6 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
             grid = map_cloud(level, config.projection, origin_m=T_map_file[:3, 3])
         except MapFileError as error:
             raise MapFileError("; ".join((error.message, *sparse)), hint=error.hint) from error
-    except MapFileError as error:
-        if str(path) in error.message:
-            raise
-        raise MapFileError(f"{path}: {error.message}", hint=error.hint) from error
     return DrawnMap(
         grid=grid,
         kind=kind,
@@ -134,6 +131,17 @@ def load_drawn_map(path: str | Path, config: Config = Config()) -> DrawnMap:
             for sentence in (*sparse, *_doubts(level, T_map_file, config.read, dense=not sparse))
         ),
     )
+
+
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Name the file in errors that do not."""
+    try:
+        yield
+    except MapFileError as error:
+        if str(path) in error.message:
+            raise
+        raise MapFileError(f"{path}: {error.message}", hint=error.hint) from error
 
 
 def digest_of_map(path: Path) -> str:
@@ -294,12 +302,10 @@ def map_cloud(
     """
     p = parameters
     points = np.asarray(level_points_m, np.float64)
-    tiles = _Tiles(_without_noise(points, projection, p), p.tile_m)
     builder = GridBuilder(projection)
     drawn = 0
-    for tile in tiles:
-        near = tiles.around(tile, p.sight_m)
-        for view_m in _viewpoints(near, tiles.corner_m(tile), projection, p):
+    for corner_m, near in _tiles(_without_noise(points, projection, p), p.tile_m, p.sight_m):
+        for view_m in _viewpoints(near, corner_m, projection, p):
             _draw(builder, near, view_m, projection, p)
             drawn += 1
     if drawn:
@@ -314,37 +320,15 @@ def map_cloud(
     return builder.grid()
 
 
-class _Tiles:
-    """Points (N, 3) by their square of `edge_m`; iterates over the squares with points."""
-
-    def __init__(self, points: F64, edge_m: float) -> None:
-        self._edge_m = edge_m
-        square = np.floor(points[:, :2] / edge_m).astype(np.int64)
-        order = np.lexsort((square[:, 1], square[:, 0]))
-        self._points = points[order]
-        square = square[order]
-        starts = np.flatnonzero(np.any(np.diff(square, axis=0, prepend=square[:1] - 1), axis=1))
-        ends = np.append(starts[1:], len(square))
-        self._rows = {
-            (int(square[a, 0]), int(square[a, 1])): slice(int(a), int(b))
-            for a, b in zip(starts, ends, strict=True)
-        }
-
-    def __iter__(self) -> Iterator[tuple[int, int]]:
-        return iter(self._rows)
-
-    def corner_m(self, tile: tuple[int, int]) -> F64:
-        """Return the lower left corner (2,) of a square."""
-        return np.array(tile) * self._edge_m
-
-    def around(self, tile: tuple[int, int], margin_m: float) -> F64:
-        """Return the points (M, 3) of a square and up to `margin_m`, at most an edge, around it."""
-        steps = (-1, 0, 1)
-        rows = (self._rows.get((tile[0] + i, tile[1] + j)) for i in steps for j in steps)
-        points = np.concatenate([self._points[found] for found in rows if found is not None])
-        low_m = self.corner_m(tile) - margin_m
-        inside = (points[:, :2] >= low_m) & (points[:, :2] < low_m + self._edge_m + 2.0 * margin_m)
-        return np.asarray(points[inside.all(axis=1)])
+def _tiles(points: F64, edge_m: float, margin_m: float) -> Iterator[tuple[F64, F64]]:
+    """Yield the lower left corner (2,) of each square of `edge_m` with points (N, 3), and the points (M, 3)
+    in it and up to `margin_m` around it."""
+    points = points[np.argsort(points[:, 0], kind="stable")]
+    for corner_m in np.unique(np.floor(points[:, :2] / edge_m), axis=0) * edge_m:
+        low_m, high_m = corner_m - margin_m, corner_m + edge_m + margin_m
+        first, last = np.searchsorted(points[:, 0], (low_m[0], high_m[0]))
+        strip = points[first:last]
+        yield corner_m, strip[(strip[:, 1] >= low_m[1]) & (strip[:, 1] < high_m[1])]
 
 
 def _without_noise(points: F64, projection: ProjectionConfig, p: CloudMapParameters) -> F64:

@@ -20,7 +20,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from pc2grid.errors import MapFileError
 from pc2grid.geometry import F32, F64, SE2, BoolGrid, frozen_arrays, transform_points
 from pc2grid.io.building_file import (
     building_points,
@@ -31,7 +30,7 @@ from pc2grid.io.building_file import (
     sampled,
 )
 from pc2grid.io.maps import is_map_file, load_map
-from pc2grid.mapping.drawn import CLOUD_MAP, check_plausible, drivable_plan, level_cloud, voxel_cloud
+from pc2grid.mapping.drawn import CLOUD_MAP, check_plausible, drivable_plan, level_cloud, named, voxel_cloud
 from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.settings import ReadConfig
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
@@ -186,17 +185,13 @@ def load_building(path: str | Path) -> OccupancyGrid | Building:
     path = Path(path)
     if is_map_file(path):
         return load_map(path)
-    try:
+    with named(path):
         if is_building_file(path) and kind_of(path) == "mesh":
             vertices, triangles = load_mesh(path)
             check_plausible(vertices)
             mesh = Mesh(vertices.astype(np.float32), triangles.astype(np.uint32))
             return Building.of(voxel_cloud(sampled(mesh.vertices_m.astype(np.float64), triangles)), mesh)
         return Building.of(np.concatenate([np.empty((0, 3)), *building_points(path, ReadConfig())]))
-    except MapFileError as error:
-        if str(path) in error.message:
-            raise
-        raise MapFileError(f"{path}: {error.message}", hint=error.hint) from error
 
 
 def voxel_m(points_m: F64) -> float:

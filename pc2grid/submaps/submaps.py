@@ -161,7 +161,7 @@ def look_around(
     return ranges * np.float32(grid.resolution_m), ends
 
 
-def ray_ends(ranges_m: F32) -> F64:
+def ray_ends(ranges_m: NDArray[np.floating]) -> F64:
     """Return the ends (N, B, 2) of the rays of isovists (N, B), relative to their centres."""
     bearings_rad = 2.0 * np.pi * np.arange(ranges_m.shape[1]) / ranges_m.shape[1]
     directions = np.stack((np.cos(bearings_rad), np.sin(bearings_rad)), axis=-1)

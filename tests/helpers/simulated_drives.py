@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
+from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan, planar_normals
 from pc2grid.geometry import SE2
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid, RegisteredScan, Scan
 from pc2grid.submaps.submaps import WALL, isovist, partition
@@ -132,10 +132,11 @@ def look(grid: OccupancyGrid, truth: SE2, stamp_ns: int, field_rad: float, reach
 
 def flat_scan(hits_m: ArrayLike, free_m: ArrayLike, stamp_ns: int = 0) -> PlanarScan:
     """The planar scan of a sensor at the base. free_m : of each bearing, or the same for all."""
-    free = np.asarray(free_m, np.float32)
-    return PlanarScan.of_hits(
+    free, hits = np.asarray(free_m, np.float32), np.asarray(hits_m, np.float32).reshape(-1, 2)
+    return PlanarScan(
         stamp_ns=stamp_ns,
-        hits_m=np.asarray(hits_m, np.float32).reshape(-1, 2),
+        hits_m=hits,
+        normal_rad=planar_normals(hits, np.zeros(2)),
         origin_m=np.zeros(2),
         free_m=np.full(BEARINGS, free) if free.ndim == 0 else free,
     )

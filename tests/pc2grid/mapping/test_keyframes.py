@@ -6,7 +6,7 @@ import io
 import numpy as np
 import pytest
 
-from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.clouds.planar_scan import PlanarScan, planar_normals
 from pc2grid.errors import OutputError
 from pc2grid.geometry import SE2, transform_points
 from pc2grid.mapping import keyframes as spool
@@ -20,10 +20,12 @@ from tests.helpers.simulated_drives import office
 
 def planar_scan(hits: int) -> PlanarScan:
     rng = np.random.default_rng(hits)
-    return PlanarScan.of_hits(
+    hits_m, origin_m = rng.normal(size=(hits, 2)).astype(np.float32), rng.normal(size=2)
+    return PlanarScan(
         stamp_ns=2**60 + hits,
-        hits_m=rng.normal(size=(hits, 2)).astype(np.float32),
-        origin_m=rng.normal(size=2),
+        hits_m=hits_m,
+        normal_rad=planar_normals(hits_m, origin_m),
+        origin_m=origin_m,
         free_m=rng.random(8).astype(np.float32),
     )
 

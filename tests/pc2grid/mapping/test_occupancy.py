@@ -183,8 +183,7 @@ def room_with(shelves: float) -> LocalMap:
     free_m = np.zeros(BEARINGS, np.float32)
     bearing = (np.arctan2(hits[:, 1], hits[:, 0]) / (2 * np.pi / BEARINGS)).astype(int) % BEARINGS
     free_m[bearing] = np.hypot(*hits.T)
-    scan = PlanarScan.of_hits(stamp_ns=0, hits_m=hits.astype(np.float32), origin_m=np.zeros(2), free_m=free_m)
-    return LocalMap([Keyframe(0, scan, SE2())], [SE2()])
+    return LocalMap([Keyframe(0, flat_scan(hits, free_m), SE2())], [SE2()])
 
 
 def test_an_overlap_counts_as_much_as_it_is_likely() -> None:

@@ -57,7 +57,6 @@ from pc2grid_lab.paper.methods import (
     differences,
     make_methods,
     metric,
-    signature_of,
 )
 from pc2grid_lab.runner import (
     BACK,
@@ -71,7 +70,7 @@ from pc2grid_lab.runner import (
     write_text,
 )
 from signature.config import SignatureConfig
-from signature.paper import SignatureTable, score_matrix
+from signature.paper import SignatureTable, describe as signature_of, score_matrix
 
 RADII_M = (6.0, 8.0, 10.0)
 """Table IV."""
