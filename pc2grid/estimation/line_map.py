@@ -148,7 +148,7 @@ instead of 0.042 m.
 Weights that fall with the square of the range were tried there, and made the heading worse (ATE 0.018 to
 0.044 m): the noise of a hit is small beside the shape of walls, and far hits determine the heading.
 """
-TRACKING_PARAMETERS = TrackingParameters()
+TRACKING = TrackingParameters()
 _BORDER_CELLS = 5
 """Width of the border of free ground that may be a wall: a neighbourhood of the matching on either side."""
 

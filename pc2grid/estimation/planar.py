@@ -12,29 +12,30 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from pc2grid.clouds.ground import Ground, assumed_ground, find_ground
 from pc2grid.clouds.planar_scan import DepthLimit, PlanarScan, project_to_plane
-from pc2grid.estimation.ground_model import GroundModel
 from pc2grid.estimation.line_map import (
     CAMERA_MATCHING,
     MATCHING_PARAMETERS,
-    TRACKING_PARAMETERS,
+    TRACKING,
     LineMatch,
     MatchingParameters,
     PointGrid,
-    TrackingParameters,
     best_placements,
     evenly,
 )
 from pc2grid.estimation.registration import KissRegistration
-from pc2grid.estimation.scan_matching import Measurement, ScanMatch
-from pc2grid.estimation.smoother import KERNEL, PLANAR, PoseWithCovariance
-from pc2grid.geometry import F32, F64, SE2
+from pc2grid.estimation.smoother import KERNEL, PLANAR, Measurement, PoseWithCovariance, ScanMatch
+from pc2grid.geometry import F32, F64, SE2, leveling
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
 
 
 class PlanarMatcher:
-    """Matches the scans of a sensor whose base stands on the floor; see `ScanMatcher`."""
+    """Matches the scans of a sensor whose base stands on the floor.
+
+    points_m : (N, 3) deskewed points of a scan in the base frame.
+    """
 
     free = PLANAR
 
@@ -42,25 +43,24 @@ class PlanarMatcher:
         self,
         registration: RegistrationConfig,
         projection: ProjectionConfig,
-        parameters: TrackingParameters = TRACKING_PARAMETERS,
     ) -> None:
-        self._registration, self._projection, self._parameters = registration, projection, parameters
+        self._registration, self._projection = registration, projection
         self._depth_limit = DepthLimit()
-        self._floor = GroundModel(None, parameters)
+        self._floor = GroundModel(None)
         self._matching = MATCHING_PARAMETERS
-        self._maps = MatchingMaps(projection.max_range_m, parameters)
+        self._maps = MatchingMaps(projection.max_range_m)
         self._kiss = KissRegistration(registration)
-        # Of the scan taken last: in the plane, its points without the floor, whether it has no odometry.
+        # Of the scan taken last: in the plane, and its points without the floor.
         self._planar_scan: PlanarScan
-        self._points_m, self._unaided = np.empty((0, 3), np.float32), True
-        self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=parameters.followed)
+        self._points_m = np.empty((0, 3), np.float32)
+        self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=TRACKING.followed)
 
     def start(self, scan: Scan, points_m: F32) -> F64:
-        """Implement `ScanMatcher.start`."""
-        self._floor = GroundModel.start(points_m, scan, self._parameters)
+        """Begin with the first scan; returns its pose (4, 4): the session frame is its base, levelled."""
+        self._floor = GroundModel.start(points_m, scan)
         narrow = SENSOR_MODELS[scan.sensor].narrow  # the view is a part of the surroundings only
         self._matching = CAMERA_MATCHING if narrow else MATCHING_PARAMETERS
-        self._maps = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
+        self._maps = MatchingMaps(self._projection.max_range_m, self._matching)
         self._points_m = self._floor.remove(points_m)
         self._planar_scan = self._project(scan, points_m)
         return self.levelled(np.eye(4))
@@ -79,10 +79,10 @@ class PlanarMatcher:
         return bool(self._maps)
 
     def take(self, scan: Scan, points_m: F32) -> None:
-        """Implement `ScanMatcher.take`."""
+        """Prepare a scan for the following calls."""
         self._floor.follow(points_m, scan)
         self._points_m = self._floor.remove(points_m)
-        self._planar_scan, self._unaided = self._project(scan, points_m), scan.T_odom_base is None
+        self._planar_scan = self._project(scan, points_m)
 
     def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
         """Match from the expected pose and, if KISS-ICP brings half of the hits into other cells, from its
@@ -97,7 +97,7 @@ class PlanarMatcher:
 
     def search(self, belief: PoseWithCovariance) -> Iterator[ScanMatch]:
         """Search the window of the belief, and match the best placements."""
-        p, (sigma_m, sigma_rad), prior = self._parameters, belief.sigmas, SE2.from_matrix(belief.pose)
+        p, (sigma_m, sigma_rad), prior = TRACKING, belief.sigmas, SE2.from_matrix(belief.pose)
         window = min(KERNEL * sigma_m, p.search_most_m), min(KERNEL * sigma_rad, math.pi)
         for guess in self._maps.search(self._planar_scan, prior, *window):
             yield self._matched(self._maps, guess, belief)
@@ -107,28 +107,18 @@ class PlanarMatcher:
         return fit
 
     def follow(self, belief: PoseWithCovariance) -> Measurement | None:
-        """Match with the last scans, if there is no odometry, which is trusted more.
+        """Match with a map of the last scans alone; returns the motion T_last_now, or None if the scan does
+        not fit them.
 
-        Half of the view of a turning camera may be new to the map, but not to the scans before.
+        Half of the view of a turning camera may be new to the local map, but not to the scans before.
         """
-        if not self._unaided:
-            return None
-        fit = self._matched_with_last(belief)
+        last = MatchingMaps(self._projection.max_range_m, self._matching)
+        for before, pose in self._latest:
+            last.extend(before, pose)
+        fit = self._matched(last, SE2.from_matrix(belief.pose), belief)
         at, information = fit.alone
         motion = self._latest[-1][1].inverse() @ SE2.from_matrix(at)
         return (motion.lift(), _turned(information, -motion.yaw)) if fit.credible else None
-
-    def fits_last(self, belief: PoseWithCovariance) -> bool:
-        """Return True if the scan fits the last scans and they fix its position."""
-        fit = self._matched_with_last(belief)
-        return fit.credible and fit.measured
-
-    def _matched_with_last(self, belief: PoseWithCovariance) -> ScanMatch:
-        """Match the planar scan with a map of the last scans alone."""
-        last = MatchingMaps(self._projection.max_range_m, self._parameters, self._matching)
-        for before, pose in self._latest:
-            last.extend(before, pose)
-        return self._matched(last, SE2.from_matrix(belief.pose), belief)
 
     def _matched(self, maps: MatchingMaps, guess: SE2, belief: PoseWithCovariance) -> ScanMatch:
         """Match the planar scan with local maps from a guess, with a belief as prior.
@@ -137,7 +127,7 @@ class PlanarMatcher:
         better than a scan must. Otherwise a scan with much new ground, at a short range or after a long step,
         would fit best at the pose of the scan before.
         """
-        p, prior = self._parameters, SE2.from_matrix(belief.pose)
+        p, prior = TRACKING, SE2.from_matrix(belief.pose)
         information = _turned(belief.information, -prior.yaw)  # in the axes of the session frame
         match = maps.match(self._planar_scan, guess, prior, information)
         unknown = 1.0 - match.overlap - match.contradicted
@@ -204,11 +194,9 @@ class MatchingMaps:
     def __init__(
         self,
         reach_m: float,
-        parameters: TrackingParameters = TRACKING_PARAMETERS,
         matching: MatchingParameters = MATCHING_PARAMETERS,
     ) -> None:
-        self._half_m = reach_m + 2.0 * parameters.map_travel_m
-        self._parameters = parameters
+        self._half_m = reach_m + 2.0 * TRACKING.map_travel_m
         self._matching = matching
         self._maps: list[tuple[PointGrid, float]] = []  # each with the travel at which it was begun
         self._last: SE2 | None = None  # where a scan was added last
@@ -219,7 +207,7 @@ class MatchingMaps:
 
     def search(self, planar_scan: PlanarScan, guess: SE2, window_m: float, window_rad: float) -> list[SE2]:
         """Return the best placements of a planar scan around a guess T_session_base, to be refined."""
-        p, grid = self._parameters, self._maps[0][0]
+        p, grid = TRACKING, self._maps[0][0]
         hits = planar_scan.hits_m[evenly(len(planar_scan.hits_m), p.matched_hits)].astype(np.float64)
         field = grid.likelihood(p.search_sigma_m)
         found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
@@ -231,7 +219,7 @@ class MatchingMaps:
         prior, information : Gaussian prior of the pose, with its information (3, 3) of x, y, yaw.
         """
         grid = self._maps[0][0]
-        chosen = evenly(len(planar_scan.hits_m), self._parameters.matched_hits)
+        chosen = evenly(len(planar_scan.hits_m), TRACKING.matched_hits)
         hits, normals = planar_scan.hits_m[chosen], planar_scan.normal_rad[chosen]
         if near != prior:
             near = grid.weighed(hits, normals, near, prior, information)
@@ -243,7 +231,7 @@ class MatchingMaps:
             step = self._last.inverse() @ pose
             self._travel_m += math.hypot(step.x, step.y)
         self._last = pose
-        if not self._maps or self._travel_m - self._maps[-1][1] > self._parameters.map_travel_m:
+        if not self._maps or self._travel_m - self._maps[-1][1] > TRACKING.map_travel_m:
             middle = np.array([pose.x, pose.y])
             low_m, high_m = middle - self._half_m, middle + self._half_m
             self._maps.append((PointGrid(low_m, high_m, parameters=self._matching), self._travel_m))
@@ -258,3 +246,59 @@ class MatchingMaps:
     def restart(self) -> None:
         """Forget the maps: the next scan begins new ones."""
         self._maps, self._last = [], None
+
+
+class GroundModel:
+    """The floor in the base frame, averaged over the scans that show it.
+
+    ground : the floor; None for a planar laser, which measures none.
+    """
+
+    def __init__(self, ground: Ground | None) -> None:
+        self.ground = ground
+        self._scans = 0
+        self._observations = int(ground is not None and ground.seen)  # that have shown the floor
+
+    @classmethod
+    def start(cls, points_m: F32, scan: Scan) -> GroundModel:
+        """Find the floor in the first scan.
+
+        It is searched for at the height given by the mounting of the sensor, then as the lowest level plane;
+        else it is assumed. points_m : (N, 3) points of the scan that are used, base frame.
+        """
+        if SENSOR_MODELS[scan.sensor].planar:
+            return cls(None)
+        sensor_m = scan.T_base_sensor[:3, 3]
+        assumed = assumed_ground(scan.T_base_sensor)
+        found = find_ground(points_m, sensor_m, assumed) if assumed.offset_m == 0.0 else None
+        return cls(found or find_ground(points_m, sensor_m) or assumed)
+
+    def follow(self, points_m: F32, scan: Scan) -> None:
+        """Update the floor by the points (N, 3) of a scan; only every `rolling_every`th scan is used.
+
+        Wheels do not tilt against the floor, and a ramp ahead soon passes.
+        """
+        if self.ground is None:
+            return
+        self._scans += 1
+        if self._scans % TRACKING.rolling_every == 0:
+            found = find_ground(points_m, scan.T_base_sensor[:3, 3], self.ground)
+            if found is not None:
+                self._observations += 1
+                self.ground = self.ground.toward(found, 1.0 / self._observations)
+
+    def remove(self, points_m: F32) -> F32:
+        """Remove the floor from points (N, 3), for KISS-ICP."""
+        if self.ground is None or not len(points_m):
+            return points_m
+        return points_m[self.ground.heights(points_m) > TRACKING.floor_slack_m]
+
+    def T_level_base(self) -> F64:
+        """Return tilt and height (4, 4) of the base over the floor. The heading of the base stays."""
+        if self.ground is None:
+            return np.eye(4)
+        level = leveling(self.ground.normal)
+        # Levelling is the smallest rotation, which may change the heading: turn it back.
+        turn = SE2(0.0, 0.0, -SE2.from_matrix(level).yaw).lift()
+        level[:3, :3] = turn[:3, :3] @ level[:3, :3]
+        return level

@@ -135,6 +135,30 @@ class PoseWithCovariance:
         return float(np.linalg.slogdet(self.covariance)[1])
 
 
+Measurement = tuple[F64, F64]
+"""A pose or a motion (4, 4), with its information (D, D) in the axes of the base where it begins."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScanMatch:
+    """A scan matched with the local map; D directions of the pose are free.
+
+    pose : (4, 4) T_session_base, with the expected pose as prior. alone : the pose by the points alone, with
+    its information (D, D) in the axes of the base.
+    overlap : share of the points that meet the map. measured : True if they fix every direction of the
+    position.
+    evidence : logarithm of the likelihood of the scan at that pose, but for a constant.
+    credible : True if surfaces and free space there support the pose without any prior.
+    """
+
+    pose: F64
+    alone: Measurement
+    overlap: float
+    measured: bool
+    evidence: float
+    credible: bool
+
+
 @dataclass(frozen=True, slots=True)
 class ScanFactors:
     """The measurements of one scan.
@@ -148,8 +172,8 @@ class ScanFactors:
     seconds: float
     T_odom_base: F64 | None = None
     continues: bool = True
-    match: tuple[F64, F64] | None = None
-    motion: tuple[F64, F64] | None = None
+    match: Measurement | None = None
+    motion: Measurement | None = None
 
 
 class FactorWindow(NamedTuple):

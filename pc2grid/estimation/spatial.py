@@ -24,17 +24,14 @@ import numpy as np
 from pc2grid.clouds.columns import ColumnMap
 from pc2grid.clouds.ground import LEVEL, FloorBelow, level_floor, vertical_held
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.estimation.ground_model import DECIDING_SCANS, is_rolling
 from pc2grid.estimation.line_map import (
-    TRACKING_PARAMETERS,
-    TrackingParameters,
+    TRACKING,
     best_placements,
     evenly,
     moved,
     steps,
 )
-from pc2grid.estimation.scan_matching import Measurement, ScanMatch
-from pc2grid.estimation.smoother import KERNEL, SPATIAL, PoseWithCovariance
+from pc2grid.estimation.smoother import KERNEL, SPATIAL, Measurement, PoseWithCovariance, ScanMatch
 from pc2grid.estimation.surface_map import LEAST_INFORMATION, SURFACES, SurfaceMap, SurfaceMatch
 from pc2grid.geometry import F32, F64, SE2, BoolGrid, invert_pose, leveling, motion_size
 from pc2grid.model import SENSOR_MODELS, Scan
@@ -63,11 +60,14 @@ class SpatialParameters:
     standing_s: float = 5.0
 
 
-SPATIAL_PARAMETERS = SpatialParameters()
+SPATIAL_MATCHING = SpatialParameters()
 
 
 class SpatialMatcher:
-    """Matches the scans of a sensor in the hand, in the session frame (z up); see `ScanMatcher`."""
+    """Matches the scans of a sensor in the hand, in the session frame (z up).
+
+    points_m : (N, 3) deskewed points of a scan in the base frame.
+    """
 
     free = SPATIAL
 
@@ -75,11 +75,8 @@ class SpatialMatcher:
         self,
         registration: RegistrationConfig,
         projection: ProjectionConfig,
-        parameters: SpatialParameters = SPATIAL_PARAMETERS,
-        tracking: TrackingParameters = TRACKING_PARAMETERS,
     ) -> None:
         self._registration, self._projection = registration, projection
-        self._parameters, self._tracking = parameters, tracking
         self._map: SpaceMap | None = None
         self._last: F64 = np.eye(4)  # pose of the last scan that was not lost
         # Of the scan taken last.
@@ -90,7 +87,7 @@ class SpatialMatcher:
         self._map = None
 
     def start(self, scan: Scan, points_m: F32) -> F64:
-        """Implement `ScanMatcher.start`."""
+        """Begin with the first scan; returns its pose (4, 4): the session frame is its base, levelled."""
         self.take(scan, points_m)
         return first_pose(scan, points_m)
 
@@ -103,7 +100,7 @@ class SpatialMatcher:
         return bool(self._map)
 
     def take(self, scan: Scan, points_m: F32) -> None:
-        """Implement `ScanMatcher.take`."""
+        """Prepare a scan for the following calls."""
         if self._map is None:
             self._map = SpaceMap(scan, points_m, self._registration, self._projection)
         self._thinned = self._map.thin(scan, points_m, self._last[:3, :3])
@@ -117,11 +114,10 @@ class SpatialMatcher:
 
         A hand turns fast; then the direction of the predicted step is unreliable.
         """
-        p, t = self._parameters, self._tracking
         step_m = float(np.linalg.norm(belief.pose[:3, 3] - self._last[:3, 3]))
-        window_m = min(step_m + KERNEL * belief.sigmas[0], t.search_most_m)
-        covariance = np.diag([window_m**2] * 3 + [p.turned_rad**2] * 3)
-        for guess in self._space.search(self._thinned, self._last, window_m, p.starts):
+        window_m = min(step_m + KERNEL * belief.sigmas[0], TRACKING.search_most_m)
+        covariance = np.diag([window_m**2] * 3 + [SPATIAL_MATCHING.turned_rad**2] * 3)
+        for guess in self._space.search(self._thinned, self._last, window_m, SPATIAL_MATCHING.starts):
             yield self._matched(guess, PoseWithCovariance(guess, covariance, belief.free))
 
     def _matched(self, guess: F64, held: PoseWithCovariance) -> ScanMatch:
@@ -130,18 +126,19 @@ class SpatialMatcher:
         surfaces, points_m, weights = space.surfaces, self._thinned.points_m, self._thinned.weights
         found = surfaces.match(points_m, weights, surfaces.near(points_m, weights, guess, held), held)
         of_known, of_all = space.agreement(self._thinned, found.pose)
-        quality = of_all - self._parameters.residual_weight_per_m * found.residual_m
+        quality = of_all - SPATIAL_MATCHING.residual_weight_per_m * found.residual_m
         return ScanMatch(
             pose=found.pose,
             alone=_alone(found, held),
             overlap=found.overlap,
             measured=found.measured,
             evidence=SURFACES.independent(len(self._thinned.points_m)) * quality,
-            credible=of_known >= self._parameters.least_agreement,
+            credible=of_known >= SPATIAL_MATCHING.least_agreement,
         )
 
     def observable(self, fit: ScanMatch) -> ScanMatch:
-        """Implement `ScanMatcher.observable`.
+        """Return the match with only the information that the surfaces really provide
+        (`SurfaceMap.observable`).
 
         Without odometry, the vertical that the scan shows by itself is added, also where the map holds
         nothing: the map leans as far as the scans that made it. A slide is then known only as far as it would
@@ -161,10 +158,6 @@ class SpatialMatcher:
 
     def follow(self, belief: PoseWithCovariance) -> None:
         """Return None: the surfaces of the last scans are in the map."""
-
-    def fits_last(self, belief: PoseWithCovariance) -> bool:
-        """Return False: the last scans are not matched alone."""
-        return False
 
     def extend(self, pose: F64) -> None:
         """Do nothing: `cut` adds scans to the map, more of them than there are keyframes."""
@@ -200,6 +193,15 @@ def _alone(found: SurfaceMatch, held: PoseWithCovariance) -> Measurement:
 # --- the beginning of a session -----------------------------------------------------------------------
 
 
+_UPRIGHT_HEIGHT_M, _UPRIGHT_TILT_RAD = 0.05, math.radians(0.5)
+"""A base on wheels keeps its height and its tilt within these, as its odometry reports them: an EKF in three
+dimensions reports some tenths of a degree; a phone in the hand (depth/room) 0.8 to 6.5 degrees in a second.
+Without odometry, a sensor that is mounted lower than this above its base is in the hand."""
+DECIDING_SCANS = 20
+"""So many scans of a base that moves decide whether it is on wheels; what tilts and rises later is on a ramp.
+By hand."""
+
+
 @dataclass(frozen=True, slots=True)
 class Beginning:
     """The first scans of a session, all but those `left_out`.
@@ -214,14 +216,14 @@ class Beginning:
     warning: str | None = None
 
 
-def begin(scans: Iterator[Scan], parameters: SpatialParameters = SPATIAL_PARAMETERS) -> Beginning:
+def begin(scans: Iterator[Scan]) -> Beginning:
     """Look ahead until the first scans decide between hand and wheels and, in the hand, which way is up.
 
     A session in the hand begins with the first scan that shows which way is up. If none does, all scans are
     kept, and the sensor is assumed to be held level.
     """
-    ahead = islice(scans, parameters.most_waiting)
-    waiting, in_hand = _until_decided(ahead, parameters.standing_s)
+    ahead = islice(scans, SPATIAL_MATCHING.most_waiting)
+    waiting, in_hand = _until_decided(ahead)
     if not in_hand:
         return Beginning(waiting)
     unknown = "no floor, and neither odometry nor an IMU says which way is up"
@@ -236,7 +238,7 @@ def begin(scans: Iterator[Scan], parameters: SpatialParameters = SPATIAL_PARAMET
     return Beginning(seen, True, warning=said)
 
 
-def _until_decided(scans: Iterator[Scan], standing_s: float) -> tuple[list[Scan], bool]:
+def _until_decided(scans: Iterator[Scan]) -> tuple[list[Scan], bool]:
     """Take scans until they decide between hand and wheels; returns them, and True for a sensor in the hand.
 
     A hand may be level for a moment. So only scans count after which the base has moved, or may have moved;
@@ -249,10 +251,25 @@ def _until_decided(scans: Iterator[Scan], standing_s: float) -> tuple[list[Scan]
         if not is_rolling(scan, waiting[0]):
             return waiting, True
         moving += _has_moved(waiting[0], scan)
-        stands = not moving and scan.stamp_ns - waiting[0].stamp_ns > standing_s * 1e9
+        stands = not moving and scan.stamp_ns - waiting[0].stamp_ns > SPATIAL_MATCHING.standing_s * 1e9
         if SENSOR_MODELS[scan.sensor].planar or moving == DECIDING_SCANS or stands:
             break
     return waiting, False
+
+
+def is_rolling(scan: Scan, first: Scan | None = None) -> bool:
+    """Return True if the base stays upright: by its odometry, or without odometry by the mounting.
+
+    first : the first scan, whose height is that of a base on wheels. A planar laser is taken to be on wheels.
+    """
+    T = scan.T_odom_base
+    if SENSOR_MODELS[scan.sensor].planar:
+        return True
+    if T is None:
+        return float(scan.T_base_sensor[2, 3]) > _UPRIGHT_HEIGHT_M
+    before = T if first is None or first.T_odom_base is None else first.T_odom_base
+    level = float(T[2, 2]) > math.cos(_UPRIGHT_TILT_RAD)
+    return level and abs(float(T[2, 3] - before[2, 3])) < _UPRIGHT_HEIGHT_M
 
 
 def _has_moved(first: Scan, scan: Scan) -> bool:
@@ -261,7 +278,7 @@ def _has_moved(first: Scan, scan: Scan) -> bool:
     if first.T_odom_base is None or scan.T_odom_base is None:
         return True
     distance_m, turn_rad = motion_size(invert_pose(first.T_odom_base) @ scan.T_odom_base)
-    p = TRACKING_PARAMETERS
+    p = TRACKING
     return distance_m >= p.keyframe_travel_m or turn_rad >= p.keyframe_turn_rad
 
 
@@ -350,12 +367,11 @@ class SpaceMap:
         points_m: F32,
         registration: RegistrationConfig,
         projection: ProjectionConfig,
-        parameters: SpaceMapParameters = SPACE_MAP,
     ) -> None:
         """Make an empty map, with voxels that suit the points (N, 3) of a scan, base frame."""
-        self._projection, self._parameters = projection, parameters
+        self._projection = projection
         self._noise_per_m2 = SENSOR_MODELS[scan.sensor].noise_per_m2
-        noise_range_m = SENSOR_MODELS[scan.sensor].range_of_noise_m(parameters.noise_m)
+        noise_range_m = SENSOR_MODELS[scan.sensor].range_of_noise_m(SPACE_MAP.noise_m)
         self._reach_m = min(projection.max_range_m, noise_range_m)
         ranges_m = np.linalg.norm(points_m - scan.T_base_sensor[:3, 3], axis=1)
         self.surfaces = SurfaceMap.of_first_scan(ranges_m, 2.0 * projection.max_range_m, registration)
@@ -376,7 +392,7 @@ class SpaceMap:
         sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
         return ThinnedScan(
             thinned,
-            1.0 / (1.0 + (sigma_m / self._parameters.good_m) ** 2),
+            1.0 / (1.0 + (sigma_m / SPACE_MAP.good_m) ** 2),
             self.surfaces.alone(shown @ turn.T),
         )
 
@@ -391,7 +407,7 @@ class SpaceMap:
 
         The points at the height of walls are searched for in the plane, within `window_m` along x and y.
         """
-        p = self._parameters
+        p = SPACE_MAP
         planar = SE2.from_matrix(guess)
         T_level_base = planar.inverse().lift() @ guess
         level = thinned.placed(T_level_base)
@@ -408,7 +424,7 @@ class SpaceMap:
 
     def extend(self, scan: Scan, points_m: F32, thinned: ThinnedScan, pose: F64) -> None:
         """Add a scan at its final pose (4, 4), if the sensor has moved enough since the last one."""
-        p = self._parameters
+        p = SPACE_MAP
         self._above_floor_m, travel_m = None, 0.0
         if self._added_at is not None:
             travel_m, turned_rad = motion_size(invert_pose(self._added_at) @ pose)
@@ -444,7 +460,7 @@ class SpaceMap:
 
     def _floor_m(self, sensor_m: F64) -> float:
         """Return z of the floor below a sensor at (3,)."""
-        assumed_m = float(sensor_m[2]) - self._parameters.assumed_m
+        assumed_m = float(sensor_m[2]) - SPACE_MAP.assumed_m
         return assumed_m if self._floor.z_m is None else self._floor.z_m
 
     def _lowered(self, points_m: F64) -> F64:

@@ -209,9 +209,8 @@ class SurfaceMap:
         edge_m: float,
         reach_m: float,
         registration: RegistrationConfig,
-        parameters: SurfaceParameters = SURFACES,
     ) -> None:
-        p = self._parameters = parameters
+        p = SURFACES
         self._reach_m = reach_m
         self._cleared_at: F64 | None = None
         self.fine = VoxelShapes(edge_m, p.least, p.most, p.noise_m)
@@ -223,26 +222,25 @@ class SurfaceMap:
         ranges_m: NDArray[np.floating],
         reach_m: float,
         registration: RegistrationConfig,
-        parameters: SurfaceParameters = SURFACES,
     ) -> SurfaceMap:
         """Return an empty map whose voxels suit the surroundings, by the ranges (N,) of a first scan."""
-        p = parameters
+        p = SURFACES
         middle_m = float(np.percentile(ranges_m, 75)) if len(ranges_m) else 0.0
-        return cls(float(np.clip(p.edge_per_range * middle_m, *p.edge_m)), reach_m, registration, p)
+        return cls(float(np.clip(p.edge_per_range * middle_m, *p.edge_m)), reach_m, registration)
 
     def __bool__(self) -> bool:
         return len(self.fine) > 0
 
     def thinned(self, points_m: F32) -> F64:
         """Downsample the points (N, 3) of a scan to about one for each half voxel."""
-        p, points = self._parameters, points_m.astype(np.float64)
+        p, points = SURFACES, points_m.astype(np.float64)
         rows = VoxelShapes(p.thinning * self.fine.edge_m, p.least, p.most, p.noise_m).enter(points)
         # The rows are numbered by the first of their points.
         return points[np.diff(np.maximum.accumulate(rows), prepend=-1) > 0]
 
     def alone(self, points_m: F64) -> F64:
         """Return the shapes (V, 9) of the surfaces in points (N, 3) alone."""
-        p = self._parameters
+        p = SURFACES
         view = VoxelShapes(self.fine.edge_m, p.least, p.most, p.noise_m)
         view.add(points_m)
         return view.shapes
@@ -263,7 +261,7 @@ class SurfaceMap:
 
         weights : (N,) of the points, 0..1, by their noise.
         """
-        chosen = random_subset(len(points_m), self._parameters.points)
+        chosen = random_subset(len(points_m), SURFACES.points)
         return self._align(points_m[chosen], weights[chosen], guess, prior)
 
     def near(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> F64:
@@ -272,7 +270,7 @@ class SurfaceMap:
         The weight is the information of the surfaces there: KISS-ICP slides in the directions that they leave
         free.
         """
-        p, registered = self._parameters, self._kiss.register(points_m, guess)
+        p, registered = SURFACES, self._kiss.register(points_m, guess)
         few = random_subset(len(points_m), p.few_points)
         H = self.fine.equations(points_m[few], weights[few], registered, p.near_scale * self.fine.edge_m)[0]
         step = _step(registered, H / p.near_sigma_m**2, np.zeros(6), prior)
@@ -287,7 +285,7 @@ class SurfaceMap:
         gradients there is small beside the tangent. Both are compared along the six principal changes of the
         pose, in metres of displacement of the points. Directions that are not observable get no information.
         """
-        p = self._parameters
+        p = SURFACES
         few = random_subset(len(points_m), p.few_points)
         points, own, aside_m = points_m[few], weights[few], p.aside * self.fine.edge_m
 
@@ -312,7 +310,7 @@ class SurfaceMap:
 
     def _align(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> SurfaceMatch:
         """Align points by Gauss-Newton from a guess."""
-        p = self._parameters
+        p = SURFACES
         unit = p.point_sigma_m**-2
         pose, information, found, distance_m = guess, np.zeros((6, 6)), 0.0, 0.0
         for scale_m in p.rounds:

@@ -5,6 +5,12 @@ scan fixes the pose to millimetres, but only across the surfaces that it shows. 
 wheels, `SpatialMatcher` in the hand) matches the scan by itself; the smoother fuses that with odometry and
 with the scans before. `HealthJudge` judges the result by the fit of the scan with the local map.
 
+The selection of a match (`MatchSelector`) is the same with three and with six degrees of freedom. KISS-ICP
+brings the scan near from each expected pose, and the matches begin there. If none fits, the scan is searched
+for. The posterior density of a match is the product of the likelihood of the scan and of the density of the
+expected pose. The best match is taken. Its covariance is widened by the spread of all matches: where two
+places fit alike, neither is known.
+
 `Odometer` compares odometry with the scans. Wheels slip, and odometry of real robots comes late, bunched or
 repeated. The scans then show another motion, and tracking follows them: the poses are right, and the user is
 warned of where and how often odometry was an outlier (`check_odometry`).
@@ -15,22 +21,34 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+from itertools import chain
 
 import numpy as np
 
 from pc2grid.clouds.cloud import deskew, random_subset
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.estimation.line_map import TRACKING_PARAMETERS, TrackingParameters
+from pc2grid.estimation.line_map import TRACKING, steps
 from pc2grid.estimation.planar import PlanarMatcher
-from pc2grid.estimation.scan_matching import MatchedScan, MatchSelector, ScanMatcher
-from pc2grid.estimation.smoother import IN_THE_HAND, SMOOTHER, PoseWithCovariance, ScanFactors, Smoother
+from pc2grid.estimation.smoother import (
+    IN_THE_HAND,
+    KERNEL,
+    SMOOTHER,
+    Measurement,
+    PoseWithCovariance,
+    ScanFactors,
+    ScanMatch,
+    Smoother,
+)
 from pc2grid.estimation.spatial import SpatialMatcher
 from pc2grid.geometry import F32, F64, SE2, invert_pose, motion_size
 from pc2grid.model import MOST_LISTED, Health, OdometryCheck, OdometryOutlier, RegisteredScan, Scan
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
+
+ScanMatcher = PlanarMatcher | SpatialMatcher
+"""Matches the scans of a session, one after another, with a local map."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -64,32 +82,30 @@ class Tracker:
         self,
         registration: RegistrationConfig,
         projection: ProjectionConfig | None = None,
-        parameters: TrackingParameters = TRACKING_PARAMETERS,
         *,
         in_hand: bool,
     ) -> None:
         """Make a tracker. in_hand : see `pc2grid.estimation.spatial.begin`, which decides it."""
         self._config = registration
-        self._parameters = parameters
         self._last: Scan | None = None
-        self._odometer = Odometer(parameters=parameters)
+        self._odometer = Odometer()
         self._keyframe: SE2 | None = None  # where the last one was
         self._restarted = False  # no keyframe has been reported since tracking started again
         self._walls_changed = False  # why
-        self._standstill = Standstill(parameters)
+        self._standstill = Standstill()
         self._in_hand = in_hand
         projection = projection or ProjectionConfig()
         self._sensor: ScanMatcher
         if in_hand:
             self._sensor = SpatialMatcher(registration, projection)
         else:
-            self._sensor = PlanarMatcher(registration, projection, parameters)
+            self._sensor = PlanarMatcher(registration, projection)
         self._smoother = Smoother(self._sensor.free, IN_THE_HAND if in_hand else SMOOTHER)
-        self._health = HealthJudge(parameters)
+        self._health = HealthJudge()
 
     def start(self, scan: Scan) -> Tracked:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
-        self._odometer = Odometer(scan.stamp_ns, self._parameters)
+        self._odometer = Odometer(scan.stamp_ns)
         points = self._deskewed(scan, np.eye(4), 1.0)
         pose = self._sensor.start(scan, points)
         self._smoother.start(self._flat(pose), self._reading(scan))
@@ -113,14 +129,14 @@ class Tracker:
         motion = invert_pose(self._smoother.belief.pose) @ first.pose
         points = self._deskewed(scan, motion, seconds)
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
-        placed = MatchSelector(self._sensor, self._parameters).place(scan, points, first, expected)
+        placed = MatchSelector(self._sensor).place(scan, points, first, expected)
         between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
         evidence = ScanFactors(seconds, reading, continues, placed.alone, between)
         estimate = self._estimated(placed, evidence)
         # 4. Judge the pose, and start again if nothing fits any more.
         health = self._judged(placed, estimate, evidence)
         sure = placed.sure and not placed.first
-        if self._standstill.left(scan, sure=sure) and self._sensor.fits_last(first):
+        if self._standstill.left(scan, sure=sure) and self._sensor.follow(first) is not None:
             self._walls_changed, health = True, self._health.give_up()
         pose = self._sensor.levelled(estimate.pose)
         tracked = self._finish(scan, points, pose, health)
@@ -175,7 +191,7 @@ class Tracker:
         """Return True if the base has moved enough since the last keyframe for another one."""
         if self._keyframe is None:
             return True
-        p, step = self._parameters, self._keyframe.inverse() @ SE2.from_matrix(pose)
+        p, step = TRACKING, self._keyframe.inverse() @ SE2.from_matrix(pose)
         return math.hypot(step.x, step.y) >= p.keyframe_travel_m or abs(step.yaw) >= p.keyframe_turn_rad
 
     def _restart(self) -> None:
@@ -212,7 +228,7 @@ class Tracker:
         """
         away = scan.points_m - scan.T_base_sensor[:3, 3].astype(np.float32)
         keep = np.flatnonzero(np.einsum("ij,ij->i", away, away) >= self._config.min_range_m**2)
-        keep = keep[random_subset(len(keep), self._parameters.max_points)]
+        keep = keep[random_subset(len(keep), TRACKING.max_points)]
         points = scan.points_m[keep]
         if scan.offsets_s is None or not self._config.deskew or not len(points):
             return points
@@ -226,11 +242,125 @@ class Tracker:
         return deskew(points, offsets, motion, seconds)
 
 
+# --- the most probable of several matches --------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class MatchedScan:
+    """The selected match of a scan with the local map.
+
+    pose : (4, 4) initial T_session_base for the smoother. alone : as of `ScanMatch`; None if the scan fits
+    nowhere. motion : T_last_now, if the scan shows new ground and fits only the scans before.
+    sure : True if it fits the map well. measured : True if its points fix every direction of the position.
+    first : True if there is no local map yet, nor any since tracking started again.
+    """
+
+    pose: F64
+    alone: Measurement | None = None
+    motion: Measurement | None = None
+    sure: bool = False
+    measured: bool = False
+    first: bool = False
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class _Candidate:
+    """A match with the logarithm of its posterior density, but for a constant.
+
+    sure : True if the scan fits well there. near : True if it lies at an expected pose, False if it was
+    searched for.
+    """
+
+    score: float
+    fit: ScanMatch = field(compare=False)
+    sure: bool = field(compare=False)
+    near: bool = field(compare=False)
+
+
+class MatchSelector:
+    """Selects the most probable match of each scan of a sensor."""
+
+    def __init__(self, sensor: ScanMatcher) -> None:
+        self._sensor = sensor
+
+    def place(
+        self, scan: Scan, points_m: F32, belief: PoseWithCovariance, others: Iterable[PoseWithCovariance] = ()
+    ) -> MatchedScan:
+        """Match the next scan with the local map.
+
+        points_m : (N, 3) deskewed, base frame. belief : the most credible prediction of the pose, which a
+        scan gets that fits nowhere, or is empty. others : less credible ones, made only where needed.
+        """
+        p = TRACKING
+        self._sensor.take(scan, points_m)
+        if not self._sensor:
+            return MatchedScan(belief.pose, sure=True, first=True)
+        found = self._candidates(belief, others)
+        best = max(found)
+        if best.fit.overlap < p.min_overlap or not (best.near or best.fit.credible):
+            # Odometry is trusted more than the last scans.
+            motion = None if scan.T_odom_base is not None else self._sensor.follow(belief)
+            return MatchedScan(belief.pose, motion=motion)
+        fit = self._sensor.observable(best.fit)
+        alone, information = fit.alone
+        if len(found) > 1:
+            spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
+            # The inverse of the sum of both covariances, also where a match has none of a direction.
+            information = np.asarray(
+                np.linalg.solve(np.eye(len(spread)) + information @ spread, information), np.float64
+            )
+        estimate = alone, 0.5 * (information + information.T)
+        return MatchedScan(fit.pose, estimate, sure=best.sure, measured=fit.measured)
+
+    def _candidates(
+        self, first: PoseWithCovariance, others: Iterable[PoseWithCovariance]
+    ) -> list[_Candidate]:
+        """Return the matches at the expected poses, as many as are needed until one fits that an exact belief
+        has led to; if none fits, also those of a search.
+        """
+        expected: list[PoseWithCovariance] = []
+        fits: list[ScanMatch] = []
+        for belief in chain((first,), others):
+            expected.append(belief)
+            fits += self._sensor.match(belief)
+            found = [self._candidate(fit, expected) for fit in fits]
+            if max(found).sure and max(found).near and not self._is_vague(belief):
+                return found
+        if not max(found).sure and (self._is_vague(first) or not max(found).near):
+            found += [
+                replace(self._candidate(fit, expected), near=False) for fit in self._sensor.search(first)
+            ]
+        return found
+
+    def _candidate(self, fit: ScanMatch, expected: Sequence[PoseWithCovariance]) -> _Candidate:
+        """Weight a match by the expected pose that explains it best."""
+        chi2 = [belief.chi2(fit.pose) for belief in expected]
+        density = max(belief.log_density(c) for belief, c in zip(expected, chi2, strict=True))
+        sure = fit.credible and fit.overlap >= TRACKING.sure_overlap
+        return _Candidate(fit.evidence + density, fit, sure, near=min(chi2) < KERNEL**2)
+
+    def _is_vague(self, belief: PoseWithCovariance) -> bool:
+        """Return True if a belief is wider than the reach of a match."""
+        p, (sigma_m, sigma_rad) = TRACKING, belief.sigmas
+        return KERNEL * max(sigma_m / p.search_above_m, sigma_rad / p.search_above_rad) > 1.0
+
+
+def _spread(found: Sequence[_Candidate], best: _Candidate) -> F64:
+    """Return the covariance (6, 6) of all candidates about the best one, in the axes of the base there."""
+    mass = np.exp([other.score - best.score for other in found])
+    poses = np.array([other.fit.pose for other in found])
+    away = steps(np.tile(best.fit.pose, (len(poses), 1, 1)), poses).step
+    spread: F64 = np.einsum("n,na,nb->ab", mass / mass.sum(), away, away)
+    return spread
+
+
+# --- health and odometry -------------------------------------------------------------------------------
+
+
 class HealthJudge:
     """Judges each scan, and counts the lost ones in a row."""
 
-    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
-        self._parameters = parameters
+    def __init__(self) -> None:
         self._lost_scans = 0
 
     def judge(self, placed: MatchedScan, unaided: PoseWithCovariance | None, *, bridged: bool) -> Health:
@@ -243,7 +373,7 @@ class HealthJudge:
         direction of an unaided pose is not known. One that does not fit is also DEGENERATE if odometry gives
         its pose from a scan that was not lost; else LOST.
         """
-        p, (sigma_m, sigma_rad) = self._parameters, (0.0, 0.0) if unaided is None else unaided.sigmas
+        p, (sigma_m, sigma_rad) = TRACKING, (0.0, 0.0) if unaided is None else unaided.sigmas
         fits = placed.first or placed.alone is not None
         if fits and sigma_m <= p.known_m and sigma_rad <= p.known_rad:
             self.restart()
@@ -258,11 +388,11 @@ class HealthJudge:
     @property
     def gives_up(self) -> bool:
         """Return True if tracking must start again, after so many lost scans in a row."""
-        return self._lost_scans > self._parameters.give_up_scans
+        return self._lost_scans > TRACKING.give_up_scans
 
     def give_up(self) -> Health:
         """Start tracking again at once: the scan is lost."""
-        self._lost_scans += self._parameters.give_up_scans + 1
+        self._lost_scans += TRACKING.give_up_scans + 1
         return Health.LOST
 
     def restart(self) -> None:
@@ -276,8 +406,7 @@ class Standstill:
     Walls that come back, while the base stands or when it leaves, have not changed.
     """
 
-    def __init__(self, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
-        self._parameters = parameters
+    def __init__(self) -> None:
         self._known: tuple[int, F64] | None = None  # stamp and T_odom_base of the last scan that fits well
 
     def left(self, scan: Scan, *, sure: bool) -> bool:
@@ -292,7 +421,7 @@ class Standstill:
         known = self._known
         if sure or known is None or T_odom_base is None:
             return False
-        p, (distance_m, turn_rad) = self._parameters, motion_size(invert_pose(known[1]) @ T_odom_base)
+        p, (distance_m, turn_rad) = TRACKING, motion_size(invert_pose(known[1]) @ T_odom_base)
         if distance_m <= p.standing_m and turn_rad <= p.standing_rad:
             return False
         self._known = scan.stamp_ns, T_odom_base
@@ -302,8 +431,8 @@ class Standstill:
 class Odometer:
     """Keeps the last reading, and the pose of the base then. begin_ns : stamp of the first scan."""
 
-    def __init__(self, begin_ns: int = 0, parameters: TrackingParameters = TRACKING_PARAMETERS) -> None:
-        self._parameters, self._begin_ns = parameters, begin_ns
+    def __init__(self, begin_ns: int = 0) -> None:
+        self._begin_ns = begin_ns
         self._scans = 0
         self._last: tuple[F64, F64] | None = None  # T_base_odom and T_session_base
 
@@ -330,12 +459,12 @@ class Odometer:
             return True
         reported = self.reported(scan)
         usual_s = (scan.stamp_ns - self._begin_ns) * 1e-9 / max(self._scans, 1)
-        gap = min(seconds, scan.odometry_gap_s) > self._parameters.gap * usual_s
+        gap = min(seconds, scan.odometry_gap_s) > TRACKING.gap * usual_s
         return reported is not None and not gap and self.is_possible(reported, seconds)
 
     def is_possible(self, motion: F64, seconds: float) -> bool:
         """Return True if a robot or a person indoors can make a motion (4, 4) in a time."""
-        p, (distance_m, turn_rad) = self._parameters, motion_size(motion)
+        p, (distance_m, turn_rad) = TRACKING, motion_size(motion)
         return max(distance_m, turn_rad) <= p.jump + p.fastest * seconds
 
     def disagreement(self, scan: Scan, pose: F64) -> Disagreement | None:

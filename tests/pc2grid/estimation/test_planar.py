@@ -9,12 +9,11 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from pc2grid.estimation.ground_model import GroundModel, is_rolling
-from pc2grid.estimation.planar import PlanarMatcher
+from pc2grid.estimation.planar import GroundModel, PlanarMatcher
 from pc2grid.estimation.registration import KissRegistration
-from pc2grid.estimation.scan_matching import MatchedScan, MatchSelector, ScanMatch
-from pc2grid.estimation.smoother import PLANAR, PoseWithCovariance
-from pc2grid.estimation.spatial import Beginning, begin
+from pc2grid.estimation.smoother import PLANAR, PoseWithCovariance, ScanMatch
+from pc2grid.estimation.spatial import Beginning, begin, is_rolling
+from pc2grid.estimation.tracker import MatchedScan, MatchSelector
 from pc2grid.geometry import F64, SE2, pose_from_rotation_vector
 from pc2grid.io.recording import open_log
 from pc2grid.model import Health, Scan

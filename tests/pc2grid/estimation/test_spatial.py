@@ -10,9 +10,16 @@ import numpy as np
 import pytest
 
 from pc2grid.clouds.ground import FloorBelow, level_floor
-from pc2grid.estimation.ground_model import is_rolling
-from pc2grid.estimation.scan_matching import ScanMatch
-from pc2grid.estimation.spatial import SPATIAL_PARAMETERS, SpaceMap, SpatialMatcher, begin, first_pose
+from pc2grid.estimation import spatial
+from pc2grid.estimation.smoother import ScanMatch
+from pc2grid.estimation.spatial import (
+    SPATIAL_MATCHING,
+    SpaceMap,
+    SpatialMatcher,
+    begin,
+    first_pose,
+    is_rolling,
+)
 from pc2grid.estimation.surface_map import LEAST_INFORMATION
 from pc2grid.estimation.tracker import Tracked, Tracker
 from pc2grid.geometry import F64, SE2, invert_pose, motion_size, pose_from_rotation_vector
@@ -265,13 +272,14 @@ def test_a_session_begins_with_the_floor_in_view() -> None:
     assert f"{left_out} scans show no floor" in warning and "begin with the floor in view" in warning
 
 
-def test_where_no_floor_comes_in_view_the_user_is_told() -> None:
+def test_where_no_floor_comes_in_view_the_user_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     unaided = [dataclasses.replace(scan, T_odom_base=None) for scan, _ in images(room(), looking_up(5))]
     beginning = begin(iter(unaided))
     assert list(beginning.scans) == unaided and not beginning.left_out
     assert beginning.warning is not None and "taken to be held level" in beginning.warning
-    few = dataclasses.replace(SPATIAL_PARAMETERS, most_waiting=3)
-    assert begin(iter(unaided), few).scans == unaided[:3]
+    few = dataclasses.replace(SPATIAL_MATCHING, most_waiting=3)
+    monkeypatch.setattr(spatial, "SPATIAL_MATCHING", few)
+    assert begin(iter(unaided)).scans == unaided[:3]
     assert begin(iter(())).warning is None
 
 

@@ -42,7 +42,7 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 
 from pc2grid.errors import ConfigError, LogNotFound, Pc2GridError
-from pc2grid.estimation.line_map import TRACKING_PARAMETERS
+from pc2grid.estimation.line_map import TRACKING
 from pc2grid.geometry import F32, F64, SE2, transform_points
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.building_file import is_building_file
@@ -253,7 +253,7 @@ T = TypeVar("T")
 def after_motion(posed: Iterable[tuple[T, F64]]) -> Iterator[tuple[T, F64]]:
     """Yield those with a pose (4, 4) after which the robot has moved or turned as far as a keyframe of the
     product needs."""
-    p, last = TRACKING_PARAMETERS, None
+    p, last = TRACKING, None
     for one, pose in posed:
         step_m, step_rad = (math.inf, math.inf) if last is None else apart(last, SE2.from_matrix(pose))
         if step_m >= p.keyframe_travel_m or step_rad >= p.keyframe_turn_rad:
