@@ -13,7 +13,8 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +23,8 @@ from pc2grid.clouds.cloud import VoxelCloud, random_subset
 from pc2grid.clouds.ground import find_ground
 from pc2grid.geometry import (
     F64,
-    I64,
     SE2,
+    BoolGrid,
     frozen_arrays,
     invert_pose,
     pose_from_rotation_vector,
@@ -40,15 +41,14 @@ class RegistrationParameters:
 
     voxel_m : edge of the voxels that the query, and the map for it, are reduced to. points : so many of the
         query are registered. least_points : so many of these must meet the map.
-    tile_m : edge of the squares of the map whose normals are estimated together.
     margin_m : of the part of the map that is used, around the query.
     floor_m : the floors are compared so far around the sensor.
-    normal_radius_m, normal_neighbours : neighbourhood in which the normals of the map are estimated.
-    rounds_m : largest distance of corresponding points, round by round.
-    iterations : of each round, at most. converged : a round ends when the share of points that meet the map,
-        and their distance as a share of it, change by less.
+    rounds_m : largest distance of corresponding points, round by round. Further than the first, ICP must not
+        move the planar pose; nearer than the last, a point lies on the map.
+    converged : a round ends when the share of points that meet the map, and their distance as a share of it,
+        change by less.
     tukey : constant of Tukey's loss, as a share of the distance of the round.
-    farthest_m, farthest_rad, tilt_rad : ICP must not move or tilt the planar pose more than this.
+    farthest_rad, tilt_rad : ICP must not turn or tilt the planar pose more than this.
     patch_m : errors of points nearer than this to each other are taken to be the same, in the covariance. In
         simulation the normalised squared errors are then about 6, as they should for 6 numbers.
     noise_m : least standard deviation of a distance; of voxels and of maps.
@@ -57,16 +57,11 @@ class RegistrationParameters:
     voxel_m: float = 0.1
     points: int = 2000
     least_points: int = 100
-    tile_m: float = 4.0
     margin_m: float = 1.0
     floor_m: float = 8.0
-    normal_radius_m: float = 0.35
-    normal_neighbours: int = 30
     rounds_m: tuple[float, ...] = (0.6, 0.3, 0.15)
-    iterations: int = 30
     converged: tuple[float, ...] = (1e-3, 1e-4, 1e-5)
     tukey: float = 0.5
-    farthest_m: float = 0.6
     farthest_rad: float = math.radians(10.0)
     tilt_rad: float = math.radians(8.0)
     patch_m: float = 2.0
@@ -79,9 +74,7 @@ class RayParameters:
 
     views, rays : at most so many scans are compared, evenly spread, and of each so many rays.
     bin_rad : size of the bins of directions in which surfaces hide each other.
-    near_m : a point so near to the map lies on it.
     gap_m : a surface is passed, or not reached, if it is at least so far off along the ray.
-    floor_m : points this near to the floor are no evidence: it is the same everywhere.
     patch_m : rays that end within a cell of this size hit one object.
     patch_rays : a patch counts for a place if so many more of its rays end on surfaces of this place than of
         the other.
@@ -91,16 +84,12 @@ class RayParameters:
     views: int = 5
     rays: int = 4000
     bin_rad: float = math.radians(1.5)
-    near_m: float = 0.15
     gap_m: float = 0.4
-    floor_m: float = 0.15
     patch_m: float = 0.5
     patch_rays: int = 3
     above_m: float = 2.0
 
 
-_TILES = 1 << 20  # along y, at most
-_NO_POINTS = np.empty(0, np.int64)
 REGISTRATION = RegistrationParameters()
 RAYS = RayParameters()
 
@@ -114,7 +103,7 @@ class SpatialView:
     points_m: F64
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 @frozen_arrays(
     end_m=(np.float64, "R", 3),
     height_m=(np.float64, "R"),
@@ -137,25 +126,13 @@ class Rays:
     through: NDArray[np.bool_]
     before: NDArray[np.bool_]
 
-    @staticmethod
-    def joined(parts: Sequence[Rays]) -> Rays:
-        """Join the rays of several views."""
-        none = np.empty(0, bool)
-        return Rays(
-            end_m=np.concatenate([np.empty((0, 3)), *(part.end_m for part in parts)]),
-            height_m=np.concatenate([np.empty(0), *(part.height_m for part in parts)]),
-            on=np.concatenate([none, *(part.on for part in parts)]),
-            through=np.concatenate([none, *(part.through for part in parts)]),
-            before=np.concatenate([none, *(part.before for part in parts)]),
-        )
-
     @property
     def counts(self) -> tuple[int, int, int]:
         """Return the numbers of rays that are on, through and before."""
         on, through, before = (int(np.count_nonzero(k)) for k in (self.on, self.through, self.before))
         return on, through, before
 
-    def patches_over(self, other: Rays, parameters: RayParameters = RAYS) -> int:
+    def patches_over(self, other: Rays) -> int:
         """Return the number of patches that only this place explains, minus those that only the other place
         explains.
 
@@ -164,12 +141,12 @@ class Rays:
         """
         contradicted = self.through | self.before, other.through | other.before
         balance = (self.on & contradicted[1]).astype(np.int64) - (other.on & contradicted[0])
-        high = np.minimum(self.height_m, other.height_m) > parameters.above_m
+        high = np.minimum(self.height_m, other.height_m) > RAYS.above_m
         balance, end_m = balance[high], self.end_m[high]
-        cells = np.floor(end_m / parameters.patch_m).astype(np.int64)
+        cells = np.floor(end_m / RAYS.patch_m).astype(np.int64)
         _, patch = np.unique(cells, axis=0, return_inverse=True)
         lead = np.bincount(patch.ravel(), balance)
-        over, under = lead >= parameters.patch_rays, lead <= -parameters.patch_rays
+        over, under = lead >= RAYS.patch_rays, lead <= -RAYS.patch_rays
         return int(np.count_nonzero(over)) - int(np.count_nonzero(under))
 
 
@@ -226,87 +203,48 @@ class SpatialFit:
 
 
 class MapSurface:
-    """The points of a map in space, (V, 3) `points_m`, and the normals of its surfaces: each is estimated
-    once, for the first query near it.
-    """
+    """The points of a map in space, (V, 3) `points_m`, and the surfaces that they show."""
 
-    def __init__(self, points: PointMap, parameters: RegistrationParameters = REGISTRATION) -> None:
-        self._parameters = parameters
+    def __init__(self, points: PointMap) -> None:
         self.points_m: F64 = points.points_m()
-        tiles, of_point, count = np.unique(
-            self._tiles_of(self.points_m), return_inverse=True, return_counts=True
-        )
-        members = np.split(np.argsort(of_point, kind="stable"), np.cumsum(count)[:-1])
-        self._members = dict(zip(tiles.tolist(), members, strict=False))
-        self._surfaces: dict[int, tuple[F64, F64]] = {}
 
-    def near(self, at_m: F64) -> tuple[F64, F64]:
-        """Return the points (M, 3), one a voxel, and the normals (M, 3) of the surfaces within reach of
-        points (N, 3).
-
-        Some lie farther away, because whole tiles are returned.
-        """
-        reach_m = 2.0 * self._parameters.rounds_m[0]
-        corners_m = np.array([(x, y) for x in (-reach_m, reach_m) for y in (-reach_m, reach_m)])
-        tiles = np.unique(self._tiles_of((at_m[:, None, :2] + corners_m).reshape(-1, 2)))
-        none = np.empty((0, 3))
-        points, normals = zip((none, none), *map(self._surface, tiles.tolist()), strict=True)
-        return np.concatenate(points), np.concatenate(normals)
-
-    def _tiles_of(self, points_m: F64) -> I64:
-        """Return the number of the tile of each point (N, 2 or more)."""
-        x, y = np.floor(points_m[:, :2] / self._parameters.tile_m).astype(np.int64).T
-        return np.asarray(x * _TILES + y)
-
-    def _surface(self, tile: int) -> tuple[F64, F64]:
-        """Return the points and normals of a tile."""
+    @cached_property
+    def surfaces(self) -> tuple[F64, F64]:
+        """Return points (M, 3), one a voxel, and the normals (M, 3) of the surfaces there."""
         from pc2grid.open3d_core import o3d
 
-        p = self._parameters
-        if tile not in self._surfaces:
-            beside = [tile + x * _TILES + y for x in (-1, 0, 1) for y in (-1, 0, 1)]
-            members = [self.points_m[self._members.get(k, _NO_POINTS)] for k in (tile, *beside)]
-            if not len(members[0]):
-                return members[0], members[0]
-            points = _around(np.concatenate(members[1:]), members[0], p.normal_radius_m)
-            cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(p.voxel_m)
-            own = np.flatnonzero(self._tiles_of(np.asarray(cloud.points)) == tile)
-            cloud.estimate_normals(
-                o3d.geometry.KDTreeSearchParamHybrid(radius=p.normal_radius_m, max_nn=p.normal_neighbours)
-            )
-            self._surfaces[tile] = np.asarray(cloud.points)[own], np.asarray(cloud.normals)[own]
-        return self._surfaces[tile]
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(self.points_m))
+        cloud = cloud.voxel_down_sample(REGISTRATION.voxel_m)
+        cloud.estimate_normals()
+        return np.asarray(cloud.points), np.asarray(cloud.normals)
 
 
 def register_in_space(
-    views: Sequence[SpatialView],
-    surface: MapSurface,
-    T_map_query: SE2,
-    parameters: RegistrationParameters = REGISTRATION,
-    rays: RayParameters = RAYS,
+    views: Sequence[SpatialView], surface: MapSurface, T_map_query: SE2
 ) -> SpatialFit | Unfit:
     """Register the scans of a query with the points of a map, from a planar pose of its odom frame.
 
     "unknown" if the map has no points there, or the floors are not found on both sides; "left" if ICP leaves
     the neighbourhood of the planar pose.
     """
-    p = parameters
-    cloud = VoxelCloud(p.voxel_m)
+    cloud = VoxelCloud(REGISTRATION.voxel_m)
     for view in views:
         cloud.add(view.points_m)
     query = cloud.points_m()
     if not len(query):
         return "unknown"
     lifted = T_map_query.lift()
-    target = _around(surface.points_m, transform_points(lifted, query), p.margin_m)
+    target = surface.points_m[_around(surface.points_m, transform_points(lifted, query))]
     start = _on_floor(target, query, lifted, views[-1].sensor_m)
     if start is None:
         return "unknown"
-    found = _icp(query, surface.near(transform_points(start, query)), start, p)
+    points_m, normals = surface.surfaces
+    near = _around(points_m, transform_points(start, query))
+    found = _icp(query, points_m[near], normals[near], start)
     if isinstance(found, str):
         return found
     T, information, center_m, rmse_m = found
-    compared = compare_rays(views, target, T, rays)
+    compared = compare_rays(views, target, T)
     on, through, before = compared.counts
     count = on + through + before
     return SpatialFit(
@@ -322,12 +260,14 @@ def register_in_space(
     )
 
 
-def _around(points: F64, query: F64, margin_m: float) -> F64:
-    """Return the points of a map (V, 3) within the horizontal extent of a query (N, 3) in the map."""
+def _around(points: F64, query: F64) -> BoolGrid:
+    """Return a mask (V,) of the points of a map (V, 3) within the horizontal extent of a query (N, 3) in the
+    map.
+    """
+    margin_m = REGISTRATION.margin_m
     low, high = query[:, :2].min(axis=0) - margin_m, query[:, :2].max(axis=0) + margin_m
-    inside = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
-    around: F64 = points[inside]
-    return around
+    inside: BoolGrid = ((points[:, :2] >= low) & (points[:, :2] <= high)).all(axis=1)
+    return inside
 
 
 def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None:
@@ -359,16 +299,14 @@ def _on_floor(target: F64, query: F64, lifted: F64, sensor_m: F64) -> F64 | None
     return start
 
 
-def _icp(
-    query: F64, surface: tuple[F64, F64], start: F64, p: RegistrationParameters
-) -> tuple[F64, F64, F64, float] | Unfit:
+def _icp(query: F64, target_m: F64, normals: F64, start: F64) -> tuple[F64, F64, F64, float] | Unfit:
     """Register a query; returns the pose (4, 4), its information (6, 6) at a point (3,), and the rmse, m.
 
-    surface : points (M, 3) and normals (M, 3) of the map.
+    target_m, normals : (M, 3) of the surfaces of the map.
     """
     from pc2grid.open3d_core import o3d
 
-    target_m, normals = surface
+    p = REGISTRATION
     source, target = (
         o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
         for points in (query[random_subset(len(query), p.points)], target_m)
@@ -379,12 +317,12 @@ def _icp(
     T = start
     for distance_m, converged in zip(p.rounds_m, p.converged, strict=True):
         estimate = steps.TransformationEstimationPointToPlane(steps.TukeyLoss(k=p.tukey * distance_m))
-        criteria = steps.ICPConvergenceCriteria(converged, converged, p.iterations)
+        criteria = steps.ICPConvergenceCriteria(converged, converged)
         result = steps.registration_icp(source, target, distance_m, T, estimate, criteria)
         T = np.array(result.transformation)
         if len(result.correspondence_set) < p.least_points:
             return "unknown"
-        if _has_left(query.mean(axis=0), start, T, p):
+        if _has_left(query.mean(axis=0), start, T):
             return "left"
     pairs = np.asarray(result.correspondence_set)
     placed = transform_points(T, np.asarray(source.points))[pairs[:, 0]]
@@ -401,31 +339,31 @@ def _icp(
     return T, information, center_m, rmse_m
 
 
-def _has_left(center_m: F64, start: F64, T: F64, p: RegistrationParameters) -> bool:
+def _has_left(center_m: F64, start: F64, T: F64) -> bool:
     """Return True if a pose (4, 4) moves or turns a query about its centre (3,) farther than a planar pose
     can be off.
     """
-    turn_rad = rotation_vector(invert_pose(start) @ T)
+    p, turn_rad = REGISTRATION, rotation_vector(invert_pose(start) @ T)
     before_m, after_m = (transform_points(pose, center_m[None])[0] for pose in (start, T))
     return (
-        math.hypot(*(after_m - before_m)[:2]) > p.farthest_m
+        math.hypot(*(after_m - before_m)[:2]) > p.rounds_m[0]
         or abs(turn_rad[2]) > p.farthest_rad
         or math.hypot(turn_rad[0], turn_rad[1]) > p.tilt_rad
     )
 
 
-def compare_rays(
-    views: Sequence[SpatialView], target: F64, T_map_query: F64, parameters: RayParameters = RAYS
-) -> Rays:
-    """Compare rays of the views with the surfaces of a map (V, 3)."""
+def compare_rays(views: Sequence[SpatialView], target: F64, T_map_query: F64) -> Rays:
+    """Compare rays of the views with the surfaces of a map (V, 3).
+
+    Rays to the floor are no evidence: it is the same everywhere.
+    """
     from scipy.spatial import cKDTree
 
-    p = parameters
-    if not len(target):
-        return Rays.joined([])
+    p, near_m = RAYS, REGISTRATION.rounds_m[-1]
     tree = cKDTree(target)
     every = max(1, math.ceil(len(views) / p.views))
-    found = []
+    none = np.empty(0, np.bool_)
+    found: list[tuple[NDArray[Any], ...]] = [(np.empty((0, 3)), np.empty(0), none, none, none)]
     for view in views[::-1][::every]:
         chosen = random_subset(len(view.points_m), p.rays)
         placed = transform_points(T_map_query, view.points_m[chosen])
@@ -436,8 +374,8 @@ def compare_rays(
         ground = find_ground(placed - origin, np.zeros(3))
         if ground is not None:
             height_m = ground.heights(placed - origin)
-        stands = ~(np.abs(height_m) <= p.floor_m)
-        on = tree.query(placed, distance_upper_bound=p.near_m)[0] < p.near_m
+        stands = ~(np.abs(height_m) <= near_m)
+        on = tree.query(placed, distance_upper_bound=near_m)[0] < near_m
         ray_bin, range_m = _directions(placed - origin, p.bin_rad)
         map_bin, map_m = _directions(target - origin, p.bin_rad)
         size = int(max(ray_bin.max(), map_bin.max())) + 1
@@ -446,16 +384,8 @@ def compare_rays(
         np.maximum.at(last, map_bin, map_m)
         through = ~on & (first[ray_bin] < range_m - p.gap_m)
         before = ~on & ~through & (last[ray_bin] > range_m + p.gap_m)
-        found.append(
-            Rays(
-                end_m=view.points_m[chosen],
-                height_m=height_m,
-                on=stands & on,
-                through=stands & through,
-                before=stands & before,
-            )
-        )
-    return Rays.joined(found)
+        found.append((view.points_m[chosen], height_m, stands & on, stands & through, stands & before))
+    return Rays(*map(np.concatenate, zip(*found, strict=True)))
 
 
 def _directions(away: F64, bin_rad: float) -> tuple[NDArray[np.int64], F64]:
