@@ -36,8 +36,6 @@ class MatchingParameters:
     cell_m : edge of a cell of moments. It is also the standard deviation that one point counts with, far
         above the noise of a range: the errors of neighbours on one wall are not independent.
     sectors : number of directions of normals that are kept apart; a point uses its own and the two beside it.
-    least_points : a direction of the position counts as not measured with fewer points (sum of their weights)
-        across it.
     residual_scale_m : scale of the Cauchy weight of a point, times the radius of its neighbourhood in cells.
     prior_scale : scale of the Cauchy weight of the prior, in standard deviations.
     near_sigma_m : the same of a point that KISS-ICP has brought near.
@@ -49,7 +47,6 @@ class MatchingParameters:
     cell_m: float = 0.1
     near_sigma_m: float = 0.4
     sectors: int = 8
-    least_points: float = 0.44
     residual_scale_m: float = 0.05
     prior_scale: float = 2.0
     radii_cells: tuple[int, ...] = (3, 3, 2, 2, 1, 1, 1, 1, 1, 1)
@@ -65,25 +62,21 @@ class TrackingParameters:
     max_points : of a scan, chosen at random; a depth image has 300 000.
     floor_slack_m : height up to which points count as floor.
 
-    Ground:
-
-    rolling_every : scans between two estimates of the floor. The floor under wheels is the mean of all.
-
     Odometry:
 
-    gap : odometry does not continue over more than so many usual intervals between scans.
-    fastest : in m/s and in rad/s; a faster motion reported by odometry is rejected, with an allowance of
-        `jump`, m and rad, for noise.
+    fastest : in m/s and in rad/s; a faster motion reported by odometry is rejected, if a match would not
+        correct it.
 
     Refinement in the plane:
 
-    matched_hits : hits of a scan that are matched, at most, evenly chosen.
-    followed : number of last scans with which a scan is matched that does not fit the local map.
+    matched : hits of a scan that are matched in the plane, or points that are searched with, at most.
+    followed : number of last scans with which a scan is matched that does not fit the local map. With 12, the
+        lag of the smoother, walls seem to have changed where scans are seconds apart (orebro).
     hit_weight : information of a hit, as a share of one that is independent of its neighbours.
     sure_overlap : least overlap of a match that alone decides between odometry and constant velocity; with
         less, a search follows if the prediction is vague enough.
-    search_above_m, search_above_rad : the search is made only if its half width, `KERNEL` standard
-        deviations, exceeds one of these; a refinement alone converges over less.
+    reach_m, reach_rad : a refinement alone converges over so much. The search is made only if its half width,
+        `KERNEL` standard deviations, exceeds one of these.
     search_most_m : largest half width.
     search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
 
@@ -95,29 +88,27 @@ class TrackingParameters:
     Health:
 
     min_overlap : least share of the hits that meet a line of the local map, or of the points a surface.
-    known_m, known_rad : a scan of a sensor in the hand without odometry is lost if a standard deviation of
-        its pose on the local map is larger. The first is half of the tolerance of a right answer.
-    give_up_scans : lost scans in a row after which tracking starts again.
-    standing_m, standing_rad : a base stands while its odometry changes by no more.
-    changed_s : time for which no scan of a standing base fits well, after which the walls have changed; a
-        ride in a lift takes longer.
+    known_m, known_rad : in the plane, a position is measured if its standard deviation by the hits alone is
+        smaller. A scan of a sensor in the hand without odometry is lost if one of its pose on the local map
+        is larger. The first is half of the tolerance of a right answer.
+    give_up_scans : lost scans in a row after which tracking starts again, and usual intervals between scans
+        over which odometry does not continue.
+    standing_s : a base that was upright for so long at the beginning is on wheels: a hand has trembled by
+        then. If no scan of a standing base fits well for so long, the walls have changed; a ride in a lift
+        takes longer.
     """
 
     max_points: int = 40_000
     floor_slack_m: float = 0.1
 
-    rolling_every: int = 8
-
-    gap: float = 10.0
     fastest: float = 4.0
-    jump: float = 0.3
 
-    matched_hits: int = 700
+    matched: int = 600
     followed: int = 5
     hit_weight: float = 0.3
     sure_overlap: float = 0.6
-    search_above_m: float = 0.3
-    search_above_rad: float = 0.2
+    reach_m: float = 0.3
+    reach_rad: float = 0.2
     search_most_m: float = 3.0
     search_sigma_m: float = 0.15
 
@@ -129,9 +120,7 @@ class TrackingParameters:
     known_m: float = 0.15
     known_rad: float = math.radians(3.0)
     give_up_scans: int = 10
-    standing_m: float = 0.02
-    standing_rad: float = 0.01
-    changed_s: float = 3.0
+    standing_s: float = 3.0
 
 
 MATCHING_PARAMETERS = MatchingParameters()
@@ -248,14 +237,12 @@ class PointGrid:
 
         Points, normals and prior are as of `match`.
         """
-        p, points = self._parameters, np.asarray(points_m, np.float64)
-        *_, information, _, _ = self._aligned(
-            points, normal_rad, registered, prior, prior_information, p.radii_cells[:1]
-        )
+        p = self._parameters
+        at = self.match(points_m, normal_rad, registered, prior, prior_information, radii=p.radii_cells[:1])
         turn_rad = wrap_angle(registered.yaw - prior.yaw)
         pull = prior_information @ (registered.x - prior.x, registered.y - prior.y, turn_rad)
-        held = prior_information[_UPPER] + np.array(information) * (self.cell_m / p.near_sigma_m) ** 2
-        x, y, yaw = _solved(tuple(held.tolist()), tuple(pull.tolist()))
+        held = prior_information + at.information * (self.cell_m / p.near_sigma_m) ** 2
+        x, y, yaw = np.linalg.solve(held, pull).tolist()
         return SE2(registered.x - x, registered.y - y, wrap_angle(registered.yaw - yaw))
 
     def match(
@@ -273,65 +260,46 @@ class PointGrid:
         The iterations start at `guess`; the prior is a Gaussian at `prior` with `prior_information` (3, 3) of
         x, y, yaw. radii : half widths of the neighbourhood, as `MatchingParameters.radii_cells`, its default.
         """
-        p, points = self._parameters, np.asarray(points_m, np.float64)
-        placed, by_points, information, found, contradicted = self._aligned(
-            points, normal_rad, guess, prior, prior_information, radii or p.radii_cells
-        )
-        xx, xy, xt, yy, yt, tt = information
-        # The turn is eliminated (Schur complement); what is left on the position has two eigenvalues.
-        t = tt + 1e-9
-        a, b, d = xx - xt * xt / t, xy - xt * yt / t, yy - yt * yt / t
-        least = 0.5 * (a + d) - math.hypot(0.5 * (a - d), b)
-        count = max(len(points), 1)
-        return LineMatch(
-            placed,
-            by_points,
-            np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]]),
-            found / count,
-            contradicted / count,
-            least > p.least_points / self.cell_m**2,
-        )
-
-    def _aligned(
-        self,
-        points_m: F64,
-        normal_rad: NDArray[np.floating],
-        guess: SE2,
-        prior: SE2,
-        prior_information: F64,
-        radii: tuple[int, ...],
-    ) -> tuple[SE2, SE2, tuple[float, ...], int, int]:
-        """Return the results of `aligned`, in the map frame."""
         p, (low_x, low_y) = self._parameters, self.low_m.tolist()
-        pose, alone, information, found, contradicted = aligned(
+        pose, alone, (xx, xy, xt, yy, yt, tt), found, contradicted = aligned(
             self._index,
             self._moments,
             self._free,
-            points_m,
+            np.asarray(points_m, np.float64),
             np.asarray(normal_rad, np.float64),
             (guess.x - low_x, guess.y - low_y, guess.yaw),
             (prior.x - low_x, prior.y - low_y, prior.yaw),
             tuple(prior_information[_UPPER].tolist()),
             self.cell_m,
-            np.array(radii),
+            np.array(radii or p.radii_cells),
             np.full((len(points_m) + 1, 6), -1.0),
             p.residual_scale_m,
             p.prior_scale,
             p.converged,
         )
         placed, by_points = (SE2(x + low_x, y + low_y, wrap_angle(yaw)) for x, y, yaw in (pose, alone))
-        return placed, by_points, information, found, contradicted
+        information = np.array([[xx, xy, xt], [xy, yy, yt], [xt, yt, tt]])
+        count = max(len(points_m), 1)
+        return LineMatch(
+            placed,
+            by_points,
+            information,
+            found / count,
+            contradicted / count,
+            weakest(information) > TRACKING.known_m**-2,
+        )
 
 
 _UPPER = np.triu_indices(3)
 
 
 def weakest(information: F64) -> float:
-    """Return the least information on the position over its directions, from that on a pose (6, 6): position
-    first. The rotation is eliminated (Schur complement).
+    """Return the least information on the position over its directions, from that on a pose (3, 3) or (6, 6):
+    position first. The rotation is eliminated (Schur complement).
     """
-    mixed, turn = information[:3, 3:], information[3:, 3:] + 1e-9 * np.eye(3)
-    return float(np.linalg.eigvalsh(information[:3, :3] - mixed @ np.linalg.solve(turn, mixed.T))[0])
+    n = (len(information) + 1) // 2
+    mixed, turn = information[:n, n:], information[n:, n:] + 1e-9 * np.eye(len(information) - n)
+    return float(np.linalg.eigvalsh(information[:n, :n] - mixed @ np.linalg.solve(turn, mixed.T))[0])
 
 
 def sector_of(normal_rad: F64, sectors: int) -> NDArray[np.int64]:
@@ -432,7 +400,7 @@ def _for_compiled(*arrays: F64) -> Iterator[F64]:
 
 # --- compiled functions -------------------------------------------------------------------------------
 
-_DAMPING = 1e-6  # so that directions that no point measures can be solved for
+DAMPING = 1e-6  # so that directions that no point measures can be solved for
 
 
 @compiled(error_model="numpy")
@@ -556,11 +524,11 @@ def aligned(
 def _solved(A: tuple[float, ...], b: tuple[float, ...]) -> tuple[float, float, float]:
     """Solve A x = b by the factors L D L^T of a positive definite matrix (3, 3), its upper triangle."""
     a00, a01, a02, a11, a12, a22 = A
-    a00 += _DAMPING
+    a00 += DAMPING
     l10, l20 = a01 / a00, a02 / a00
-    d1 = a11 + _DAMPING - l10 * a01
+    d1 = a11 + DAMPING - l10 * a01
     l21 = (a12 - l20 * a01) / d1
-    d2 = a22 + _DAMPING - l20 * a02 - l21 * l21 * d1
+    d2 = a22 + DAMPING - l20 * a02 - l21 * l21 * d1
     y1 = b[1] - l10 * b[0]
     x2 = (b[2] - l20 * b[0] - l21 * y1) / d2
     x1 = y1 / d1 - l21 * x2

@@ -46,23 +46,16 @@ class PlanarMatcher:
     ) -> None:
         self._registration, self._projection = registration, projection
         self._depth_limit = DepthLimit()
-        self._floor = GroundModel(None)
-        self._matching = MATCHING_PARAMETERS
-        self._maps = MatchingMaps(projection.max_range_m)
         self._kiss = KissRegistration(registration)
-        # Of the scan taken last: in the plane, and its points without the floor.
-        self._planar_scan: PlanarScan
-        self._points_m = np.empty((0, 3), np.float32)
         self._latest: deque[tuple[PlanarScan, SE2]] = deque(maxlen=TRACKING.followed)
 
     def start(self, scan: Scan, points_m: F32) -> F64:
         """Begin with the first scan; returns its pose (4, 4): the session frame is its base, levelled."""
-        self._floor = GroundModel.start(points_m, scan)
+        self._floor = GroundModel(points_m, scan)
         narrow = SENSOR_MODELS[scan.sensor].narrow  # the view is a part of the surroundings only
         self._matching = CAMERA_MATCHING if narrow else MATCHING_PARAMETERS
         self._maps = MatchingMaps(self._projection.max_range_m, self._matching)
-        self._points_m = self._floor.remove(points_m)
-        self._planar_scan = self._project(scan, points_m)
+        self.take(scan, points_m)
         return self.levelled(np.eye(4))
 
     def restart(self) -> None:
@@ -80,7 +73,6 @@ class PlanarMatcher:
 
     def take(self, scan: Scan, points_m: F32) -> None:
         """Prepare a scan for the following calls."""
-        self._floor.follow(points_m, scan)
         self._points_m = self._floor.remove(points_m)
         self._planar_scan = self._project(scan, points_m)
 
@@ -131,7 +123,7 @@ class PlanarMatcher:
         information = _turned(belief.information, -prior.yaw)  # in the axes of the session frame
         match = maps.match(self._planar_scan, guess, prior, information)
         unknown = 1.0 - match.overlap - match.contradicted
-        hits = min(len(self._planar_scan.hits_m), p.matched_hits)
+        hits = min(len(self._planar_scan.hits_m), p.matched)
         return ScanMatch(
             pose=match.pose.lift(),
             alone=(match.by_points.lift(), _turned(match.information, match.by_points.yaw)),
@@ -147,8 +139,11 @@ class PlanarMatcher:
         self._latest.append((self._planar_scan, SE2.from_matrix(pose)))
         return self._planar_scan
 
-    def extend(self, pose: F64) -> None:
-        """Add the scan taken last to the local maps at its final pose (4, 4)."""
+    def extend(self, scan: Scan, points_m: F32, pose: F64) -> None:
+        """Add the scan taken last, a keyframe, to the local maps and to the floor at its final pose (4,
+        4).
+        """
+        self._floor.follow(points_m, scan)
         self._maps.extend(self._planar_scan, SE2.from_matrix(pose))
         self._kiss.add(self._points_m, pose)
 
@@ -208,7 +203,7 @@ class MatchingMaps:
     def search(self, planar_scan: PlanarScan, guess: SE2, window_m: float, window_rad: float) -> list[SE2]:
         """Return the best placements of a planar scan around a guess T_session_base, to be refined."""
         p, grid = TRACKING, self._maps[0][0]
-        hits = planar_scan.hits_m[evenly(len(planar_scan.hits_m), p.matched_hits)].astype(np.float64)
+        hits = planar_scan.hits_m[evenly(len(planar_scan.hits_m), p.matched)].astype(np.float64)
         field = grid.likelihood(p.search_sigma_m)
         found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
         return [pose for _, pose in found]
@@ -219,7 +214,7 @@ class MatchingMaps:
         prior, information : Gaussian prior of the pose, with its information (3, 3) of x, y, yaw.
         """
         grid = self._maps[0][0]
-        chosen = evenly(len(planar_scan.hits_m), TRACKING.matched_hits)
+        chosen = evenly(len(planar_scan.hits_m), TRACKING.matched)
         hits, normals = planar_scan.hits_m[chosen], planar_scan.normal_rad[chosen]
         if near != prior:
             near = grid.weighed(hits, normals, near, prior, information)
@@ -249,43 +244,35 @@ class MatchingMaps:
 
 
 class GroundModel:
-    """The floor in the base frame, averaged over the scans that show it.
+    """The floor in the base frame, averaged over the keyframes that show it.
 
     ground : the floor; None for a planar laser, which measures none.
     """
 
-    def __init__(self, ground: Ground | None) -> None:
-        self.ground = ground
-        self._scans = 0
-        self._observations = int(ground is not None and ground.seen)  # that have shown the floor
-
-    @classmethod
-    def start(cls, points_m: F32, scan: Scan) -> GroundModel:
+    def __init__(self, points_m: F32, scan: Scan) -> None:
         """Find the floor in the first scan.
 
         It is searched for at the height given by the mounting of the sensor, then as the lowest level plane;
         else it is assumed. points_m : (N, 3) points of the scan that are used, base frame.
         """
-        if SENSOR_MODELS[scan.sensor].planar:
-            return cls(None)
-        sensor_m = scan.T_base_sensor[:3, 3]
-        assumed = assumed_ground(scan.T_base_sensor)
-        found = find_ground(points_m, sensor_m, assumed) if assumed.offset_m == 0.0 else None
-        return cls(found or find_ground(points_m, sensor_m) or assumed)
+        self.ground: Ground | None = None
+        if not SENSOR_MODELS[scan.sensor].planar:
+            sensor_m, assumed = scan.T_base_sensor[:3, 3], assumed_ground(scan.T_base_sensor)
+            found = find_ground(points_m, sensor_m, assumed) if assumed.offset_m == 0.0 else None
+            self.ground = found or find_ground(points_m, sensor_m) or assumed
+            self._observations = int(self.ground.seen)  # that have shown the floor
 
     def follow(self, points_m: F32, scan: Scan) -> None:
-        """Update the floor by the points (N, 3) of a scan; only every `rolling_every`th scan is used.
+        """Update the floor by the points (N, 3) of a scan.
 
         Wheels do not tilt against the floor, and a ramp ahead soon passes.
         """
         if self.ground is None:
             return
-        self._scans += 1
-        if self._scans % TRACKING.rolling_every == 0:
-            found = find_ground(points_m, scan.T_base_sensor[:3, 3], self.ground)
-            if found is not None:
-                self._observations += 1
-                self.ground = self.ground.toward(found, 1.0 / self._observations)
+        found = find_ground(points_m, scan.T_base_sensor[:3, 3], self.ground)
+        if found is not None:
+            self._observations += 1
+            self.ground = self.ground.toward(found, 1.0 / self._observations)
 
     def remove(self, points_m: F32) -> F32:
         """Remove the floor from points (N, 3), for KISS-ICP."""

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv, dpotrs
 
-from pc2grid.estimation.line_map import inverse_adjoint, moved, steps
+from pc2grid.estimation.line_map import DAMPING, inverse_adjoint, moved, steps
 from pc2grid.geometry import F64, BoolGrid, invert_pose
 from pc2grid.libraries import compiled
 
@@ -44,7 +44,6 @@ ERRORS = 4
 LEAST_S = 1e-3
 """Scans follow each other no faster."""
 _LEAST_DRIFT = 1e-3  # standard deviation of odometry that reports no motion
-_DAMPING = 1e-9  # so that unknowns without evidence can be solved for
 
 
 class SmootherParameters(NamedTuple):
@@ -62,7 +61,8 @@ class SmootherParameters(NamedTuple):
     gyroscope_radps : of a gyroscope, with its bias.
     steady_s : the velocity is averaged over this time, so that an error of one pose does not return in the
         next with the opposite sign.
-    scale, direction_rad, yaw_rad_per_m, turn : standard deviations, over robots, of the systematic errors.
+    systematic, direction_rad, yaw_rad_per_m : standard deviations, over robots, of the systematic errors; the
+        first is that of distances and of turns.
     kernel : see `pc2grid.estimation.smoother.KERNEL`.
     iterations : of Gauss-Newton, at most. converged : they end when no unknown changes by more.
     """
@@ -76,10 +76,9 @@ class SmootherParameters(NamedTuple):
     growth: float = 0.0
     gyroscope_radps: float = 0.02
     steady_s: float = 0.3
-    scale: float = 0.05
+    systematic: float = 0.05
     direction_rad: float = math.radians(2.0)
     yaw_rad_per_m: float = math.radians(2.0)
-    turn: float = 0.05
     kernel: float = KERNEL
     iterations: int = 5
     converged: float = 1e-2
@@ -88,7 +87,7 @@ class SmootherParameters(NamedTuple):
 SMOOTHER = SmootherParameters()
 IN_THE_HAND = SmootherParameters(
     reading_m=0.002, reading_rad=0.001, drift=0.005, drift_turn_m=0.005, unsteady=0.9, growth=0.5,
-    scale=1e-6, direction_rad=1e-6, yaw_rad_per_m=1e-6, turn=1e-6,
+    systematic=1e-6, direction_rad=1e-6, yaw_rad_per_m=1e-6,
 )  # fmt: skip
 """For odometry in six degrees of freedom, which is visual and inertial: it is exact to millimetres from image
 to image, drifts by a percent, and has no wheels whose errors are always the same. Chosen by hand."""
@@ -262,7 +261,7 @@ class Smoother:
         self._state = WindowState(T_session_base[None].copy(), reading[None].copy(), np.zeros(ERRORS))
         self._window = self._row(ScanFactors(seconds=0.0), T_session_base, reading, 0.0)
         self._begins = True  # no scan has been added since
-        errors = np.array([p.scale, p.direction_rad, p.yaw_rad_per_m, p.turn])
+        errors = np.array([p.systematic, p.direction_rad, p.yaw_rad_per_m, p.systematic])
         own = np.concatenate((np.full(d, 1e-4), self._noise(p.reading_m, p.reading_rad)))
         information = np.diag(np.concatenate((errors, own)) ** -2)
         self._prior = MarginalPrior(self._state, np.zeros(len(information)), information)
@@ -388,7 +387,7 @@ class Smoother:
             H, g, self._drift_scale = normal_equations(
                 state, self._window, self._prior, self._free, p, self._drift_scale, n
             )
-            H.flat[:: len(g) + 1] += _DAMPING
+            H.flat[:: len(g) + 1] += DAMPING
             factor, delta, failed = dposv(H.T, -g, overwrite_a=True)
             if failed:
                 raise np.linalg.LinAlgError("the information of the smoother is not positive definite")
@@ -416,7 +415,7 @@ class Smoother:
         )
         information, gradient = _without(H, g, 2 * len(self._free))
         shift = np.asarray(
-            np.linalg.solve(information + _DAMPING * np.eye(len(gradient)), gradient), np.float64
+            np.linalg.solve(information + DAMPING * np.eye(len(gradient)), gradient), np.float64
         )
         self._prior = MarginalPrior(few.part(1, 3), shift, information)
         self._state = self._state.part(1, len(self._state.poses))
@@ -439,7 +438,7 @@ def _without(H: F64, g: F64, first: int) -> tuple[F64, F64]:
     Returns the information and the gradient on the other unknowns.
     """
     old, rest = np.s_[ERRORS : ERRORS + first], np.delete(np.arange(len(H)), np.s_[ERRORS : ERRORS + first])
-    A, B = H[old, old] + _DAMPING * np.eye(first), H[rest, old]
+    A, B = H[old, old] + DAMPING * np.eye(first), H[rest, old]
     solved = np.linalg.solve(A, np.column_stack((B.T, g[old])))
     reduced = H[rest][:, rest] - B @ solved[:, :-1]
     return 0.5 * (reduced + reduced.T), g[rest] - B @ solved[:, -1]

@@ -44,20 +44,24 @@ class SpatialParameters:
 
     least_agreement : least agreement, -1..1, of a credible pose with the known cells at its points. In a
         hall, right poses have 0.89 and more, wrong ones 0.66 to 0.88 (lidar/hall).
-    residual_weight_per_m : of two matches the one with the larger agreement - weight * residual is taken.
-    starts : placements that a search refines in space. turned_rad : standard deviation of their orientation:
-        more than a step of the search.
-    most_waiting : scans kept, at most, until one shows the floor or a motion: some 50 MB.
-    standing_s : a base that stands level for so long is on wheels: a robot that waits to be located must not
-        wait for its own motion, and a hand has trembled by then.
+    most_waiting : scans kept, at most, until one shows the floor, or all that the sensor is on wheels: some
+        50 MB.
+
+    The local map:
+
+    noise_m : points whose deviation is larger are not used. good_m : points whose deviation is smaller count
+        fully when a scan is registered.
+    step_rad : a scan joins the map after this turn, or when it has moved by a cell of the grid.
+    assumed_m : height of the sensor above the floor as long as no floor is visible.
     """
 
     least_agreement: float = 0.85
-    residual_weight_per_m: float = 5.0
-    starts: int = 10
-    turned_rad: float = 0.1
     most_waiting: int = 100
-    standing_s: float = 5.0
+
+    noise_m: float = 0.025
+    good_m: float = 0.01
+    step_rad: float = math.radians(3.0)
+    assumed_m: float = 1.4
 
 
 SPATIAL_MATCHING = SpatialParameters()
@@ -77,14 +81,14 @@ class SpatialMatcher:
         projection: ProjectionConfig,
     ) -> None:
         self._registration, self._projection = registration, projection
-        self._map: SpaceMap | None = None
+        self._space: SpaceMap
+        self._begins = True  # a scan that is taken begins a map
         self._last: F64 = np.eye(4)  # pose of the last scan that was not lost
-        # Of the scan taken last.
-        self._thinned = ThinnedScan(np.empty((0, 3)), np.empty(0), np.empty((0, 9)))
+        self._thinned: ThinnedScan  # of the scan taken last
 
     def restart(self) -> None:
         """Forget the map: the next scan begins a new one."""
-        self._map = None
+        self._begins = True
 
     def start(self, scan: Scan, points_m: F32) -> F64:
         """Begin with the first scan; returns its pose (4, 4): the session frame is its base, levelled."""
@@ -97,13 +101,14 @@ class SpatialMatcher:
 
     def __bool__(self) -> bool:
         """Return True if there is a local map."""
-        return bool(self._map)
+        return bool(self._space)
 
     def take(self, scan: Scan, points_m: F32) -> None:
         """Prepare a scan for the following calls."""
-        if self._map is None:
-            self._map = SpaceMap(scan, points_m, self._registration, self._projection)
-        self._thinned = self._map.thin(scan, points_m, self._last[:3, :3])
+        if self._begins:
+            self._space = SpaceMap(scan, points_m, self._registration, self._projection)
+            self._begins = False
+        self._thinned = self._space.thin(scan, points_m, self._last[:3, :3])
 
     def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
         """Match from the expected pose."""
@@ -116,9 +121,8 @@ class SpatialMatcher:
         """
         step_m = float(np.linalg.norm(belief.pose[:3, 3] - self._last[:3, 3]))
         window_m = min(step_m + KERNEL * belief.sigmas[0], TRACKING.search_most_m)
-        covariance = np.diag([window_m**2] * 3 + [SPATIAL_MATCHING.turned_rad**2] * 3)
-        for guess in self._space.search(self._thinned, self._last, window_m, SPATIAL_MATCHING.starts):
-            yield self._matched(guess, PoseWithCovariance(guess, covariance, belief.free))
+        for guess in self._space.search(self._thinned, self._last, window_m):
+            yield self._matched(guess, PoseWithCovariance(guess, window_m**2 * np.eye(6), belief.free))
 
     def _matched(self, guess: F64, held: PoseWithCovariance) -> ScanMatch:
         """Match the scan taken last with the map from a guess (4, 4), with a belief as prior."""
@@ -126,13 +130,12 @@ class SpatialMatcher:
         surfaces, points_m, weights = space.surfaces, self._thinned.points_m, self._thinned.weights
         found = surfaces.match(points_m, weights, surfaces.near(points_m, weights, guess, held), held)
         of_known, of_all = space.agreement(self._thinned, found.pose)
-        quality = of_all - SPATIAL_MATCHING.residual_weight_per_m * found.residual_m
         return ScanMatch(
             pose=found.pose,
             alone=_alone(found, held),
             overlap=found.overlap,
             measured=found.measured,
-            evidence=SURFACES.independent(len(self._thinned.points_m)) * quality,
+            evidence=SURFACES.independent(len(self._thinned.points_m)) * of_all,
             credible=of_known >= SPATIAL_MATCHING.least_agreement,
         )
 
@@ -145,21 +148,21 @@ class SpatialMatcher:
         tilt the scan. Not of a camera, whose narrow view shows too little for that.
         """
         thinned, (alone, information) = self._thinned, fit.alone
-        placement = SurfaceMatch(fit.pose, information, fit.overlap, 0.0, fit.measured)
-        held = self._space.surfaces.observable(thinned.points_m, thinned.weights, placement)
-        information, pull, turn = held.information.copy(), np.zeros(6), self._last[:3, :3]
+        kept = self._space.surfaces.observable(thinned.points_m, thinned.weights, fit.pose)
+        information, pull, turn = kept.T @ information @ kept, np.zeros(6), self._last[:3, :3]
         if len(thinned.shapes):
             of_turns, pull[3:] = vertical_held(thinned.shapes, turn @ alone[2, :3])
             pull[3:] = turn.T @ pull[3:]
             information[3:, 3:] += turn.T @ of_turns @ turn
             step = np.asarray(np.linalg.solve(information + LEAST_INFORMATION, pull), np.float64)
             alone = moved(alone[None], step[None])[0]
-        return replace(fit, alone=(alone, information), measured=held.measured)
+        measured = fit.measured and np.array_equal(kept, np.eye(6))
+        return replace(fit, alone=(alone, information), measured=measured)
 
     def follow(self, belief: PoseWithCovariance) -> None:
         """Return None: the surfaces of the last scans are in the map."""
 
-    def extend(self, pose: F64) -> None:
+    def extend(self, scan: Scan, points_m: F32, pose: F64) -> None:
         """Do nothing: `cut` adds scans to the map, more of them than there are keyframes."""
 
     def cut(self, scan: Scan, points_m: F32, pose: F64, *, lost: bool) -> PlanarScan:
@@ -171,13 +174,6 @@ class SpatialMatcher:
             self._space.extend(scan, points_m, self._thinned, pose)
             self._last = pose
         return self._space.cut(scan, pose)
-
-    @property
-    def _space(self) -> SpaceMap:
-        """Return the map, which exists as soon as a scan has been taken."""
-        if self._map is None:
-            raise ValueError("no scan has been taken")
-        return self._map
 
 
 def _alone(found: SurfaceMatch, held: PoseWithCovariance) -> Measurement:
@@ -197,9 +193,6 @@ _UPRIGHT_HEIGHT_M, _UPRIGHT_TILT_RAD = 0.05, math.radians(0.5)
 """A base on wheels keeps its height and its tilt within these, as its odometry reports them: an EKF in three
 dimensions reports some tenths of a degree; a phone in the hand (depth/room) 0.8 to 6.5 degrees in a second.
 Without odometry, a sensor that is mounted lower than this above its base is in the hand."""
-DECIDING_SCANS = 20
-"""So many scans of a base that moves decide whether it is on wheels; what tilts and rises later is on a ramp.
-By hand."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,18 +234,15 @@ def begin(scans: Iterator[Scan]) -> Beginning:
 def _until_decided(scans: Iterator[Scan]) -> tuple[list[Scan], bool]:
     """Take scans until they decide between hand and wheels; returns them, and True for a sensor in the hand.
 
-    A hand may be level for a moment. So only scans count after which the base has moved, or may have moved;
-    or a base that has stood for so long.
+    A hand is level for a moment only. What tilts and rises later is on a ramp.
     """
     waiting: list[Scan] = []
-    moving = 0
     for scan in scans:
         waiting.append(scan)
         if not is_rolling(scan, waiting[0]):
             return waiting, True
-        moving += _has_moved(waiting[0], scan)
-        stands = not moving and scan.stamp_ns - waiting[0].stamp_ns > SPATIAL_MATCHING.standing_s * 1e9
-        if SENSOR_MODELS[scan.sensor].planar or moving == DECIDING_SCANS or stands:
+        upright_s = (scan.stamp_ns - waiting[0].stamp_ns) * 1e-9
+        if SENSOR_MODELS[scan.sensor].planar or upright_s > TRACKING.standing_s:
             break
     return waiting, False
 
@@ -270,16 +260,6 @@ def is_rolling(scan: Scan, first: Scan | None = None) -> bool:
     before = T if first is None or first.T_odom_base is None else first.T_odom_base
     level = float(T[2, 2]) > math.cos(_UPRIGHT_TILT_RAD)
     return level and abs(float(T[2, 3] - before[2, 3])) < _UPRIGHT_HEIGHT_M
-
-
-def _has_moved(first: Scan, scan: Scan) -> bool:
-    """Return True if a base has moved since the first scan as far as makes a keyframe, or if that is
-    unknown."""
-    if first.T_odom_base is None or scan.T_odom_base is None:
-        return True
-    distance_m, turn_rad = motion_size(invert_pose(first.T_odom_base) @ scan.T_odom_base)
-    p = TRACKING
-    return distance_m >= p.keyframe_travel_m or turn_rad >= p.keyframe_turn_rad
 
 
 def _knows_vertical(scan: Scan) -> bool:
@@ -309,27 +289,6 @@ def first_pose(scan: Scan, points_m: F32) -> F64:
 # --- the local map ------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SpaceMapParameters:
-    """Numbers of the local map in space. Chosen by hand.
-
-    noise_m : points whose deviation is larger are not used. good_m : points whose deviation is smaller count
-        fully when a scan is registered.
-    step_m, step_rad : a scan joins the map after this motion.
-    assumed_m : height of the sensor above the floor as long as no floor is visible.
-    search_sigma_m : of the likelihood field that is searched. search_points : points that are searched with.
-    """
-
-    noise_m: float = 0.025
-    good_m: float = 0.01
-    step_m: float = 0.05
-    step_rad: float = math.radians(3.0)
-    assumed_m: float = 1.4
-    search_sigma_m: float = 0.15
-    search_points: int = 200
-
-
-SPACE_MAP = SpaceMapParameters()
 _DOWN = np.array([(0.05 * i, 0.05 * j, -1.0) for i, j in np.ndindex(9, 9)]) - (0.2, 0.2, 0.0)
 """Rays from a sensor to the floor, in its height above that: who carries it walks on ground 0.4 m wide.
 So it is free, unless measurements there contradict it."""
@@ -371,10 +330,12 @@ class SpaceMap:
         """Make an empty map, with voxels that suit the points (N, 3) of a scan, base frame."""
         self._projection = projection
         self._noise_per_m2 = SENSOR_MODELS[scan.sensor].noise_per_m2
-        noise_range_m = SENSOR_MODELS[scan.sensor].range_of_noise_m(SPACE_MAP.noise_m)
+        noise_range_m = SENSOR_MODELS[scan.sensor].range_of_noise_m(SPATIAL_MATCHING.noise_m)
         self._reach_m = min(projection.max_range_m, noise_range_m)
         ranges_m = np.linalg.norm(points_m - scan.T_base_sensor[:3, 3], axis=1)
-        self.surfaces = SurfaceMap.of_first_scan(ranges_m, 2.0 * projection.max_range_m, registration)
+        middle_m = float(np.percentile(ranges_m, 75)) if len(ranges_m) else 0.0
+        edge_m = float(np.clip(SURFACES.edge_per_range * middle_m, *SURFACES.edge_m))
+        self.surfaces = SurfaceMap(edge_m, 2.0 * projection.max_range_m, registration)
         self._columns = ColumnMap(self._reach_m, scan.sensor, projection)
         self._added_at: F64 | None = None  # pose of the last scan that joined
         self._floor = FloorBelow()
@@ -392,7 +353,7 @@ class SpaceMap:
         sigma_m = self._noise_per_m2 * np.einsum("ij,ij->i", away, away)
         return ThinnedScan(
             thinned,
-            1.0 / (1.0 + (sigma_m / SPACE_MAP.good_m) ** 2),
+            1.0 / (1.0 + (sigma_m / SPATIAL_MATCHING.good_m) ** 2),
             self.surfaces.alone(shown @ turn.T),
         )
 
@@ -402,12 +363,11 @@ class SpaceMap:
         """
         return self._columns.agreement(self._lowered(thinned.placed(pose)))
 
-    def search(self, thinned: ThinnedScan, guess: F64, window_m: float, count: int) -> list[F64]:
+    def search(self, thinned: ThinnedScan, guess: F64, window_m: float) -> list[F64]:
         """Search the best few poses (4, 4) in all headings, with the height and the tilt of a guess (4, 4).
 
         The points at the height of walls are searched for in the plane, within `window_m` along x and y.
         """
-        p = SPACE_MAP
         planar = SE2.from_matrix(guess)
         T_level_base = planar.inverse().lift() @ guess
         level = thinned.placed(T_level_base)
@@ -415,20 +375,19 @@ class SpaceMap:
         band = level[(heights > self._projection.band_min_m) & (heights < self._projection.band_max_m), :2]
         if not len(band):
             return []
-        field, corner_m = self._columns.walls(p.search_sigma_m)
-        chosen = band[evenly(len(band), p.search_points)]
-        found = best_placements(
-            field, corner_m, self._projection.resolution_m, chosen, planar, window_m, math.pi, count=count
-        )
+        field, corner_m = self._columns.walls(TRACKING.search_sigma_m)
+        chosen = band[evenly(len(band), TRACKING.matched)]
+        cell_m = self._projection.resolution_m
+        found = best_placements(field, corner_m, cell_m, chosen, planar, window_m, math.pi)
         return [pose.lift() @ T_level_base for _, pose in found]
 
     def extend(self, scan: Scan, points_m: F32, thinned: ThinnedScan, pose: F64) -> None:
         """Add a scan at its final pose (4, 4), if the sensor has moved enough since the last one."""
-        p = SPACE_MAP
+        step_m = self._projection.resolution_m
         self._above_floor_m, travel_m = None, 0.0
         if self._added_at is not None:
             travel_m, turned_rad = motion_size(invert_pose(self._added_at) @ pose)
-            if travel_m < p.step_m and turned_rad < p.step_rad:
+            if travel_m < step_m and turned_rad < SPATIAL_MATCHING.step_rad:
                 return
         self._added_at = pose
         self.surfaces.add(thinned.points_m, pose)
@@ -439,7 +398,7 @@ class SpaceMap:
         if seen_m is not None:
             self._above_floor_m = float(pose[2, 3]) - seen_m
         rays_m = placed
-        if travel_m >= p.step_m:  # who turns on the spot may hold the sensor over a table
+        if travel_m >= step_m:  # who turns on the spot may hold the sensor over a table
             rays_m = np.concatenate(
                 (placed, sensor_m + _DOWN * (1.0, 1.0, sensor_m[2] - self._floor_m(sensor_m)))
             )
@@ -460,7 +419,7 @@ class SpaceMap:
 
     def _floor_m(self, sensor_m: F64) -> float:
         """Return z of the floor below a sensor at (3,)."""
-        assumed_m = float(sensor_m[2]) - SPACE_MAP.assumed_m
+        assumed_m = float(sensor_m[2]) - SPATIAL_MATCHING.assumed_m
         return assumed_m if self._floor.z_m is None else self._floor.z_m
 
     def _lowered(self, points_m: F64) -> F64:

@@ -13,14 +13,14 @@ decides in the directions that the points do not fix.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from pc2grid.clouds.cloud import AXIS_BITS, HALF_VOXELS, random_subset
-from pc2grid.estimation.line_map import moved, steps, weakest
+from pc2grid.estimation.line_map import MATCHING_PARAMETERS, TRACKING, moved, steps, weakest
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.smoother import PoseWithCovariance
 from pc2grid.geometry import F32, F64, I64, BoolGrid
@@ -34,21 +34,20 @@ class SurfaceParameters:
 
     edge_per_range, edge_m : the edge of a voxel is this times the 75th percentile of the first ranges, within
         these bounds: a room needs finer voxels than a hall.
-    thinning : a scan is reduced to one point for each cube of this many edges.
+    thinning : a scan is reduced to one point for each cube of this many edges. To test which directions are
+        observable, points are displaced by as much.
+    near_scale : of the Cauchy weight at the pose of KISS-ICP, in edges. aside_scale : the same of that test.
     kiss : edge of a voxel of KISS-ICP over that of this map.
-    points : of a scan that are aligned, at most. few_points : the same for the test of observability.
+    points : of a scan that are aligned, at most.
     least : least number of points of a voxel with a shape. most : a voxel with more forgets the oldest in
-        proportion.
+        proportion. Without that, e1r loses a scan.
     noise_m : a voxel constrains points in the directions in which its own have a deviation below this.
-    point_sigma_m : standard deviation that one point counts with. It is far above the noise of a range, since
-        the errors of neighbours on one surface are not independent (as `MatchingParameters.point_sigma_m`).
-    near_sigma_m : the same for the pose of KISS-ICP. near_scale : of the Cauchy weight there, in edges.
+    near_sigma_m : standard deviation that one point counts with for the pose of KISS-ICP. Otherwise it is
+        `MatchingParameters.cell_m`.
     rounds : scale (m) of the Cauchy weight of a distance in each iteration.
     converged : the iterations end when a step, in rad and m, is smaller.
     least_points : with less information than that of so many points along it, a direction of the position is
-        not measured.
-    aside, aside_scale : points are displaced by this many edges to test which directions are observable, with
-        this scale of the Cauchy weight, in edges.
+        not measured: uneven voxels seem to hold a floor in every direction.
     least_kept : secant over tangent of an observable direction, at least. The least of the six has a median
         of 0.4 to 0.6 in recordings of two rooms, a kitchen, an office and a hall, and of 0.15 to 0.2 in
         simulated flats in which scans slipped.
@@ -57,27 +56,24 @@ class SurfaceParameters:
     edge_per_range: float = 0.04
     edge_m: tuple[float, float] = (0.1, 0.5)
     thinning: float = 0.5
+    near_scale: float = 3.0
+    aside_scale: float = 1.5
     kiss: float = 2.0
     points: int = 2000
-    few_points: int = 600
     least: float = 4.0
     most: float = 200.0
     noise_m: float = 0.02
-    point_sigma_m: float = 0.1
     near_sigma_m: float = 1.0
-    near_scale: float = 3.0
     rounds: tuple[float, ...] = (0.3, 0.3, 0.3, 0.1, 0.1, 0.1, *(0.05,) * 8)
     converged: float = 2e-4
     least_points: float = 5.0
-    aside: float = 0.5
-    aside_scale: float = 1.5
     least_kept: float = 0.2
 
     def independent(self, points: int) -> float:
         """Return the number of points with independent errors that are worth as much as so many points of a
         scan.
         """
-        return (self.noise_m / self.point_sigma_m) ** 2 * min(points, self.points)
+        return (self.noise_m / MATCHING_PARAMETERS.cell_m) ** 2 * min(points, self.points)
 
 
 SURFACES = SurfaceParameters()
@@ -92,14 +88,13 @@ class SurfaceMatch:
 
     pose : (4, 4) T_map_base. information : (6, 6), from the points alone, of a change of the pose as in
     `pc2grid.estimation.line_map`.
-    overlap : share of the points that meet a surface of the map. residual_m : their mean distance from it.
+    overlap : share of the points that meet a surface of the map.
     measured : True if the points fix every direction of the position.
     """
 
     pose: F64
     information: F64
     overlap: float
-    residual_m: float
     measured: bool
 
 
@@ -139,9 +134,8 @@ class _Rows:
 class VoxelShapes:
     """A map of voxels with the shape of the surface in each. edge_m : of a voxel."""
 
-    def __init__(self, edge_m: float, least: float, most: float, noise_m: float) -> None:
+    def __init__(self, edge_m: float) -> None:
         self.edge_m = edge_m
-        self._least, self._most, self._noise_m = least, most, noise_m
         self._rows = _Rows()
         self._slots: NDArray[np.int32] = np.full(1 << 15, -1, np.int32)
         self._entered = 0  # rows that the slots hold
@@ -157,8 +151,8 @@ class VoxelShapes:
 
     def add(self, points_m: F64) -> None:
         """Add points (N, 3), in the frame of the map."""
-        rows, touched = self._rows, np.unique(self.enter(points_m))
-        fit_shapes(rows.codes, rows.moments, rows.shapes, touched, self.edge_m, self._least, self._noise_m)
+        p, rows, touched = SURFACES, self._rows, np.unique(self.enter(points_m))
+        fit_shapes(rows.codes, rows.moments, rows.shapes, touched, self.edge_m, p.least, p.noise_m)
 
     def enter(self, points_m: F64) -> I64:
         """Add points (N, 3) to the moments alone; return the row (N,) of the voxel of each."""
@@ -170,7 +164,7 @@ class VoxelShapes:
         touched = np.empty(len(points_m), np.int64)
         rows.used = self._entered = add(
             self._slots, rows.codes, rows.moments, self._entered, rows.used, points_m, self.edge_m,
-            self._most, touched,
+            SURFACES.most, touched,
         )  # fmt: skip
         return touched
 
@@ -181,16 +175,13 @@ class VoxelShapes:
         self._slots[:], self._entered = -1, 0
         self.enter(np.empty((0, 3)))
 
-    def equations(
-        self, points_m: F64, weights: F64, pose: F64, scale_m: float
-    ) -> tuple[F64, F64, float, float]:
+    def equations(self, points_m: F64, weights: F64, pose: F64, scale_m: float) -> tuple[F64, F64, float]:
         """Linearise the distances of points (N, 3) in a change of their pose (4, 4), in its own axes.
 
-        Returns H (6, 6) and g (6,) of the step H d = -g, the number of points with a shape, and the sum of
-        their distances.
+        Returns H (6, 6) and g (6,) of the step H d = -g, and the number of points with a shape.
         """
         rows, H, g, J, room = self._rows, np.zeros((6, 6)), np.zeros(6), np.eye(3, 6), np.empty((3, 8))
-        found, distance_m = normal_equations(
+        found = normal_equations(
             self._slots, rows.codes, rows.shapes, points_m, weights,
             np.ascontiguousarray(pose),  # or the kernel is compiled twice
             self.edge_m, scale_m, H, g, J, room,
@@ -198,7 +189,7 @@ class VoxelShapes:
         H = H + np.triu(H, 1).T
         R = np.zeros((6, 6))
         R[:3, :3] = R[3:, 3:] = pose[:3, :3]
-        return R.T @ H @ R, R.T @ g, found, distance_m
+        return R.T @ H @ R, R.T @ g, found
 
 
 class SurfaceMap:
@@ -210,38 +201,24 @@ class SurfaceMap:
         reach_m: float,
         registration: RegistrationConfig,
     ) -> None:
-        p = SURFACES
         self._reach_m = reach_m
         self._cleared_at: F64 | None = None
-        self.fine = VoxelShapes(edge_m, p.least, p.most, p.noise_m)
-        self._kiss = KissRegistration(registration, p.kiss * edge_m, reach_m)
-
-    @classmethod
-    def of_first_scan(
-        cls,
-        ranges_m: NDArray[np.floating],
-        reach_m: float,
-        registration: RegistrationConfig,
-    ) -> SurfaceMap:
-        """Return an empty map whose voxels suit the surroundings, by the ranges (N,) of a first scan."""
-        p = SURFACES
-        middle_m = float(np.percentile(ranges_m, 75)) if len(ranges_m) else 0.0
-        return cls(float(np.clip(p.edge_per_range * middle_m, *p.edge_m)), reach_m, registration)
+        self.fine = VoxelShapes(edge_m)
+        self._kiss = KissRegistration(registration, SURFACES.kiss * edge_m, reach_m)
 
     def __bool__(self) -> bool:
         return len(self.fine) > 0
 
     def thinned(self, points_m: F32) -> F64:
         """Downsample the points (N, 3) of a scan to about one for each half voxel."""
-        p, points = SURFACES, points_m.astype(np.float64)
-        rows = VoxelShapes(p.thinning * self.fine.edge_m, p.least, p.most, p.noise_m).enter(points)
+        points = points_m.astype(np.float64)
+        rows = VoxelShapes(SURFACES.thinning * self.fine.edge_m).enter(points)
         # The rows are numbered by the first of their points.
         return points[np.diff(np.maximum.accumulate(rows), prepend=-1) > 0]
 
     def alone(self, points_m: F64) -> F64:
         """Return the shapes (V, 9) of the surfaces in points (N, 3) alone."""
-        p = SURFACES
-        view = VoxelShapes(self.fine.edge_m, p.least, p.most, p.noise_m)
+        view = VoxelShapes(self.fine.edge_m)
         view.add(points_m)
         return view.shapes
 
@@ -261,60 +238,12 @@ class SurfaceMap:
 
         weights : (N,) of the points, 0..1, by their noise.
         """
-        chosen = random_subset(len(points_m), SURFACES.points)
-        return self._align(points_m[chosen], weights[chosen], guess, prior)
-
-    def near(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> F64:
-        """Register thinned points (N, 3) by KISS-ICP from a guess (4, 4), and weigh the pose against a prior.
-
-        The weight is the information of the surfaces there: KISS-ICP slides in the directions that they leave
-        free.
-        """
-        p, registered = SURFACES, self._kiss.register(points_m, guess)
-        few = random_subset(len(points_m), p.few_points)
-        H = self.fine.equations(points_m[few], weights[few], registered, p.near_scale * self.fine.edge_m)[0]
-        step = _step(registered, H / p.near_sigma_m**2, np.zeros(6), prior)
-        near: F64 = moved(registered[None], step[None])[0]
-        return near
-
-    def observable(self, points_m: F64, weights: F64, placement: SurfaceMatch) -> SurfaceMatch:
-        """Return a match of thinned points (N, 3) with only the information that the surfaces really provide.
-
-        On surfaces that noise has made uneven, points find a neighbour anywhere, and the tangent of their
-        distances suggests a constraint. Half a voxel aside no gradient draws them back: the secant of the
-        gradients there is small beside the tangent. Both are compared along the six principal changes of the
-        pose, in metres of displacement of the points. Directions that are not observable get no information.
-        """
-        p = SURFACES
-        few = random_subset(len(points_m), p.few_points)
-        points, own, aside_m = points_m[few], weights[few], p.aside * self.fine.edge_m
-
-        def at(step: F64) -> tuple[F64, F64]:
-            """Return the Hessian (6, 6) and gradient (6,) after a change (6,) of the pose."""
-            pose = moved(placement.pose[None], step[None])[0]
-            return self.fine.equations(points, own, pose, p.aside_scale * self.fine.edge_m)[:2]
-
-        displacement = _displacement(points)
-        tangents, changes = eigh(at(np.zeros(6))[0], displacement)
-        secants = [
-            change @ (at(aside_m * change)[1] - at(-aside_m * change)[1]) / (2.0 * aside_m)
-            for change in changes.T
-        ]
-        unconstrained = changes[:, secants < p.least_kept * tangents]
-        kept = np.eye(6) - unconstrained @ unconstrained.T @ displacement
-        return replace(
-            placement,
-            information=kept.T @ placement.information @ kept,
-            measured=placement.measured and not unconstrained.size,
-        )
-
-    def _align(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> SurfaceMatch:
-        """Align points by Gauss-Newton from a guess."""
-        p = SURFACES
-        unit = p.point_sigma_m**-2
-        pose, information, found, distance_m = guess, np.zeros((6, 6)), 0.0, 0.0
+        p, chosen = SURFACES, random_subset(len(points_m), SURFACES.points)
+        points_m, weights = points_m[chosen], weights[chosen]
+        unit = MATCHING_PARAMETERS.cell_m**-2
+        pose, information, found = guess, np.zeros((6, 6)), 0.0
         for scale_m in p.rounds:
-            H, g, found, distance_m = self.fine.equations(points_m, weights, pose, scale_m)
+            H, g, found = self.fine.equations(points_m, weights, pose, scale_m)
             information = unit * H
             step = _step(pose, information, unit * g, prior)
             pose = moved(pose[None], step[None])[0]
@@ -324,9 +253,49 @@ class SurfaceMap:
             pose,
             information,
             found / max(len(points_m), 1),
-            distance_m / max(found, 1.0),
             weakest(information) > p.least_points * unit,
         )
+
+    def near(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> F64:
+        """Register thinned points (N, 3) by KISS-ICP from a guess (4, 4), and weigh the pose against a prior.
+
+        The weight is the information of the surfaces there: KISS-ICP slides in the directions that they leave
+        free.
+        """
+        p, registered = SURFACES, self._kiss.register(points_m, guess)
+        few = random_subset(len(points_m), TRACKING.matched)
+        H = self.fine.equations(points_m[few], weights[few], registered, p.near_scale * self.fine.edge_m)[0]
+        step = _step(registered, H / p.near_sigma_m**2, np.zeros(6), prior)
+        near: F64 = moved(registered[None], step[None])[0]
+        return near
+
+    def observable(self, points_m: F64, weights: F64, pose: F64) -> F64:
+        """Return the projection (6, 6) of changes of a pose (4, 4) of thinned points (N, 3) onto those that
+        the surfaces really constrain; the identity if these are all.
+
+        On surfaces that noise has made uneven, points find a neighbour anywhere, and the tangent of their
+        distances suggests a constraint. Half a voxel aside no gradient draws them back: the secant of the
+        gradients there is small beside the tangent. Both are compared along the six principal changes of the
+        pose, in metres of displacement of the points.
+        """
+        p = SURFACES
+        few = random_subset(len(points_m), TRACKING.matched)
+        points, own, aside_m = points_m[few], weights[few], p.thinning * self.fine.edge_m
+
+        def at(step: F64) -> tuple[F64, F64]:
+            """Return the Hessian (6, 6) and gradient (6,) after a change (6,) of the pose."""
+            there = moved(pose[None], step[None])[0]
+            return self.fine.equations(points, own, there, p.aside_scale * self.fine.edge_m)[:2]
+
+        displacement = _displacement(points)
+        tangents, changes = eigh(at(np.zeros(6))[0], displacement)
+        secants = [
+            change @ (at(aside_m * change)[1] - at(-aside_m * change)[1]) / (2.0 * aside_m)
+            for change in changes.T
+        ]
+        unconstrained = changes[:, secants < p.least_kept * tangents]
+        kept: F64 = np.eye(6) - unconstrained @ unconstrained.T @ displacement
+        return kept
 
 
 def _step(pose: F64, information: F64, gradient: F64, prior: PoseWithCovariance) -> F64:
@@ -460,17 +429,17 @@ def normal_equations(
     g: F64,
     J: F64,
     room: F64,
-) -> tuple[float, float]:
+) -> float:
     """Linearise the distances of points (N, 3) from the shapes (V, 9) of the voxels around them.
 
     pose : (4, 4). A point meets the shape whose mean is nearest, of its own voxel and the 26 around it. scale
     : of the Cauchy weight of a distance. weights : (N,) inverse variances of the points, relative. The
     unknowns are the shift and the rotation vector of the placed points about the origin of the base.
 
-    Adds to the upper triangle of H (6, 6) and to g (6,), and returns the number of points with a shape, and
-    the sum of their distances. J : (3, 6), the identity and zeros; it and `room` (3, 8) are written to.
+    Adds to the upper triangle of H (6, 6) and to g (6,), and returns the number of points with a shape. J :
+    (3, 6), the identity and zeros; it and `room` (3, 8) are written to.
     """
-    found, total = 0.0, 0.0
+    found = 0.0
     for n in range(len(points)):
         px, py, pz = points[n, 0], points[n, 1], points[n, 2]
         rx = pose[0, 0] * px + pose[0, 1] * py + pose[0, 2] * pz
@@ -523,5 +492,4 @@ def normal_equations(
             for b in range(a, 6):
                 H[a, b] += J[0, a] * room[0, b] + J[1, a] * room[1, b] + J[2, a] * room[2, b]
         found += 1.0
-        total += math.sqrt(squared)
-    return found, total
+    return found

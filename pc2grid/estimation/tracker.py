@@ -30,7 +30,7 @@ import numpy as np
 
 from pc2grid.clouds.cloud import deskew, random_subset
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.estimation.line_map import TRACKING, steps
+from pc2grid.estimation.line_map import TRACKING, steps, weakest
 from pc2grid.estimation.planar import PlanarMatcher
 from pc2grid.estimation.smoother import (
     IN_THE_HAND,
@@ -136,7 +136,7 @@ class Tracker:
         # 4. Judge the pose, and start again if nothing fits any more.
         health = self._judged(placed, estimate, evidence)
         sure = placed.sure and not placed.first
-        if self._standstill.left(scan, sure=sure) and self._sensor.follow(first) is not None:
+        if self._standstill.left(scan, sure=sure) and self._fits_last(first):
             self._walls_changed, health = True, self._health.give_up()
         pose = self._sensor.levelled(estimate.pose)
         tracked = self._finish(scan, points, pose, health)
@@ -160,6 +160,11 @@ class Tracker:
         unaided = estimate if self._in_hand and not read else None
         return self._health.judge(placed, unaided, bridged=bridged)
 
+    def _fits_last(self, belief: PoseWithCovariance) -> bool:
+        """Return True if the scan fits the scans before it, and they fix its position."""
+        motion = self._sensor.follow(belief)
+        return motion is not None and weakest(motion[1]) > TRACKING.known_m**-2
+
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
         """Extend the maps by a scan that is due, and keep its final pose."""
         lost = health is Health.LOST
@@ -167,7 +172,7 @@ class Tracker:
         keyframe = not lost and len(planar_scan.hits_m) > 0 and self._is_due(pose)
         if keyframe:
             self._keyframe = SE2.from_matrix(pose)
-            self._sensor.extend(pose)
+            self._sensor.extend(scan, points, pose)
         restart = keyframe and self._restarted
         walls_changed = restart and self._walls_changed
         if keyframe:
@@ -342,7 +347,7 @@ class MatchSelector:
     def _is_vague(self, belief: PoseWithCovariance) -> bool:
         """Return True if a belief is wider than the reach of a match."""
         p, (sigma_m, sigma_rad) = TRACKING, belief.sigmas
-        return KERNEL * max(sigma_m / p.search_above_m, sigma_rad / p.search_above_rad) > 1.0
+        return KERNEL * max(sigma_m / p.reach_m, sigma_rad / p.reach_rad) > 1.0
 
 
 def _spread(found: Sequence[_Candidate], best: _Candidate) -> F64:
@@ -421,11 +426,11 @@ class Standstill:
         known = self._known
         if sure or known is None or T_odom_base is None:
             return False
-        p, (distance_m, turn_rad) = TRACKING, motion_size(invert_pose(known[1]) @ T_odom_base)
-        if distance_m <= p.standing_m and turn_rad <= p.standing_rad:
+        distance_m, turn_rad = motion_size(invert_pose(known[1]) @ T_odom_base)
+        if distance_m <= KERNEL * SMOOTHER.reading_m and turn_rad <= KERNEL * SMOOTHER.reading_rad:
             return False
         self._known = scan.stamp_ns, T_odom_base
-        return (scan.stamp_ns - known[0]) * 1e-9 > p.changed_s
+        return (scan.stamp_ns - known[0]) * 1e-9 > TRACKING.standing_s
 
 
 class Odometer:
@@ -459,20 +464,26 @@ class Odometer:
             return True
         reported = self.reported(scan)
         usual_s = (scan.stamp_ns - self._begin_ns) * 1e-9 / max(self._scans, 1)
-        gap = min(seconds, scan.odometry_gap_s) > TRACKING.gap * usual_s
+        gap = min(seconds, scan.odometry_gap_s) > TRACKING.give_up_scans * usual_s
         return reported is not None and not gap and self.is_possible(reported, seconds)
 
     def is_possible(self, motion: F64, seconds: float) -> bool:
         """Return True if a robot or a person indoors can make a motion (4, 4) in a time."""
         p, (distance_m, turn_rad) = TRACKING, motion_size(motion)
-        return max(distance_m, turn_rad) <= p.jump + p.fastest * seconds
+        return max(distance_m, turn_rad) <= p.reach_m + p.fastest * seconds
 
     def disagreement(self, scan: Scan, pose: F64) -> Disagreement | None:
         """Compare the reported motion with the one to the final pose (4, 4) of a scan."""
         reported = self.reported(scan)
         if reported is None or self._last is None:
             return None
-        return disagreement(reported, invert_pose(self._last[1]) @ pose)
+        moved = invert_pose(self._last[1]) @ pose
+        distance_m, turn_rad = motion_size(invert_pose(reported) @ moved)
+        (reported_m, reported_rad), (moved_m, moved_rad) = motion_size(reported), motion_size(moved)
+        is_outlier = distance_m > _INEXACT_M + _INEXACT_SHARE * max(
+            reported_m, moved_m
+        ) or turn_rad > _INEXACT_RAD + _INEXACT_SHARE * max(reported_rad, moved_rad)
+        return Disagreement(distance_m, turn_rad, is_outlier)
 
 
 _INEXACT_M, _INEXACT_RAD, _INEXACT_SHARE = 0.1, 0.1, 0.1
@@ -492,16 +503,6 @@ class Disagreement:
     distance_m: float
     turn_rad: float
     is_outlier: bool
-
-
-def disagreement(reported: F64, moved: F64) -> Disagreement:
-    """Compare the motion (4, 4) that odometry reports with that of the poses."""
-    distance_m, turn_rad = motion_size(invert_pose(reported) @ moved)
-    (reported_m, reported_rad), (moved_m, moved_rad) = motion_size(reported), motion_size(moved)
-    is_outlier = distance_m > _INEXACT_M + _INEXACT_SHARE * max(
-        reported_m, moved_m
-    ) or turn_rad > _INEXACT_RAD + _INEXACT_SHARE * max(reported_rad, moved_rad)
-    return Disagreement(distance_m, turn_rad, is_outlier)
 
 
 def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreement | None]) -> OdometryCheck:

@@ -16,7 +16,7 @@ from pc2grid.geometry import F64, SE2
 gtsam = pytest.importorskip("gtsam")
 GAUSSIAN = SMOOTHER._replace(
     kernel=1e6, iterations=20, converged=1e-9,
-    scale=1e-9, direction_rad=1e-9, yaw_rad_per_m=1e-9, turn=1e-9,
+    systematic=1e-9, direction_rad=1e-9, yaw_rad_per_m=1e-9,
 )  # fmt: skip
 MATCH = np.diag([0.05**-2, 0.02**-2, 0.01**-2])
 SEEN_EVERY = 4  # of four scans one fits the map; odometry carries the others
