@@ -48,6 +48,7 @@ from pc2grid._version import __version__
 # as the module would hide it.
 if TYPE_CHECKING:
     from pc2grid.errors import Pc2GridError as Pc2GridError
+    from pc2grid.estimation.tracker import follow as follow
     from pc2grid.geometry import SE2 as SE2
     from pc2grid.io.maps import load_map as load_map, save_map as save_map
     from pc2grid.io.recording import Log as Log, open_log as open_log
@@ -63,12 +64,6 @@ if TYPE_CHECKING:
         Trajectory as Trajectory,
     )
     from pc2grid.observer import Observer as Observer, TimeSpan as TimeSpan
-    from pc2grid.pipeline import (
-        build_map as build_map,
-        build_maps as build_maps,
-        follow as follow,
-        map_scans as map_scans,
-    )
     from pc2grid.simulate import SimulationConfig as SimulationConfig, simulate_session as simulate_session
     from pc2grid.submaps.submaps import partition as submaps_of  # noqa: F401
 
@@ -81,10 +76,15 @@ if TYPE_CHECKING:
     )
     from signature.localization.answer import Answer as Answer
     from signature.localization.localizer import Localizer as Localizer
-    from signature.localization.map_index import MapIndex as MapIndex
-    from signature.localization.prior import Prior as Prior
-    from signature.localization.shown.page import Found as Found
+    from signature.places.map_index import MapIndex as MapIndex
+    from signature.places.prior import Prior as Prior
+    from signature.session.build import (
+        build_map as build_map,
+        build_maps as build_maps,
+        map_scans as map_scans,
+    )
     from signature.sessions import convert as convert, relocalize as relocalize
+    from signature.shown.page import Found as Found
 
 # Where each is found; with another name there, behind the colon. A test compares this with the list above.
 _HOMES = {
@@ -106,10 +106,10 @@ _HOMES = {
     "Submap": "pc2grid.model",
     "Trajectory": "pc2grid.model",
     "Observer": "pc2grid.observer",
-    "build_map": "pc2grid.pipeline",
-    "build_maps": "pc2grid.pipeline",
-    "follow": "pc2grid.pipeline",
-    "map_scans": "pc2grid.pipeline",
+    "build_map": "signature.session.build",
+    "build_maps": "signature.session.build",
+    "follow": "pc2grid.estimation.tracker",
+    "map_scans": "signature.session.build",
     "SimulationConfig": "pc2grid.simulate",
     "simulate_session": "pc2grid.simulate",
     "submaps_of": "pc2grid.submaps.submaps:partition",
@@ -121,9 +121,9 @@ _HOMES = {
     "convert": "signature.sessions",
     "relocalize": "signature.sessions",
     "Answer": "signature.localization.answer",
-    "Found": "signature.localization.shown.page",
-    "MapIndex": "signature.localization.map_index",
-    "Prior": "signature.localization.prior",
+    "Found": "signature.shown.page",
+    "MapIndex": "signature.places.map_index",
+    "Prior": "signature.places.prior",
     "Localizer": "signature.localization.localizer",
 }
 __all__ = ["__version__", *_HOMES]

@@ -448,7 +448,7 @@ class Contradiction:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Consistency:
-    """The agreement of a map with its own scans (`pc2grid.mapping.quality`).
+    """The agreement of a map with its own scans (`signature.session.quality`).
 
     hits_on_free : share of all wall hits that lie on free ground of the map, 0..1. Hits on moving objects are
         not counted.
@@ -485,7 +485,7 @@ class UncertainSegment:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precision:
-    """The precision of the places of a map relative to each other (`pc2grid.mapping.quality`).
+    """The precision of the places of a map relative to each other (`signature.session.quality`).
 
     stamps_ns : (N,) increasing, of scans along the travel, a few metres apart.
     sigma_m : (N,) standard deviation of the position there, in the least certain direction, relative to the

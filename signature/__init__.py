@@ -48,16 +48,15 @@ if TYPE_CHECKING:
     )
     from signature.localization.answer import Answer as Answer
     from signature.localization.localizer import Localizer as Localizer, locate_map as locate_map
-    from signature.localization.map_index import MapIndex as MapIndex
     from signature.localization.pose_check import PoseCheck as PoseCheck, check_pose as check_pose
-    from signature.localization.prior import Prior as Prior
-    from signature.localization.shown.page import Found as Found
     from signature.paper import (
         Signature as Signature,
         SignatureTable as SignatureTable,
         describe as signature_of,  # noqa: F401
         distances as distances,
     )
+    from signature.places.map_index import MapIndex as MapIndex
+    from signature.places.prior import Prior as Prior
     from signature.sessions import (
         add_session as add_session,
         build_session as build_session,
@@ -66,6 +65,7 @@ if TYPE_CHECKING:
         provenance as provenance,
         relocalize as relocalize,
     )
+    from signature.shown.page import Found as Found
 
 # Where each is found; with another name there, behind the colon. A test compares this with the list above.
 _HOMES = {
@@ -78,11 +78,11 @@ _HOMES = {
     "convert": "signature.sessions",
     "relocalize": "signature.sessions",
     "Answer": "signature.localization.answer",
-    "Found": "signature.localization.shown.page",
-    "MapIndex": "signature.localization.map_index",
+    "Found": "signature.shown.page",
+    "MapIndex": "signature.places.map_index",
     "PoseCheck": "signature.localization.pose_check",
     "check_pose": "signature.localization.pose_check",
-    "Prior": "signature.localization.prior",
+    "Prior": "signature.places.prior",
     "Localizer": "signature.localization.localizer",
     "locate_map": "signature.localization.localizer",
     "add_session": "signature.sessions",

@@ -23,8 +23,8 @@ from typing import Any
 
 from pc2grid._version import __version__
 from pc2grid.errors import ClusterError, DatabaseError
+from pc2grid.grids.drawn import is_drawn_map
 from pc2grid.libraries import require
-from pc2grid.mapping.drawn import is_drawn_map
 from pc2grid.observer import Observer, TimeSpan
 from signature.config import Config
 from signature.database.protocol import CONNECT_TIMEOUT_S, Entry, Label, Provenance

@@ -21,14 +21,13 @@ from pc2grid._version import __version__
 from pc2grid.clouds.cloud import VoxelCloud
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.errors import ConfigError, OutputError
+from pc2grid.estimation.tracker import follow
+from pc2grid.grids.drawn import DrawnMap, digest_of_map, is_drawn_map, load_drawn_map
 from pc2grid.io.atomic import require_writable
 from pc2grid.io.recording import Log, open_log
 from pc2grid.libraries import one_blas_thread
-from pc2grid.mapping.drawn import DrawnMap, digest_of_map, is_drawn_map, load_drawn_map
-from pc2grid.mapping.part_maps import lost_warnings
 from pc2grid.model import Health, PointMap, ReadReport, RegisteredScan, SessionMap, Trajectory
 from pc2grid.observer import Observer, ProgressBars, TimeSpan
-from pc2grid.pipeline import build_maps, follow, longest_of
 from pc2grid.submaps.submaps import divide
 from signature.config import Config
 from signature.database import Label, Provenance, SubmapDatabase, open_database
@@ -36,12 +35,13 @@ from signature.database.maintenance import exists, store
 from signature.database.postgres import is_url
 from signature.localization.answer import Answer, corrected_path
 from signature.localization.localizer import Localizer, locate_map
-from signature.localization.map_index import MapIndex
-from signature.localization.place_recognition import recognizer_for
 from signature.localization.pose_check import PoseCheck
-from signature.localization.prior import Prior
-from signature.localization.shown.page import Found
 from signature.paper import Signature, describe
+from signature.places.map_index import MapIndex
+from signature.places.prior import Prior
+from signature.session.build import build_maps, longest_of
+from signature.session.part_maps import lost_warnings
+from signature.shown.page import Found
 
 # --- from file to file --------------------------------------------------------------------------------
 
@@ -390,7 +390,6 @@ def build_sessions(
                 session=name,
                 span=span,
                 observer=observer,
-                recognizer=recognizer_for(config),
             )
         origin = provenance(path, log.digest(), config, span=span, label=label)
     return maps, origin

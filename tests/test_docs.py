@@ -38,7 +38,7 @@ import pc2grid
 import signature
 from pc2grid_cli import demo
 from pc2grid_cli.main import app
-from signature.localization.shown.picture import MISSED_LABEL, SUPPORT_LABELS
+from signature.shown.picture import MISSED_LABEL, SUPPORT_LABELS
 from tests.helpers import doc_files
 from tests.helpers.browser import DESK, PHONE, Browser
 from tests.helpers.nav2_map import nav2_map

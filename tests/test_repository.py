@@ -159,7 +159,7 @@ def test_the_wheel_holds_the_packages_without_tests_and_laboratory(wheel: zipfil
     assert tops == {*wanted, f"pc2grid-{version}.dist-info", f"pc2grid-{version}.data"}
     for package in wanted:
         assert f"{package}/py.typed" in wheel.namelist()
-    assert "signature/localization/shown/report.html" in wheel.namelist()
+    assert "signature/shown/report.html" in wheel.namelist()
 
 
 def test_the_wheel_alone_simulates_and_says_what_compare_needs(

@@ -21,7 +21,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import chain
@@ -42,10 +42,12 @@ from pc2grid.estimation.smoother import (
     ScanMatch,
     Smoother,
 )
-from pc2grid.estimation.spatial import SpatialMatcher
+from pc2grid.estimation.spatial import SpatialMatcher, begin
 from pc2grid.geometry import F32, F64, SE2, invert_pose, motion_size
+from pc2grid.libraries import one_blas_thread_each
 from pc2grid.model import MOST_LISTED, Health, OdometryCheck, OdometryOutlier, RegisteredScan, Scan
-from pc2grid.settings import ProjectionConfig, RegistrationConfig
+from pc2grid.observer import Observer
+from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
 
 ScanMatcher = PlanarMatcher | SpatialMatcher
 """Matches the scans of a session, one after another, with a local map."""
@@ -527,3 +529,35 @@ def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreemen
     return OdometryCheck(
         compared=len(compared), overruled=len(overruled), stretches=tuple(stretches[:MOST_LISTED])
     )
+
+
+def follow(
+    scans: Iterable[Scan], config: Config = Config(), observer: Observer = Observer()
+) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
+    """Yield each scan with its pose, and its planar scan, as they come.
+
+    The memory needed is that of one local map, however many scans there are.
+
+    observer : gets a warning of scans that are left out before the first that shows which way is up
+        (`pc2grid.estimation.spatial.begin`).
+
+    >>> import pc2grid
+    >>> with pc2grid.open_log("tuesday.mcap") as log:
+    ...     poses = [scan.T_session_base for scan, _ in follow(log.scans(0.0, 1.0))]
+    >>> poses[0].shape, float(poses[0][0, 3])
+    ((4, 4), 0.0)
+    """
+    return one_blas_thread_each(_followed(scans, config, observer))
+
+
+def _followed(
+    scans: Iterable[Scan], config: Config, observer: Observer
+) -> Iterator[tuple[RegisteredScan, PlanarScan]]:
+    rest = iter(scans)
+    beginning = begin(rest)
+    tracker = Tracker(config.registration, config.projection, in_hand=beginning.in_hand)
+    if beginning.warning is not None:
+        observer.on_warning(beginning.warning)
+    for scan in itertools.chain(beginning.scans, rest):
+        tracked = tracker.track(scan)
+        yield tracked.registered, tracked.planar_scan

@@ -18,9 +18,9 @@
 
 `pc2grid_lab.fit.posterior` fits b, c and d to queries whose truth is known, and judges them on buildings that
 were left out. They are fitted to fr079, intel, csail, aces, killian, wean, kidnap, workshop, birmingham, the
-hall, jarvis, the room and the kitchen of the catalogue of recordings. Loops (`pc2grid.mapping.loops`) had no
-part in it: on all pairs of local maps that csail and fr079 compare, it tells right from wrong ones as well as
-limits that were chosen for them did.
+hall, jarvis, the room and the kitchen of the catalogue of recordings. Loops (`signature.session.loops`) had
+no part in it: on all pairs of local maps that csail and fr079 compare, it tells right from wrong ones as well
+as limits that were chosen for them did.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A building is a floor plan, extruded to walls of one height, or a real one as a point cloud or a mesh. Rays
 hit the faces of the occupied voxels of a cloud, or the triangles of a mesh. For both the floor is found and
-levelled, and the robot drives where it is visible and free of obstacles (`pc2grid.mapping.drawn`). Clutter is
+levelled, and the robot drives where it is visible and free of obstacles (`pc2grid.grids.drawn`). Clutter is
 in other places in each session: chairs, boxes, tables, people. The three sensors have directions and times of
 their rays, and noise and losses of their readings.
 """
@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from pc2grid.geometry import F32, F64, SE2, BoolGrid, frozen_arrays, transform_points
+from pc2grid.grids.drawn import CLOUD_MAP, check_plausible, drivable_plan, level_cloud, named, voxel_cloud
 from pc2grid.io.building_file import (
     building_points,
     is_building_file,
@@ -30,7 +31,6 @@ from pc2grid.io.building_file import (
     sampled,
 )
 from pc2grid.io.maps import is_map_file, load_map
-from pc2grid.mapping.drawn import CLOUD_MAP, check_plausible, drivable_plan, level_cloud, named, voxel_cloud
 from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.settings import ReadConfig
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig

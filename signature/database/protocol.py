@@ -2,7 +2,7 @@
 format.
 
 A session drifts where it closes no loop, and joining corrects it by other sessions
-(`signature.localization.joining.building`). Its map stays as it was drawn; the correction is a `Deformation`,
+(`signature.join.building`). Its map stays as it was drawn; the correction is a `Deformation`,
 a small rigid motion that varies over the map. It has a row for each of some places of the map: x and y of the
 place, and the motion of the map about it, x, y and yaw, all in the axes of the map. In between, the motions
 are blended by a Gaussian of the distance. A map without rows is rigid.

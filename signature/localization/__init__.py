@@ -1,1 +1,1 @@
-"""From proposals to a decision: hypotheses, confidence, answer."""
+"""From what a look-up finds to an answer: evidence, belief, decision."""

@@ -5,7 +5,7 @@ corridor hold a query across it and with its heading, and along it the query fit
 there are many places and yet much is known. The same answer in the frame of a building, where its session was
 joined with others. The path of the query, corrected by where it was located on the way.
 
-`signature.localization.shown` draws answers.
+`signature.shown` draws answers.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from pc2grid.geometry import F64, I64, SE2, frozen_arrays, lever_arm, wrap_angle
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
-from signature.localization.hypotheses import HYPOTHESES, SAME, is_inside
-from signature.localization.prior import drifted
+from signature.places.hypotheses import HYPOTHESES, SAME, is_inside
+from signature.places.prior import drifted
 
 Status = Literal["located", "ambiguous", "not_found"]
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]
@@ -125,7 +125,7 @@ class Answer:
     local_map : what the query has seen, in its odom frame: what the hypotheses were compared with. views_m :
     where it was described by signatures, in that frame. map : of the session of the best hypothesis.
     sessions, labels : all of the database, that `Fit.session_index` counts. part : of the query, see
-    `signature.localization.query.QueryMap`.
+    `signature.places.query.QueryMap`.
     prior : what became of the prior, None if there was none. Not used: "lapsed", registration was lost after
     the time that it is about; "ahead", its time lies after the last scan. excluded : the best place that the
     prior excludes, if nothing that it allows is certain and this fits better.

@@ -31,8 +31,6 @@ from pc2grid.libraries import one_blas_thread
 from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan
 from signature.localization.answer import LIKELY, Answer, State, fits_changed
-from signature.localization.hypotheses import moved_to_origin
-from signature.localization.map_index import MapIndex
 from signature.localization.posterior import (
     Belief,
     PriorOf,
@@ -43,7 +41,9 @@ from signature.localization.posterior import (
     slip_of,
     weighed,
 )
-from signature.localization.query import Query, QueryMap, ViewSpacing, map_as_query
+from signature.places.hypotheses import moved_to_origin
+from signature.places.map_index import MapIndex
+from signature.places.query import Query, QueryMap, ViewSpacing, map_as_query
 
 MOST_KEPT = 5000
 """So many of the latest answers, scans that wait for a search to end, and poses of scans are kept, so that

@@ -33,9 +33,9 @@ from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
 from signature.localization.localizer import MOST_KEPT, Localizer
-from signature.localization.map_index import MapIndex
 from signature.localization.posterior import kept
-from signature.localization.prior import Prior
+from signature.places.map_index import MapIndex
+from signature.places.prior import Prior
 
 CheckStatus = Literal["fine", "lost", "unsure"]
 
@@ -93,7 +93,7 @@ def check_pose(
 ) -> PoseCheck:
     """Return whether a pose is right, by the last metres of a registered recording.
 
-    scans : with their planar scans, from `pc2grid.pipeline.follow`, in any frame of their own.
+    scans : with their planar scans, from `pc2grid.estimation.tracker.follow`, in any frame of their own.
     stamp_ns : time of the pose, of which the nearest scan is meant; None: the last scan.
     session : whose map frame the pose is in; may be None if there is only one.
 

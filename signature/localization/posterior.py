@@ -83,10 +83,10 @@ from pc2grid.matching.evidence import EVIDENCE, LEFT, evidence_of, masses, tempe
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, Unfit, register_in_space
 from pc2grid.matching.score import Fit, score_fit
 from signature.localization.answer import LIKELY, Answer, Place, PoseInSpace, SpaceStatus, State, Status
-from signature.localization.hypotheses import HYPOTHESES, SIGMAS, agree, more_exact, one_place
-from signature.localization.map_index import MapIndex
-from signature.localization.prior import drifted
-from signature.localization.query import QueryInSpace, QueryMap
+from signature.places.hypotheses import HYPOTHESES, SIGMAS, agree, more_exact, one_place
+from signature.places.map_index import MapIndex
+from signature.places.prior import drifted
+from signature.places.query import QueryInSpace, QueryMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

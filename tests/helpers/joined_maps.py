@@ -5,7 +5,7 @@ import numpy as np
 
 from pc2grid.geometry import SE2
 from pc2grid.model import UNKNOWN, OccupancyGrid
-from signature.localization.joining.join import JoinableMap
+from signature.join.join import JoinableMap
 from tests.helpers.simulated_drives import RESOLUTION_M, building, office
 
 WEST, EAST = (0.0, 0.0, 13.0, 14.0), (6.0, 0.0, 20.0, 14.0)

@@ -16,8 +16,8 @@ from pc2grid.submaps.submaps import WALL, isovist, partition
 from signature.config import Config
 from signature.database import Label
 from signature.database.protocol import BuildingFrame
-from signature.localization.map_index import MapIndex
 from signature.paper import Signature, SignatureTable, describe
+from signature.places.map_index import MapIndex
 
 RESOLUTION_M = 0.05
 

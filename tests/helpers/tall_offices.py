@@ -7,10 +7,10 @@ import numpy as np
 
 from pc2grid.clouds.cloud import VoxelCloud
 from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.estimation.tracker import follow
 from pc2grid.geometry import SE2
 from pc2grid.io.building_file import sampled
 from pc2grid.model import PointMap, RegisteredScan
-from pc2grid.pipeline import follow
 from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.scene import extrude
 from signature.config import Config

@@ -26,7 +26,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_lab.truth import read_relations, relation_error
 from signature.config import Config
 from signature.paper import Signature, SignatureTable
-from signature.retrieval.places import LazySequence
+from signature.places.places import LazySequence
 from tests.helpers.recordings import drive, write_mcap
 from tests.helpers.session_maps import LOOPS, session, way
 from tests.helpers.simulated_drives import office

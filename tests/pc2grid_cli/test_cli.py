@@ -102,7 +102,7 @@ def after(code: str, *arguments: object, cwd: Path) -> list[str]:
 _FOR_PICTURES = ("matplotlib", "PIL", "rich", "plotly", "dash")
 _OF_OTHER_SENSORS = ("open3d",)
 _NOT_IN_USE = ("scipy.fft", "scipy.optimize", "scipy.signal", "skimage", "sklearn", "pandas")
-_OF_OTHER_COMMANDS = ("pc2grid.simulate", "pc2grid_lab", "signature.localization.joining", "dask", "psycopg")
+_OF_OTHER_COMMANDS = ("pc2grid.simulate", "pc2grid_lab", "signature.join", "dask", "psycopg")
 
 
 def test_a_laser_is_located_without_libraries_for_other_things(office_folder: Path) -> None:

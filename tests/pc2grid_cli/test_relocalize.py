@@ -176,7 +176,7 @@ def drifting(*arguments: Any) -> Iterator[Any]:
         yield replace(registered, T_session_base=at.lift()), planar_scan
 
 
-follow = pc2grid.pipeline.follow
+follow = pc2grid.estimation.tracker.follow
 
 
 def test_the_path_follows_where_the_robot_was_located(

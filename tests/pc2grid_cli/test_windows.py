@@ -23,7 +23,7 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app
 from pc2grid_cli.output import schema
 from pc2grid_cli.relocalize import write_places
-from signature.localization.map_index import MapIndex
+from signature.places.map_index import MapIndex
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
 from tests.helpers.session_maps import way

@@ -24,7 +24,7 @@ from signature.conversion_jobs import Job
 from signature.database import Label, Provenance, maintenance, open_database
 from signature.database.postgres import is_url
 from signature.database.protocol import Entry
-from signature.localization.joining.building import join_sessions
+from signature.join.building import join_sessions
 from signature.sessions import digest_of
 
 

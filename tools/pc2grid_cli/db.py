@@ -20,8 +20,8 @@ from signature.database.maintenance import shown
 from signature.database.protocol import by_building, largest_m
 
 if TYPE_CHECKING:
-    from signature.localization.joining.building import Joined
-    from signature.localization.joining.join import SessionPair
+    from signature.join.building import Joined
+    from signature.join.join import SessionPair
 
 
 def info(given: options.DbInfo, terminal: console.Console) -> None:
@@ -126,7 +126,7 @@ _SAID = {"joined": "joined", "ambiguous": "ambiguous", "different": "not the sam
 
 def join(given: options.DbJoin, terminal: console.Console) -> None:
     """Compare every two sessions, store how they lie to each other, and print it."""
-    from signature.localization.joining.building import join_sessions
+    from signature.join.building import join_sessions
 
     output.check_file("plot", given.plot, given.force)
     with open_database(given.database) as opened:
@@ -202,7 +202,7 @@ def _sigma_m(covariance: Sequence[Sequence[float]]) -> float:
 
 def _draw(path: Path, database: SubmapDatabase, found: Joined) -> None:
     """Draw the building with most sessions; nothing if none is joined."""
-    from signature.localization.shown.picture import draw_building
+    from signature.shown.picture import draw_building
 
     known = by_building(found.frames)
     if not known:

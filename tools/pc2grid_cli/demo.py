@@ -27,9 +27,9 @@ from pc2grid_cli.output import make_folder
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.shown.page import write_report
-from signature.localization.shown.picture import draw_answer
 from signature.sessions import add_sessions, build_session, find
+from signature.shown.page import write_report
+from signature.shown.picture import draw_answer
 
 BUILDING_SEED = 3
 MAP_LENGTH_M = 60.0

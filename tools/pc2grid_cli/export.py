@@ -27,8 +27,8 @@ from pc2grid_cli import console, options, output
 from signature.database import SubmapDatabase, open_database
 from signature.database.protocol import BuildingFrame, SessionInfo
 from signature.localization.answer import Answer
-from signature.localization.shown.page import write_report
-from signature.localization.shown.picture import draw_building, draw_session
+from signature.shown.page import write_report
+from signature.shown.picture import draw_building, draw_session
 
 BuildingFrames = Mapping[str, BuildingFrame]
 """Of the buildings that sessions are joined in, by session."""
@@ -53,7 +53,7 @@ def run(given: options.Export, terminal: console.Console) -> None:
     _check(outputs, given)
     libraries.require(libraries.of_addresses(given.database))
     # Only maps of buildings need what joins them.
-    from signature.localization.joining.building import floors_of
+    from signature.join.building import floors_of
 
     with open_database(given.database) as opened:
         if given.building is not None or given.floor is not None:
@@ -160,7 +160,7 @@ def _write_map(
     stem: Path, database: SubmapDatabase, names: Sequence[str], frames: BuildingFrames, of: MapOf | None
 ) -> None:
     """Write the map of a session, or of all of a floor that are joined. of : what it shows."""
-    from signature.localization.joining.building import map_of
+    from signature.join.building import map_of
 
     planes = dict.fromkeys(_plane(info, database.grid(info.name)) for info in database.sessions(names))
     save_map(

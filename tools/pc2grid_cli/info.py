@@ -20,7 +20,7 @@ from pc2grid.model import SENSOR_MODELS
 from pc2grid_cli import console, options, output
 
 if TYPE_CHECKING:
-    from pc2grid.mapping.drawn import DrawnMap
+    from pc2grid.grids.drawn import DrawnMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,7 +66,7 @@ def run(given: options.ShowInfo, terminal: console.Console) -> int | None:
 
 def describe_map(path: Path, assignments: list[str] | None = None) -> dict[str, Any]:
     """Return the document of a map. Raises MapFileError if it cannot be read."""
-    from pc2grid.mapping.drawn import load_drawn_map
+    from pc2grid.grids.drawn import load_drawn_map
 
     drawn = load_drawn_map(path, options.Settings(assignments=assignments).settings())
     grid, R = drawn.grid, drawn.T_map_file[:3, :3]

@@ -23,9 +23,9 @@ from pc2grid_cli.output import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.localization.answer import pose_text
-from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, check_pose
-from signature.localization.prior import Prior
+from signature.places.map_index import MapIndex
+from signature.places.prior import Prior
 from signature.sessions import about_query, open_database_or_map, query_config, tracked
 
 

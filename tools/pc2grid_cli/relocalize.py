@@ -20,13 +20,12 @@ from pc2grid import libraries
 from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, LogError, NotALog, one_line
 from pc2grid.geometry import F64
+from pc2grid.grids.drawn import is_drawn_map
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.map_pose import write_initialpose
 from pc2grid.io.maps import is_map_file
 from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import stamp_text, write_trajectory
-from pc2grid.mapping.drawn import is_drawn_map
-from pc2grid.mapping.quality import PROMISED_M
 from pc2grid.matching.score import Fit
 from pc2grid.model import SENSOR_MODELS, Trajectory
 from pc2grid.observer import Observer, TimeSpan
@@ -38,10 +37,11 @@ from signature.database import SubmapDatabase
 from signature.database.maintenance import is_database
 from signature.database.protocol import BuildingFrame
 from signature.localization.answer import AmbiguousLine, Answer, answer_in_building, pose_text
-from signature.localization.map_index import MapIndex
-from signature.localization.shown.page import Found, write_report
-from signature.localization.shown.picture import draw_answer, draw_answers
+from signature.places.map_index import MapIndex
+from signature.session.quality import PROMISED_M
 from signature.sessions import find, query_config
+from signature.shown.page import Found, write_report
+from signature.shown.picture import draw_answer, draw_answers
 
 _FILES = ("trajectory", "csv", "initialpose", "output", "plot", "report")
 """Options that name what is written, in this order."""

@@ -45,9 +45,9 @@ from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.localization.answer import Answer
 from signature.localization.localizer import Follower, Localizer
-from signature.localization.map_index import MapIndex
-from signature.localization.shown.page import page
+from signature.places.map_index import MapIndex
 from signature.sessions import find, query_config
+from signature.shown.page import page
 
 _META = '<meta http-equiv="Content-Security-Policy"'
 

@@ -20,23 +20,23 @@ import numpy as np
 from pc2grid import libraries
 from pc2grid.display import plain, probability
 from pc2grid.errors import ConfigError, TrackingLost, one_line
+from pc2grid.estimation.tracker import follow
 from pc2grid.geometry import SE2
 from pc2grid.io.live.live_log import LiveLog, is_robot, open_live
 from pc2grid.io.live.nav2 import Nav2Publisher, Outlet
 from pc2grid.io.recording import ScanSource, open_log
 from pc2grid.model import RegisteredScan
 from pc2grid.observer import Observer
-from pc2grid.pipeline import follow
 from pc2grid_cli import console, known_pose, options
 from pc2grid_cli.output import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
+from signature.join.building import map_of
 from signature.localization.answer import Answer, answer_in_building, pose_text
-from signature.localization.joining.building import map_of
 from signature.localization.localizer import Follower, Localizer, ResetPolicy
-from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch
-from signature.localization.prior import Prior
+from signature.places.map_index import MapIndex
+from signature.places.prior import Prior
 from signature.sessions import query_config
 
 ResultT = TypeVar("ResultT")

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.clouds.planar_scan import PlanarScan
+from pc2grid.estimation.tracker import follow
 from pc2grid.geometry import F64, SE2
 from pc2grid.io.maps import load_map
 from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, OccupancyGrid, RegisteredScan, Scan, SensorKind, Trajectory
-from pc2grid.pipeline import follow, map_scans
 from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.drive import Drive
 from pc2grid.submaps.submaps import partition
@@ -41,9 +41,10 @@ from pc2grid_lab.runner import in_processes, names_of, once, write_text
 from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, apart, fit_frame, is_right
 from signature.config import Config
 from signature.localization.localizer import Localizer
-from signature.localization.map_index import MapIndex
-from signature.localization.query import QueryMap
 from signature.paper import SignatureTable, describe
+from signature.places.map_index import MapIndex
+from signature.places.query import QueryMap
+from signature.session.build import map_scans
 
 SENSORS: tuple[SensorKind, ...] = ("lidar", "laser", "depth")
 TRAVELS_M = (1.0, 3.0, 5.0, 8.0, 10.0, 15.0)

@@ -13,11 +13,10 @@ from pc2grid.estimation.planar import GroundModel, PlanarMatcher
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.smoother import PLANAR, PoseWithCovariance, ScanMatch
 from pc2grid.estimation.spatial import Beginning, begin, is_rolling
-from pc2grid.estimation.tracker import MatchedScan, MatchSelector
+from pc2grid.estimation.tracker import MatchedScan, MatchSelector, follow
 from pc2grid.geometry import F64, SE2, pose_from_rotation_vector
 from pc2grid.io.recording import open_log
 from pc2grid.model import Health, Scan
-from pc2grid.pipeline import follow
 from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.config import LidarConfig

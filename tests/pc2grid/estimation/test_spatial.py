@@ -21,17 +21,18 @@ from pc2grid.estimation.spatial import (
     is_rolling,
 )
 from pc2grid.estimation.surface_map import LEAST_INFORMATION
-from pc2grid.estimation.tracker import Tracked, Tracker
+from pc2grid.estimation.tracker import Tracked, Tracker, follow
 from pc2grid.geometry import F64, SE2, invert_pose, motion_size, pose_from_rotation_vector
+from pc2grid.grids.occupancy import GridBuilder
 from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import Health, OccupancyGrid, Scan
 from pc2grid.observer import Observer
-from pc2grid.pipeline import follow, map_scans
-from pc2grid.settings import Config, ProjectionConfig, RegistrationConfig
+from pc2grid.settings import ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, prepare_session
 from pc2grid.simulate.scene import Mesh, Scene
+from signature.config import Config
+from signature.session.build import map_scans
 from tests.helpers.field import DATA
 from tests.helpers.flat_by_hand import (
     CORRIDOR,

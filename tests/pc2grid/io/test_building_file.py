@@ -8,6 +8,7 @@ import pytest
 
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import F64
+from pc2grid.grids.drawn import load_drawn_map
 from pc2grid.io import building_file
 from pc2grid.io.building_file import (
     axis_of_file,
@@ -17,7 +18,6 @@ from pc2grid.io.building_file import (
     kind_of,
 )
 from pc2grid.io.export import write_cloud
-from pc2grid.mapping.drawn import load_drawn_map
 from pc2grid.settings import ReadConfig
 from pc2grid.simulate.scene import load_building
 from tests.helpers.memory import bounded_memory

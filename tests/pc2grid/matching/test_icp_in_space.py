@@ -16,7 +16,7 @@ from pc2grid.geometry import (
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, SpatialView, register_in_space
 from pc2grid.model import PointMap
 from signature.config import Config
-from signature.localization.query import QueryInSpace
+from signature.places.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, twin_map
 

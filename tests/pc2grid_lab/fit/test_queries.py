@@ -13,7 +13,7 @@ from pc2grid_lab.fit.queries import KnownWindow, office_floor, pairs_of
 from pc2grid_lab.recordings.catalogue import Catalogue
 from pc2grid_lab.recordings.run import Folder
 from signature.config import Config
-from signature.localization.query import Query
+from signature.places.query import Query
 from tests.helpers.simulated_drives import building, drive, office
 
 OFFICE = building({"office": office()})

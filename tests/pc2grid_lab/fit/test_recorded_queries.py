@@ -7,7 +7,7 @@ from pc2grid_lab.fit.posterior import known_of
 from pc2grid_lab.fit.queries import KnownWindow, rows
 from pc2grid_lab.recordings.catalogue import Catalogue
 from signature.config import Config
-from signature.localization.query import Query
+from signature.places.query import Query
 from tests.helpers.simulated_drives import OTHER, building, drive, office
 
 

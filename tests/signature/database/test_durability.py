@@ -61,7 +61,7 @@ SERVER = multiprocessing.get_context("forkserver")
 SERVER.set_forkserver_preload(
     [
         "pc2grid_cli.main",
-        "pc2grid.pipeline",
+        "signature.session.build",
         "pc2grid.estimation.tracker",
         "pc2grid.submaps.submaps",
         "pc2grid.io.containers.mcap",

@@ -13,11 +13,10 @@ from pc2grid.observer import Observer
 from pc2grid.submaps.submaps import partition
 from signature.config import Config
 from signature.database import maintenance, open_database
-from signature.localization import map_index
 from signature.localization.localizer import locate_map
-from signature.localization.map_index import MapIndex
-from signature.localization.query import query_of
-from signature.retrieval import places
+from signature.places import map_index, places
+from signature.places.map_index import MapIndex
+from signature.places.query import query_of
 from signature.sessions import add_session, provenance
 from signature.visible import SeenPlaces, View
 from tests.helpers.databases import sql

@@ -16,7 +16,7 @@ from signature.config import Config
 from signature.database import Label, maintenance, open_database
 from signature.database.protocol import BuildingFrame
 from signature.localization.localizer import locate_map
-from signature.localization.map_index import MapIndex
+from signature.places.map_index import MapIndex
 from tests.helpers.databases import MONDAY, TUESDAY, assert_holds, everything, make_entry, sql
 from tests.helpers.simulated_drives import plan
 

@@ -14,10 +14,10 @@ from pc2grid.model import Health, RegisteredScan
 from signature.config import Config, RelocalizeConfig
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
-from signature.localization.map_index import MapIndex
 from signature.localization.posterior import POSTERIOR, decide, slip_of
-from signature.localization.prior import Prior
-from signature.localization.query import Query, QueryMap
+from signature.places.map_index import MapIndex
+from signature.places.prior import Prior
+from signature.places.query import Query, QueryMap
 from tests.helpers.simulated_drives import TWINS, building, drive, office
 
 

@@ -15,11 +15,11 @@ from pc2grid.model import Health, PointMap
 from signature.config import Config
 from signature.database import Label
 from signature.localization.answer import Answer, Place
-from signature.localization.hypotheses import HYPOTHESES
 from signature.localization.localizer import Follower, Localizer
-from signature.localization.map_index import MapIndex
 from signature.localization.posterior import SPACE, log_odds_in_space, masses_of, settle_in_space, weighed
-from signature.localization.query import QueryInSpace
+from signature.places.hypotheses import HYPOTHESES
+from signature.places.map_index import MapIndex
+from signature.places.query import QueryInSpace
 from tests.helpers.building_clouds import box_surface
 from tests.helpers.simulated_drives import building, office
 from tests.helpers.tall_offices import lidar_drive, points as points_of

@@ -12,11 +12,11 @@ from pc2grid.model import FREE, Health, OccupancyGrid, RegisteredScan
 from pc2grid_cli.relocalize import as_text
 from signature.config import Config
 from signature.database import Label
-from signature.localization import map_index
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
-from signature.localization.map_index import MapIndex
-from signature.localization.query import Query, QueryMap
+from signature.places import map_index
+from signature.places.map_index import MapIndex
+from signature.places.query import Query, QueryMap
 from tests.helpers.simulated_drives import OTHER, TWINS, building, drive, office, plan
 
 OFFICE = building({"office": office()})

@@ -18,9 +18,9 @@ from pc2grid.io.map_pose import MapPose
 from pc2grid.io.maps import load_map
 from pc2grid.model import UNKNOWN, Health, OccupancyGrid, RegisteredScan
 from signature.config import Config
-from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import PoseCheck, PoseWatch, check_pose
 from signature.paper import SignatureTable
+from signature.places.map_index import MapIndex
 from tests.helpers.simulated_drives import BENT, OTHER, TWINS, building, drive, office, plan
 
 ROOM = [(0, 0, 6, 0), (0, 6, 6, 6), (0, 0, 0, 6), (6, 0, 6, 6), *BENT]

@@ -9,19 +9,18 @@ import numpy as np
 import pytest
 
 from pc2grid.clouds.planar_scan import PlanarScan
-from pc2grid.estimation.tracker import Tracker
+from pc2grid.estimation.tracker import Tracker, follow
 from pc2grid.geometry import SE2
+from pc2grid.grids.occupancy import GridBuilder
 from pc2grid.io.maps import load_map
 from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.model import RegisteredScan, Scan, Trajectory
-from pc2grid.pipeline import follow
 from signature.config import Config
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
-from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import check_pose
+from signature.places.map_index import MapIndex
 from tests.helpers.field import DATA
 from tests.helpers.simulated_drives import building
 

@@ -34,6 +34,7 @@ import numpy as np
 import typer
 
 from pc2grid.errors import Pc2GridError
+from pc2grid.estimation.tracker import follow
 from pc2grid.geometry import F32, F64, SE2
 from pc2grid.io.maps import load_map
 from pc2grid.io.recording import open_log
@@ -41,7 +42,6 @@ from pc2grid.matching.evidence import evidence_of
 from pc2grid.matching.score import Fit
 from pc2grid.model import OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.observer import TimeSpan
-from pc2grid.pipeline import follow
 from pc2grid.simulate import office_floorplan
 from pc2grid.simulate.scene import covered, place_clutter
 from pc2grid.submaps.submaps import look_around, submap_centers
@@ -54,10 +54,10 @@ from pc2grid_lab.sensors import PlanMap, RegisteredSession
 from pc2grid_lab.truth import apart
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.joining.join import JOIN
-from signature.localization.map_index import MapIndex
+from signature.join.join import JOIN
 from signature.localization.posterior import fit_in_space, terms_in_space
-from signature.localization.query import Query, QueryInSpace, QueryMap, best_observed
+from signature.places.map_index import MapIndex
+from signature.places.query import Query, QueryInSpace, QueryMap, best_observed
 from signature.visible import PROFILE_BEARINGS, seen_signatures, viewpoints_of
 from signature.weights import Pairs, SeenStatistics
 

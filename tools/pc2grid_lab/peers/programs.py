@@ -43,16 +43,16 @@ import numpy as np
 
 from pc2grid.errors import ConfigError, LogNotFound, Pc2GridError
 from pc2grid.estimation.line_map import TRACKING
+from pc2grid.estimation.tracker import follow
 from pc2grid.geometry import F32, F64, SE2, transform_points
+from pc2grid.grids.occupancy import GridBuilder
 from pc2grid.io.atomic import replace_file
 from pc2grid.io.building_file import is_building_file
 from pc2grid.io.maps import load_map, save_map
 from pc2grid.io.recording import Log, open_log
 from pc2grid.io.trajectory import read_tum
-from pc2grid.mapping.occupancy import GridBuilder
 from pc2grid.matching.icp_in_space import REGISTRATION
 from pc2grid.model import SENSOR_MODELS, RegisteredScan, Scan, SensorKind
-from pc2grid.pipeline import follow
 from pc2grid.simulate import Session, load_building, prepare_session
 from pc2grid_cli.console import Console, json_text, warn
 from pc2grid_cli.output import make_folder

@@ -18,12 +18,12 @@ import cv2
 import networkx as nx
 import numpy as np
 
+from pc2grid.estimation.tracker import follow
 from pc2grid.geometry import F64, SE2, invert_pose, leveling
 from pc2grid.io.recording import open_log
 from pc2grid.io.trajectory import read_tum
 from pc2grid.model import OccupancyGrid, Trajectory
 from pc2grid.observer import TimeSpan
-from pc2grid.pipeline import follow
 from pc2grid_cli.options import Reading
 from pc2grid_lab.recordings.catalogue import Catalogue, Pair, Placed, Recording
 from pc2grid_lab.recordings.run import Folder, Followed
@@ -61,8 +61,8 @@ from pc2grid_lab.truth import (
 )
 from signature.config import Config
 from signature.database import open_database
-from signature.localization.map_index import MapIndex
 from signature.localization.pose_check import check_pose
+from signature.places.map_index import MapIndex
 
 _GAP_NS = 200_000_000
 """True poses farther apart are not interpolated, as a robot turns between them."""

@@ -50,8 +50,8 @@ from pc2grid_lab.recordings.catalogue import (
 from pc2grid_lab.runner import Finished, Task, in_processes, kept_result, pc2grid, run, run_tasks
 from pc2grid_lab.truth import rms, trajectory_errors
 from signature.database import open_database
-from signature.localization.joining.join import JoinableMap, join_maps
-from signature.localization.map_index import MapIndex
+from signature.join.join import JoinableMap, join_maps
+from signature.places.map_index import MapIndex
 
 RESULTS = ("maps", "bare", "answers", "followed", "joins")
 """Folders of the results: of `convert`, of bare KISS-ICP, of `relocalize` for each window, of `watch`, and of

@@ -22,8 +22,8 @@ from pc2grid.io.live.live_log import Feed, LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.source import RawMessage, TopicInfo
 from pc2grid.settings import ReadConfig
+from signature.join.building import map_of
 from signature.localization.answer import Answer, answer_in_building
-from signature.localization.joining.building import map_of
 from signature.localization.localizer import Follower, ResetPolicy
 
 PARAMETERS = {"database": "", "topic": "", "publish": "initialpose", "publish_map": False, "map_frame": "map"}

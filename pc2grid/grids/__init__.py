@@ -1,0 +1,1 @@
+"""Occupancy grids: drawn from scans, or read from maps that somebody else made."""

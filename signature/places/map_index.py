@@ -1,0 +1,270 @@
+"""The maps and places of a database, prepared to be searched."""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from itertools import chain
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pc2grid.errors import DatabaseCorrupt
+from pc2grid.geometry import I64
+from pc2grid.libraries import one_blas_thread
+from pc2grid.matching.icp_in_space import MapSurface
+from pc2grid.matching.score import Fit
+from pc2grid.matching.search import SearchMap
+from pc2grid.model import OccupancyGrid
+from pc2grid.observer import Observer
+from signature.config import Config
+from signature.database.protocol import BuildingFrame, Label
+from signature.paper import PlaceTable
+from signature.places.hypotheses import look_up
+from signature.places.places import (
+    AT_ONCE_M2,
+    FIRST_PLACES,
+    SQUARE_M,
+    Area,
+    DatabaseGrids,
+    LazySequence,
+    Places,
+)
+from signature.places.prior import Prior
+from signature.places.query import QueryMap
+from signature.visible import SeenPlaces
+
+if TYPE_CHECKING:
+    from signature.database import SubmapDatabase
+
+
+class MapIndex:
+    """The maps of a database and their places, prepared to be searched again and again.
+
+    Each map is prepared (in tens of milliseconds) when it first matters to a query, and kept.
+
+    prior : what is known of the pose beforehand, see `within`. whole : the index without it.
+    look : number of the look of a robot that is searched for, see `at_look`.
+    surface_of : the points of the maps, which answers are refined and checked with; None if they have none.
+    """
+
+    prior: Prior | None = None
+    whole: MapIndex | None = None
+    look: int | None = None
+    surface_of: Callable[[str], MapSurface | None] | None = None
+
+    def __init__(
+        self,
+        grids: Mapping[str, OccupancyGrid],
+        table: PlaceTable,
+        made_with: Config,
+        config: Config,
+        labels: Mapping[str, Label] | None = None,
+        areas_m2: Mapping[str, float] | None = None,
+        stored: Callable[[str], SeenPlaces | None] = lambda session: None,
+        frames: Mapping[str, BuildingFrame] | None = None,
+        drawn: Collection[str] = (),
+    ) -> None:
+        """Prepare the places of some maps.
+
+        grids : map of each session, in the order of `table.session_index`.
+
+        made_with : how the places were cut and described; queries are described in the same way.
+        config : its relocalize section says how to search and when to be sure.
+        labels : building and floor of sessions, where known.
+        areas_m2 : free space of each map, for maps that are not to be read before they are needed.
+        stored : what is seen from the places of a session; None: it is computed from the map when it is
+            needed.
+        frames : where the sessions that are joined lie in their buildings.
+        drawn : the sessions whose maps somebody else made.
+        """
+        self.frames = dict(frames or {})
+        self.made_with = made_with
+        self.config = config.relocalize
+        self.sessions = tuple(grids)
+        self.labels = tuple((labels or {}).get(name, Label()) for name in grids)
+        count = len(grids)
+        areas_m2 = areas_m2 or {name: grid.free_m2 for name, grid in grids.items()}
+        self._areas_m2 = tuple(areas_m2[name] for name in self.sessions)
+        # Of a large database, about as many grids are kept as are searched at once, and as many prepared
+        # maps, which take ten times as much memory, as one look uses.
+        area_m2 = sum(self._areas_m2)
+        most = most_prepared = None
+        if area_m2 > AT_ONCE_M2:
+            most = math.ceil(count * AT_ONCE_M2 / area_m2)
+            most_prepared = FIRST_PLACES + self.config.hypotheses
+        self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count, most)
+        self.maps: LazySequence[SearchMap] = LazySequence(
+            lambda i: SearchMap.of(self.grids[i], drawn=self.sessions[i] in drawn), count, most_prepared
+        )
+        self._from_above: LazySequence[SearchMap] = LazySequence(
+            lambda i: SearchMap.of(self.grids[i], from_below=True, drawn=self.sessions[i] in drawn),
+            count,
+            most_prepared,
+        )
+        self.places = Places(
+            table,
+            self.grids,
+            made_with.partition.radius_m,
+            self._areas_m2,
+            stored=lambda i: stored(self.sessions[i]),
+        )
+
+    @staticmethod
+    @one_blas_thread
+    def of(database: SubmapDatabase, config: Config, observer: Observer = Observer()) -> MapIndex:
+        """Return the index of everything in a database.
+
+        If that is more than `signature.places.places.AT_ONCE_M2` of free floor, maps are read when
+        they first matter, and points always are, so the database must stay open as long as the index is used.
+
+        observer : gets the progress where places have to be selected, and a warning if what is seen from them
+            is damaged and has to be computed.
+        """
+        infos = {info.name: info for info in database.sessions()}
+        areas_m2 = {name: info.area_m2 for name, info in infos.items()}
+        grids: Mapping[str, OccupancyGrid] = DatabaseGrids(database, tuple(infos))
+        is_large = sum(areas_m2.values()) > AT_ONCE_M2
+        if not is_large:
+            grids = dict(grids)
+        labels = {name: info.provenance.label for name, info in infos.items()}
+        lacking: list[str] = []
+
+        def stored(name: str) -> SeenPlaces | None:
+            # What is seen from a place follows from the map, so damage to it costs time and no answer.
+            with contextlib.suppress(DatabaseCorrupt):
+                return database.seen_places(name)
+            lacking.append(name)
+            return None
+
+        places, made_with = database.signatures().places, database.config()
+        frames: Mapping[str, BuildingFrame] = {}
+        with contextlib.suppress(DatabaseCorrupt):  # without them a search takes longer, and finds the same
+            frames = database.frames()
+        drawn = {name for name, info in infos.items() if info.sensor == "map"}
+        index = MapIndex(grids, places, made_with, config, labels, areas_m2, stored, frames, drawn)
+        if any(info.points for info in infos.values()):
+
+            def surface_of(name: str) -> MapSurface | None:
+                points = database.points(name)
+                return None if points is None else MapSurface(points)
+
+            # As many as an answer may compare.
+            index.surface_of = lru_cache(index.config.hypotheses)(surface_of)
+        with observer.step("prepare places"):
+            index.places.index(observer.on_progress)
+        if lacking:
+            observer.on_warning(
+                f"{database.location}: lacks what is seen from the places of {len(lacking)} of its"
+                f" {len(infos)} sessions, so it was computed now; `pc2grid db copy --recover` makes it whole"
+            )
+        return index
+
+    @staticmethod
+    def of_session(database: SubmapDatabase, session: str) -> MapIndex:
+        """Return the index of one session of a database by itself, without points."""
+        table, config = database.signatures(session).places, database.config()
+        table = replace(table, session_index=np.zeros(len(table), np.int32))
+        return MapIndex({session: database.grid(session)}, table, config, config, stored=database.seen_places)
+
+    def surface(self, session_index: int) -> MapSurface | None:
+        """Return the points of a session in space; None if it has none."""
+        return None if self.surface_of is None else self.surface_of(self.sessions[session_index])
+
+    def within(self, prior: Prior) -> MapIndex:
+        """Return an index of which only places that the prior allows are answers; all that is prepared is
+        shared.
+
+        Raises ConfigError if the prior does not name its session where there are several, or an unknown one.
+        """
+        restricted = copy.copy(self)
+        restricted.prior, restricted.whole = prior.of_one(self.sessions), self.whole or self
+        return restricted
+
+    def at_look(self, number: int) -> MapIndex:
+        """Return an index whose searches end in time for a robot: beside the likeliest places they take one
+        batch of the others, at each look the next one.
+
+        number : of the look. All that is prepared is shared. If there is only one batch, it is this index.
+        """
+        if len(_batches(len(self.places.table))) <= 2:
+            return self
+        limited = copy.copy(self)
+        limited.look = number
+        return limited
+
+    def prior_for(self, query: QueryMap) -> Prior | None:
+        """Return the prior, if there is one and the motion of the query since its time is known."""
+        lapsed = self.prior is None or self.prior.T_odom_prior(query) is None
+        return None if lapsed else self.prior
+
+    def allows(self, query: QueryMap, h: Fit) -> bool:
+        """Return whether the prior allows the place of a hypothesis; true if there is none that applies."""
+        prior = self.prior_for(query)
+        T_odom_prior = None if prior is None else prior.T_odom_prior(query)
+        if prior is None or T_odom_prior is None:
+            return True
+        here = self.sessions[h.session_index] == prior.session
+        return here and prior.allows(h.T_map_query @ T_odom_prior, query.since_prior_m)
+
+    def search(self, query: QueryMap, known: tuple[Fit, ...] = ()) -> Iterator[tuple[tuple[Fit, ...], float]]:
+        """Yield hypotheses for the query, best first, again and again: the known ones, refined, and those
+        found next to more and more places, the likeliest first; with a prior, anywhere in its region at once.
+        Beside them the share 0..1 of the mass, by the signatures, that is not searched yet.
+
+        What has less than the share `RelocalizeConfig.coarse_keep` of the best coarse score is left out.
+        """
+        rows, mass = self.places.order(query.views, query.center_m, self.config)
+        batches = _batches(len(rows))
+        if self.look is not None and len(batches) > 1:
+            batches = [batches[0], batches[1 + self.look % (len(batches) - 1)]]
+        areas = [self.places.areas(rows[batch]) for batch in batches]
+        areas[0] = chain(areas[0], self._allowed(query))
+        left = 1.0
+        for batch, found in zip(batches, self._look_up(query, areas, known), strict=True):
+            left -= float(mass[batch].sum())
+            yield found, left
+
+    def in_region(self, query: QueryMap, known: tuple[Fit, ...] = ()) -> tuple[Fit, ...]:
+        """Return `known` and what fits anywhere in the region of the prior."""
+        return next(self._look_up(query, [self._allowed(query)], known))
+
+    def _look_up(
+        self, query: QueryMap, areas: Iterable[Iterable[Area]], known: tuple[Fit, ...]
+    ) -> Iterator[tuple[Fit, ...]]:
+        maps = self.maps_for(query)
+        return look_up(query, areas, self.places, maps, self.config, known, lambda h: self.allows(query, h))
+
+    def _allowed(self, query: QueryMap) -> Iterator[Area]:
+        """Yield the region of the prior, if there is one that applies."""
+        prior = self.prior_for(query)
+        if prior is not None and prior.session is not None:
+            number = self.sessions.index(prior.session)
+            yield Area(number, prior.squares(query, self.places.ground[number][0], SQUARE_M))
+
+    def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
+        """Return the maps as they are searched for a query: to one in a lower plane, their free space is
+        unknown."""
+
+        def facing(i: int) -> SearchMap:
+            below = query.walls.facing(self.maps[i].walls).only_explain
+            return (self._from_above if below else self.maps)[i]
+
+        return LazySequence(facing, len(self.maps), 0)
+
+    def joined(self, a: int, b: int) -> tuple[BuildingFrame, BuildingFrame] | None:
+        """Return where two sessions lie in the building in which they are joined; None if they are not."""
+        frame, other = (self.frames.get(self.sessions[number]) for number in (a, b))
+        if frame is None or other is None or frame.name != other.name:
+            return None
+        return frame, other
+
+
+def _batches(count: int) -> list[I64]:
+    """Return the numbers of so many places, likeliest first, in the batches that are searched one after the
+    other."""
+    return np.split(np.arange(count), range(FIRST_PLACES, count, 10 * FIRST_PLACES))

@@ -1,0 +1,1 @@
+"""A recording becomes the maps of a session."""

@@ -1,0 +1,523 @@
+"""Loop closure: overlaps with places of earlier visits correct the drift of tracking.
+
+A session is cut into local maps of a few metres of travel. Each new local map is compared with older ones
+that it may overlap: correlative scan matching over the uncertainty of tracking proposes poses, and a pose
+counts as much as it is likely by the walls and the free space of both (`pc2grid.matching.evidence`). A robust
+pose graph over the local maps gives the corrected poses (the scan-to-submap constraints of Hess et al.,
+"Real-time loop closure in 2D lidar SLAM", 2016, between two submaps). Between the anchors of local maps the
+correction is interpolated, because the error of tracking grows gradually.
+
+After a long way a loop may be farther off than this search reaches. For these a `SessionRecognizer` looks the
+map of the last few local maps (`PlaceMap`) up among those of all earlier places, without using their poses.
+
+A recognition alone may be wrong with high confidence: buildings repeat themselves, and some look alike when
+they are turned by 180 degrees. What the recognizer does not know is that the drift of tracking is bounded. So
+its evidence is that of an answer, and the tracked pose the prior: one equation tells how likely each place is
+(`pc2grid.matching.evidence.masses`), and its loops count as much. Loops that contradict each other and the
+travel between them are told by the pose graph.
+
+Where tracking was lost and started again, the pose relative to earlier scans is unknown: a new segment
+begins. Loops that were accepted between two segments join them again. A component of joined segments is a
+part, and becomes a session of its own (`connected`).
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from array import array
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import compress
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from pc2grid.estimation.line_map import evenly
+from pc2grid.geometry import F64, I64, SE2
+from pc2grid.matching.evidence import LEFT, masses
+from pc2grid.model import Loop
+from pc2grid.settings import ProjectionConfig
+from signature.session.graph import Edge, Solution, WallDirection, optimise, wall_direction
+from signature.session.keyframes import TURN_M_PER_RAD, Keyframe, Keyframes, grid_of
+from signature.session.local_maps import LOCAL_MAPS, LocalMapParameters, LocalMaps, pose_at
+from signature.session.part_maps import OptimisedKeyframes, interpolate_corrections
+from signature.session.quality import position_sigmas
+from signature.session.recognition import PlaceMap, Recognition, SessionRecognizer
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LoopParameters:
+    """Numbers of loop closure. Chosen by hand and checked on the relations of fr079 and intel, unless noted.
+
+    Cutting into local maps:
+
+    travel_m : travel after which a local map is complete.
+
+    Which pairs are compared:
+
+    near_m : older local maps within this distance may overlap the newest one.
+    compared : older local maps that the newest is compared with, and pairs of local maps of two place maps.
+
+    How tracking drifts: the standard deviation of a tracked step, and how far a loop is searched.
+
+    drift_m, drift_rad : standard deviations of position and yaw on a metre of travel: 0.4 degrees over 4 m
+        (`docs/method.md`).
+    certain_m, certain_rad : the window directly after a loop; it grows by two standard deviations.
+    max_window_m, max_window_rad : its largest size.
+
+    information_share : in the pose graph, of the information that a match reports: the errors of points on
+        one wall are correlated.
+
+    Place recognition:
+
+    maps_per_place : consecutive local maps that make a place map: 12 m of travel, chosen on aces, csail and
+        killian.
+    """
+
+    travel_m: float = 4.0
+    near_m: float = 8.0
+    compared: int = 10
+    certain_m: float = 0.3
+    certain_rad: float = math.radians(4.0)
+    drift_m: float = 0.01
+    drift_rad: float = 0.0018
+    max_window_m: float = 3.0
+    max_window_rad: float = math.radians(20.0)
+    information_share: float = 0.1
+    maps_per_place: int = 3
+
+    def window(self, travel_m: float) -> tuple[float, float]:
+        """Return the half widths of the search window, metres and radians, after so much travel."""
+        return (
+            min(self.certain_m + 2 * self.drift_m * travel_m, self.max_window_m),
+            min(self.certain_rad + 2 * self.drift_rad * travel_m, self.max_window_rad),
+        )
+
+    @property
+    def lost_m(self) -> float:
+        """Return the travel that a lost part of the session counts as: that of the largest window."""
+        return self.max_window_m / (2 * self.drift_m)
+
+    def tracked_information(self, restart: bool) -> F64:
+        """Return the information (3, 3) of the step from a local map to the next. restart : tracking was lost
+        in between."""
+        travel_m = self.lost_m if restart else self.travel_m
+        sigma = travel_m * np.array((self.drift_m, self.drift_m, self.drift_rad))
+        return np.diag(sigma**-2)
+
+
+LOOPS = LoopParameters()
+
+
+class LoopCloser:
+    """Closes loops while a session is recorded.
+
+    keyframes : gets those of the session; local maps are drawn from them when needed.
+    recognizer : gets the place maps whose overlaps are not all known; None: loops are searched near the
+        tracked pose only.
+    projection : how the grids for the recognizer are drawn.
+    """
+
+    def __init__(
+        self,
+        keyframes: Keyframes,
+        *,
+        recognizer: SessionRecognizer | None = None,
+        projection: ProjectionConfig = ProjectionConfig(),
+        parameters: LoopParameters = LOOPS,
+        local_map_parameters: LocalMapParameters = LOCAL_MAPS,
+    ) -> None:
+        self._parameters = parameters
+        self._keyframes = keyframes
+        self._local_maps = LocalMaps(keyframes, local_map_parameters)
+        self._graph = SessionGraph(parameters)
+        self._place_maps = PlaceMaps(self._local_maps, parameters.maps_per_place, recognizer, projection)
+        self._travel_m = 0.0  # in the local map that is not complete yet
+        self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
+        self._drift_m = 0.0  # travel since the pose was last certain
+
+    def add(self, keyframe: Keyframe) -> None:
+        """Keep the next keyframe; every few metres this completes a local map."""
+        if len(self._keyframes):
+            step = self._keyframes.pose(len(self._keyframes) - 1).inverse() @ keyframe.T_session_base
+            self._travel_m += math.hypot(step.x, step.y) + TURN_M_PER_RAD * abs(step.yaw)
+            if self._travel_m > self._parameters.travel_m or keyframe.restart:
+                self._complete_local_map()
+        self._keyframes.append(keyframe)
+
+    def finish(self) -> OptimisedKeyframes:
+        """Return the optimised poses; without a loop and without walls they are the tracked ones."""
+        if not len(self._keyframes):
+            return OptimisedKeyframes.empty()
+        self._complete_local_map()
+        self._close_recognized(self._place_maps.finish())
+        return self._optimised_keyframes()
+
+    # --- during the session -------------------------------------------------------------------------------
+
+    def _complete_local_map(self) -> None:
+        """Make a local map of the last keyframes: place it by tracking, then compare it with older ones."""
+        newest = len(self._graph)
+        self._local_maps.complete()
+        restart = self._local_maps.runs[newest].start in self._keyframes.restarts
+        self._travel_m = 0.0
+        self._place(newest, restart)
+        overlaps = list(self._overlaps(newest))
+        self._close(overlaps)
+        # Overlaps with the local maps just before show nothing but that tracking is smooth.
+        recent = newest - 2 * self._parameters.maps_per_place
+        known = any(edge.first < recent for edge in overlaps)
+        self._close_recognized(self._place_maps.extend(restart=restart, known=known))
+
+    def _place(self, newest: int, restart: bool) -> None:
+        """Add the newest local map to the pose graph, by tracking."""
+        walls = wall_direction(self._local_maps[newest].normal_rad)
+        pose = self._tracked(newest)
+        if not newest:
+            self._graph.add(pose, walls)
+            self._travelled_m.append(0.0)
+            return
+        step = self._tracked(newest - 1).inverse() @ pose
+        drift_m = self._parameters.lost_m if restart else math.hypot(step.x, step.y)
+        self._drift_m += drift_m
+        self._travelled_m.append(self._travelled_m[-1] + drift_m)
+        self._graph.extend(step, walls, restart=restart)
+
+    def _tracked(self, number: int) -> SE2:
+        """Return the pose of a local map as tracked."""
+        return self._keyframes.pose(self._local_maps.anchors[number])
+
+    def _close(self, loops: list[Edge]) -> None:
+        """Add loops to the pose graph, and solve it again."""
+        if loops:
+            self._drift_m *= 1.0 - max(loop.counts for loop in loops)
+            self._graph.edges += loops
+            self._graph.solve()
+
+    def _overlaps(self, newest: int) -> Iterator[Edge]:
+        """Yield verified overlaps of the newest local map with older ones, near its tracked pose."""
+        window = self._parameters.window(self._drift_m)
+        nodes = self._graph.nodes
+        # The local map before the newest is left out: tracking matched both against the same walls.
+        before = nodes[: max(newest - 1, 0), :2]
+        distance_m = np.hypot(*(before - nodes[newest, :2]).T)
+        near = np.flatnonzero(distance_m < self._parameters.near_m + window[0]).tolist()
+        # A robot that drives up and down passes a place dozens of times: some of all visits are chosen.
+        for older in (near[k] for k in evenly(len(near), self._parameters.compared)):
+            yield from self._compare(older, newest, self._graph.relative(older, newest), window)
+
+    def _compare(
+        self, older: int, newer: int, guess: SE2, window: tuple[float, float], mass: float = 1.0
+    ) -> list[Edge]:
+        """Match two local maps near a guess; returns an edge, or none if they do not match.
+
+        window : half widths of the search around the guess, metres and radians. mass : of the guess.
+        """
+        overlap = self._local_maps[older].overlap(self._local_maps[newer], guess, *window)
+        if overlap is None:
+            return []
+        information = mass * self._parameters.information_share * overlap.information
+        return [Edge(older, newer, overlap.pose, information, loop=True, counts=mass * overlap.counts)]
+
+    # --- place recognition --------------------------------------------------------------------------------
+
+    def _close_recognized(self, found: Sequence[Recognition]) -> None:
+        """Close the loops to the places that the newest place map may show; each counts as it is likely."""
+        p = self._parameters
+        loops: list[Edge] = []
+        for place, mass in zip(found, masses([f.evidence for f in found], self._prior(found)), strict=True):
+            # Places a short way apart show nothing but that tracking is smooth.
+            if mass < LEFT or self._way_m(place) < 2 * p.maps_per_place * p.travel_m:
+                continue
+            for older, newer, guess in self._place_maps.guesses(place)[: p.compared]:
+                loops += self._compare(older, newer, guess, p.window(0.0), float(mass))
+        self._close(loops)
+        if loops:
+            # The newest place map is where it belongs now: loops that the search near the tracked pose missed
+            # are near.
+            self._close([edge for number in self._place_maps.latest() for edge in self._overlaps(number)])
+
+    def _prior(self, found: Sequence[Recognition]) -> list[float]:
+        """Return how likely tracking has drifted to each place; 1 where it is tracked.
+
+        The drift since the older place is a Gaussian. Its standard deviations are the window in which loops
+        are searched after so much travel: in killian, aces, csail, intel and the workshop tracking alone is
+        off by up to 1.7 % of the travel, 10.4 m and 10 degrees.
+        """
+        prior = []
+        for place in found:
+            older, newer = self._place_maps.middle(place.older), self._place_maps.middle(place.newer)
+            window_m, window_rad = self._parameters.window(self._way_m(place))
+            drift = place.T_older_newer.inverse() @ self._graph.relative(older, newer)
+            off = math.hypot(drift.x / window_m, drift.y / window_m, drift.yaw / window_rad)
+            prior.append(max(math.exp(-0.5 * off**2), sys.float_info.min))
+        return prior
+
+    def _way_m(self, place: Recognition) -> float:
+        """Return the travel between the two place maps; a lost part counts as `lost_m`."""
+        older, newer = self._place_maps.middle(place.older), self._place_maps.middle(place.newer)
+        return self._travelled_m[newer] - self._travelled_m[older]
+
+    # --- at the end of the session ------------------------------------------------------------------------
+
+    def _optimised_keyframes(self) -> OptimisedKeyframes:
+        """Solve the pose graph; returns its poses, loops and parts."""
+        solution = self._optimise()
+        scans, anchors = self._keyframes.scans, self._local_maps.anchors
+        loops = tuple(
+            Loop(
+                older=scans[anchors[edge.first]],
+                newer=scans[anchors[edge.second]],
+                T_older_newer=edge.T_first_second,
+                information=edge.information,
+                accepted=bool(accepted),
+            )
+            for edge, accepted in zip(self._graph.edges, solution.accepted, strict=True)
+            if edge.loop
+        )
+        part = self._parts(solution)
+        lengths = [len(run) for run in self._local_maps.runs]
+        return OptimisedKeyframes(
+            scans=np.array(scans, dtype=np.int64),
+            poses=self._optimised(),
+            loops=loops,
+            segments=np.repeat(self._segments(), lengths),
+            parts=np.repeat(part, lengths),
+            anchors=np.array(anchors, dtype=np.int64),
+            sigma_m=self._graph.sigmas(solution, part),
+        )
+
+    def _optimise(self) -> Solution:
+        """Solve the pose graph, measure its overlaps again, and solve it again.
+
+        The overlaps were measured on local maps that are bent by the drift of tracking. So these are drawn
+        again with the optimised poses, and compared again.
+        """
+        self._graph.solve()
+        self._local_maps.redraw(self._optimised())
+        self._graph.edges = [self._again(edge) if edge.loop else edge for edge in self._graph.edges]
+        return self._graph.solve()
+
+    def _again(self, edge: Edge) -> Edge:
+        """Measure an overlap again on the present local maps; return the old one if they no longer
+        overlap."""
+        guess = self._graph.relative(edge.first, edge.second)
+        return next(iter(self._compare(edge.first, edge.second, guess, self._parameters.window(0.0))), edge)
+
+    def _optimised(self) -> F64:
+        """Return keyframe poses (K, 3) that follow the anchors of their local maps.
+
+        The correction passes gradually from one anchor to the next. Where tracking was lost the error is a
+        jump, so there each local map moves rigidly up to its end.
+        """
+        tracked = self._keyframes.poses()
+        known: dict[int, SE2] = {}
+        for number, run in enumerate(self._local_maps.runs):
+            anchor = self._local_maps.anchors[number]
+            correction = pose_at(self._graph.nodes, number) @ pose_at(tracked, anchor).inverse()
+            restarts = self._keyframes.restarts
+            ends = [k for k, at in ((run[0], run.start), (run[-1], run.stop)) if at in restarts]
+            for k in sorted({anchor, *ends}):
+                known[k] = correction @ pose_at(tracked, k)
+        return interpolate_corrections(
+            tracked, list(known), np.array([(p.x, p.y, p.yaw) for p in known.values()])
+        )
+
+    # --- segments and parts -------------------------------------------------------------------------------
+
+    def _segments(self) -> I64:
+        """Return the number (N,) of the segment of each local map; a new one begins at each restart."""
+        restarts = self._keyframes.restarts
+        begins = [number > 0 and run.start in restarts for number, run in enumerate(self._local_maps.runs)]
+        return np.cumsum(begins, dtype=np.int64)
+
+    def _parts(self, solution: Solution) -> I64:
+        """Return the number (N,) of the part of each local map."""
+        loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
+        return connected(self._segments(), loops)
+
+
+_JOINING = 2
+"""Different local maps on each of the two sides that must be in agreeing loops, to join two segments; a
+single room may look like another one. Chosen by hand."""
+
+
+def connected(segment: I64, loops: Sequence[Edge]) -> I64:
+    """Return the number (N,) of the part of each local map, in the order in which the parts begin.
+
+    segment : (N,) number of the segment of each, from 0. loops : accepted ones. Two segments are joined if
+    enough different local maps of the one overlap enough different ones of the other.
+    """
+    ends: dict[tuple[int, int], list[Edge]] = {}
+    for loop in loops:
+        ends.setdefault((int(segment[loop.first]), int(segment[loop.second])), []).append(loop)
+    joined = [
+        pair
+        for pair, between in ends.items()
+        if len({loop.first for loop in between}) >= _JOINING
+        and len({loop.second for loop in between}) >= _JOINING
+    ]
+    count = int(segment.max(initial=-1)) + 1
+    rows, columns = np.array(joined, dtype=np.int64).reshape(-1, 2).T
+    graph = coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count))
+    _, label = connected_components(graph, directed=False)
+    _, first, part = np.unique(label[segment], return_index=True, return_inverse=True)
+    return np.asarray(np.argsort(np.argsort(first))[part], dtype=np.int64)
+
+
+class SessionGraph:
+    """The pose graph over the anchors of local maps, which grows with the session.
+
+    nodes : (N, 3) x, y, yaw of each anchor in the session, by the last optimisation. edges : tracked steps
+    and loops, in the order in which they were found.
+    """
+
+    def __init__(self, parameters: LoopParameters) -> None:
+        self._parameters = parameters
+        self.nodes: F64 = np.empty((0, 3))
+        self.edges: list[Edge] = []
+        self._walls: list[WallDirection] = []  # of each local map
+
+    def __len__(self) -> int:
+        return len(self.nodes)
+
+    def add(self, pose: SE2, walls: WallDirection) -> None:
+        """Add a local map at a pose."""
+        self.nodes = np.vstack((self.nodes, (pose.x, pose.y, pose.yaw)))
+        self._walls.append(walls)
+
+    def extend(self, step: SE2, walls: WallDirection, *, restart: bool) -> None:
+        """Add the next local map, a tracked step from the last one. restart : tracking was lost before it."""
+        newest = len(self)
+        information = self._parameters.tracked_information(restart)
+        self.edges.append(Edge(newest - 1, newest, step, information))
+        self.add(pose_at(self.nodes, newest - 1) @ step, walls)
+
+    def relative(self, first: int, second: int) -> SE2:
+        """Return T_first_second by the present poses."""
+        return pose_at(self.nodes, first).inverse() @ pose_at(self.nodes, second)
+
+    def solve(self) -> Solution:
+        """Solve for the poses that agree best with all edges."""
+        solution = optimise(self.nodes, self.edges, self._walls)
+        self.nodes = solution.poses
+        return solution
+
+    def sigmas(self, solution: Solution, part: I64) -> F64:
+        """Return the standard deviation (N,) in metres of the position of each local map within its part
+        (N,)."""
+        sigma_m = np.zeros(len(part))
+        number = np.empty(len(part), np.int64)  # of each local map within its part
+        for own in (np.flatnonzero(part == k) for k in range(int(part.max(initial=-1)) + 1)):
+            number[own] = np.arange(len(own))
+            within = [
+                replace(edge, first=int(number[edge.first]), second=int(number[edge.second]))
+                for edge in compress(self.edges, solution.accepted)
+                if part[edge.first] == part[edge.second] == part[own[0]]
+            ]
+            walls = [self._walls[local_map] for local_map in own]
+            sigma_m[own] = position_sigmas(solution.poses[own], within, walls)
+        return sigma_m
+
+
+# --- place recognition --------------------------------------------------------------------------------
+
+
+class PlaceMaps:
+    """The place maps of a session that were given to its recognizer.
+
+    maps : consecutive local maps in a place map.
+    recognizer : None: there are no place maps. projection : how their grids are drawn.
+    """
+
+    def __init__(
+        self,
+        local_maps: LocalMaps,
+        maps: int,
+        recognizer: SessionRecognizer | None,
+        projection: ProjectionConfig,
+    ) -> None:
+        self._local_maps, self._maps = local_maps, maps
+        self._recognizer, self._projection = recognizer, projection
+        self._asked: list[range] = []  # the local maps of each
+        self._known_places: list[bool] = []  # whether each local map overlaps one of an earlier visit
+        self._begin = 0  # first local map of the place that is not complete yet
+
+    def extend(self, *, restart: bool, known: bool) -> Sequence[Recognition]:
+        """Add the newest local map. Return what is recognised in the place map that it completes.
+
+        restart : tracking was lost before it. known : it overlaps a local map of an earlier visit.
+
+        A place map does not reach across a lost part of the session: it would be bent. If all its local maps
+        overlap those of an earlier visit already, it is not passed on, as it adds nothing.
+        """
+        if restart:
+            self._begin = len(self._known_places)
+        self._known_places.append(known)
+        place = range(self._begin, len(self._known_places))
+        if len(place) < self._maps:
+            return ()
+        self._begin = place.stop
+        return self._ask(place)
+
+    def finish(self) -> Sequence[Recognition]:
+        """Make a place map of the last local maps, which may overlap the one before; returns as `extend`
+        does."""
+        stop = len(self._known_places)
+        return self._ask(range(max(stop - self._maps, 0), stop)) if self._begin < stop else ()
+
+    def latest(self) -> range:
+        """Return the local maps of the last place map that was passed on."""
+        return self._asked[-1]
+
+    def middle(self, index: int) -> int:
+        """Return the local map in whose frame a place map is drawn."""
+        return _middle(self._asked[index])
+
+    def guesses(self, found: Recognition) -> list[tuple[int, int, SE2]]:
+        """Return the pairs of local maps of two place maps, the nearest first.
+
+        Each is the older, the newer, and T_older_newer by the recognition.
+        """
+        pairs = []
+        for older, T_place_older in self._within(self._asked[found.older]):
+            for newer, T_place_newer in self._within(self._asked[found.newer]):
+                # The last place map overlaps the one before. Neighbours are matched by tracking already.
+                if newer - older < 2:
+                    continue
+                guess = T_place_older.inverse() @ found.T_older_newer @ T_place_newer
+                pairs.append((older, newer, guess))
+        return sorted(pairs, key=lambda pair: (math.hypot(pair[2].x, pair[2].y), *pair[:2]))
+
+    def _within(self, place: range) -> list[tuple[int, SE2]]:
+        """Return the local maps of a place map, and their tracked poses in its frame."""
+        anchors = self._local_maps.anchors
+        poses = self._local_maps.poses((anchors[number] for number in place), anchors[_middle(place)])
+        return list(zip(place, poses, strict=True))
+
+    def _ask(self, place: range) -> Sequence[Recognition]:
+        """Pass a place map to the recognizer, unless all of its local maps are known."""
+        if self._recognizer is None or all(self._known_places[k] for k in place):
+            return ()
+        self._asked.append(place)
+        return self._recognizer.recognize(self._draw(len(self._asked) - 1, place))
+
+    def _draw(self, index: int, numbers: range) -> PlaceMap:
+        """Draw the place map of consecutive local maps, in the frame of the anchor of the middle one."""
+        runs = self._local_maps.runs
+        keyframes, poses = self._local_maps.keyframes(
+            range(runs[numbers[0]].start, runs[numbers[-1]].stop), self._local_maps.anchors[_middle(numbers)]
+        )
+        return PlaceMap(
+            index=index,
+            grid=grid_of(zip(keyframes, poses, strict=True), self._projection),
+            poses=np.array([(pose.x, pose.y, pose.yaw) for pose in poses]),
+            scans=np.array([keyframe.index for keyframe in keyframes]),
+        )
+
+
+def _middle(numbers: range) -> int:
+    """Return the local map in whose frame a place map is drawn."""
+    return numbers[len(numbers) // 2]
