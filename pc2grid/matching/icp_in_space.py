@@ -322,8 +322,9 @@ def _icp(query: F64, target_m: F64, normals: F64, start: F64) -> tuple[F64, F64,
         T = np.array(result.transformation)
         if len(result.correspondence_set) < p.least_points:
             return "unknown"
-        if _has_left(query.mean(axis=0), start, T):
-            return "left"
+    # Only the last round counts: the first one may turn too far, and the next ones back.
+    if _has_left(query.mean(axis=0), start, T):
+        return "left"
     pairs = np.asarray(result.correspondence_set)
     placed = transform_points(T, np.asarray(source.points))[pairs[:, 0]]
     normals = normals[pairs[:, 1]]
