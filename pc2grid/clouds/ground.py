@@ -79,6 +79,7 @@ class CloudParameters:
 
     reach_m, reach_per_m : radius of the neighbourhood of a hit, and its growth with the range, since the
         distance between beams grows with it.
+    sparse_factor : the neighbourhood is this many times as wide where it contains fewer than three hits.
     max_flatness : largest ratio of the variances across and along a surface.
 
     Planar scan:
@@ -99,6 +100,7 @@ class CloudParameters:
 
     reach_m: float = 0.08
     reach_per_m: float = 0.02
+    sparse_factor: float = 4.0
     max_flatness: float = 0.3
 
     limit_sigmas: float = 2.0

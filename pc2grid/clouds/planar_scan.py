@@ -156,15 +156,15 @@ def planar_normals(hits_m: F32, origin_m: F64) -> F32:
     """Return the direction (M,) in radians of the surface normal at hits (M, 2), on the sensor's side.
 
     origin_m : (2,) position of the sensor. The normal is the minor axis of the hits within a distance of
-    `reach_m` + `reach_per_m` * range. Fewer than three, or hits that do not lie along a line, get the
-    direction to the sensor.
+    `reach_m` + `reach_per_m` * range. Where these are fewer than three, the distance is `sparse_factor`
+    times as large. Hits that do not lie along a line get the direction to the sensor.
     """
 
     p = CLOUD_PARAMETERS
     away = hits_m.astype(np.float64) - origin_m
     bearings = np.arctan2(away[:, 1], away[:, 0])
     order = np.argsort(bearings, kind="stable")
-    return _compiled_normals(away, order, bearings, p.reach_m, p.reach_per_m, p.max_flatness)
+    return _compiled_normals(away, order, bearings, p.reach_m, p.reach_per_m, p.sparse_factor, p.max_flatness)
 
 
 def heights_seen(
@@ -331,6 +331,7 @@ def _compiled_normals(
     bearings: F64,
     reach_m: float,
     reach_per_m: float,
+    sparse_factor: float,
     max_flatness: float,
 ) -> F32:
     """Return the angle of the surface normal at each hit, see `planar_normals`.
@@ -348,35 +349,37 @@ def _compiled_normals(
         distance = math.hypot(x, y)
         towards = math.atan2(-y, -x)
         angles[i] = towards
-        reach = reach_m + reach_per_m * distance
-        window = reach / max(distance, reach)
-        n = 1.0
-        sx = sy = sxx = sxy = syy = 0.0
-        # Half of the hits on either side at most, so that each neighbour is counted once.
-        for step, farthest in ((-1, (count - 1) // 2), (1, count // 2)):
-            for k in range(1, farthest + 1):
-                j = order[(place + step * k) % count]
-                turn = abs(bearings[j] - bearings[i])
-                if min(turn, 2.0 * math.pi - turn) > window:
-                    break
-                dx, dy = away[j, 0] - x, away[j, 1] - y
-                if dx * dx + dy * dy < reach * reach:
-                    n += 1.0
-                    sx += dx
-                    sy += dy
-                    sxx += dx * dx
-                    sxy += dx * dy
-                    syy += dy * dy
-        if n < 3.0:
-            continue
-        mx, my = sx / n, sy / n
-        a, b, d = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
-        spread = math.sqrt(0.25 * (a - d) * (a - d) + b * b)
-        if 0.5 * (a + d) - spread < max_flatness * (0.5 * (a + d) + spread):
-            normal = 0.5 * math.atan2(2.0 * b, a - d) + 0.5 * math.pi
-            if math.cos(normal - towards) < 0.0:
-                normal += math.pi
-            angles[i] = normal
+        for factor in (1.0, sparse_factor):
+            reach = factor * (reach_m + reach_per_m * distance)
+            window = reach / max(distance, reach)
+            n = 1.0
+            sx = sy = sxx = sxy = syy = 0.0
+            # Half of the hits on either side at most, so that each neighbour is counted once.
+            for step, farthest in ((-1, (count - 1) // 2), (1, count // 2)):
+                for k in range(1, farthest + 1):
+                    j = order[(place + step * k) % count]
+                    turn = abs(bearings[j] - bearings[i])
+                    if min(turn, 2.0 * math.pi - turn) > window:
+                        break
+                    dx, dy = away[j, 0] - x, away[j, 1] - y
+                    if dx * dx + dy * dy < reach * reach:
+                        n += 1.0
+                        sx += dx
+                        sy += dy
+                        sxx += dx * dx
+                        sxy += dx * dy
+                        syy += dy * dy
+            if n < 3.0:
+                continue
+            mx, my = sx / n, sy / n
+            a, b, d = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+            spread = math.sqrt(0.25 * (a - d) * (a - d) + b * b)
+            if 0.5 * (a + d) - spread < max_flatness * (0.5 * (a + d) + spread):
+                normal = 0.5 * math.atan2(2.0 * b, a - d) + 0.5 * math.pi
+                if math.cos(normal - towards) < 0.0:
+                    normal += math.pi
+                angles[i] = normal
+            break
     return angles
 
 

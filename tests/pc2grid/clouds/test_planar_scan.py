@@ -188,7 +188,7 @@ NOISE_PER_M2 = 0.0015
 CAMERA = np.eye(4)  # 0.6 m above the floor, looking along x, optical axes
 CAMERA[:3, :3] = [[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]
 CAMERA[2, 3] = 0.6
-LEVEL = Ground(np.array([0.0, 0.0, 1.0]), 0.0)
+LEVEL = Ground(np.array([0.0, 0.0, 1.0]), 0.0, None)
 
 
 def image_of_wall(wall_m: float, limit_m: float = LIMIT_M, seed: int = 0) -> np.ndarray:
@@ -268,15 +268,17 @@ def planar_normals_plain(hits_m: F32, origin_m: F64, parameters: CloudParameters
     distances = np.linalg.norm(away[:, None] - away, axis=2)
     angles = np.arctan2(-away[:, 1], -away[:, 0])
     for k in range(len(angles)):
-        reach = p.reach_m + p.reach_per_m * ranges[k]
-        near = (distances[k] < reach) & (turns[k] <= reach / max(ranges[k], reach))
-        near[k] = True
-        if near.sum() < 3:
-            continue
-        variances, axes = np.linalg.eigh(np.cov(away[near].T, bias=True))
-        if variances[0] < p.max_flatness * variances[1]:
-            normal = axes[:, 0] * (1.0 if axes[:, 0] @ away[k] <= 0.0 else -1.0)
-            angles[k] = np.arctan2(normal[1], normal[0])
+        for factor in (1.0, p.sparse_factor):
+            reach = factor * (p.reach_m + p.reach_per_m * ranges[k])
+            near = (distances[k] < reach) & (turns[k] <= reach / max(ranges[k], reach))
+            near[k] = True
+            if near.sum() < 3:
+                continue
+            variances, axes = np.linalg.eigh(np.cov(away[near].T, bias=True))
+            if variances[0] < p.max_flatness * variances[1]:
+                normal = axes[:, 0] * (1.0 if axes[:, 0] @ away[k] <= 0.0 else -1.0)
+                angles[k] = np.arctan2(normal[1], normal[0])
+            break
     return angles.astype(np.float32)
 
 
