@@ -286,9 +286,10 @@ def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision 
     scans = np.unique([*mapped.tolist(), *ends])
     nodes = trajectory.planar()[scans]
     number = {scan: k for k, scan in enumerate(scans.tolist())}
+    lengths_m = np.diff(trajectory.path_m()[scans]).tolist()
     measured = [
-        (k, k + 1, LOOPS.tracked_information(restart=_lost(trajectory, *scans[k : k + 2])))
-        for k in range(len(scans) - 1)
+        (k, k + 1, LOOPS.tracked_information(length_m, restart=_lost(trajectory, *scans[k : k + 2])))
+        for k, length_m in enumerate(lengths_m)
     ]
     measured += [(number[loop.older], number[loop.newer], loop.information) for loop in closed]
     edges = [

@@ -100,10 +100,13 @@ class LoopParameters:
         """Return the travel that a lost part of the session counts as: that of the largest window."""
         return self.max_window_m / (2 * self.drift_m)
 
-    def tracked_information(self, restart: bool) -> F64:
-        """Return the information (3, 3) of the step from a local map to the next. restart : tracking was lost
-        in between."""
-        travel_m = self.lost_m if restart else self.travel_m
+    def tracked_information(self, length_m: float, restart: bool) -> F64:
+        """Return the information (3, 3) of a tracked step between anchors. restart : tracking was lost in
+        between.
+
+        However near they are, each anchor lies in the middle of its own local map: half of one drifts, too.
+        """
+        travel_m = self.lost_m if restart else 0.5 * self.travel_m + length_m
         sigma = travel_m * np.array((self.drift_m, self.drift_m, self.drift_rad))
         return np.diag(sigma**-2)
 
@@ -391,7 +394,7 @@ class SessionGraph:
     def extend(self, step: SE2, walls: WallDirection, *, restart: bool) -> None:
         """Add the next local map, a tracked step from the last one. restart : tracking was lost before it."""
         newest = len(self)
-        information = self._parameters.tracked_information(restart)
+        information = self._parameters.tracked_information(math.hypot(step.x, step.y), restart)
         self.edges.append(Edge(newest - 1, newest, step, information))
         self.add(pose_at(self.nodes, newest - 1) @ step, walls)
 

@@ -117,7 +117,7 @@ def test_poses_do_not_hang_on_a_loop_at_the_edge_of_being_rejected() -> None:
 
 
 AXES_STEP_M = 4.0
-STEP_INFORMATION = LOOPS.tracked_information(restart=False)
+STEP_INFORMATION = LOOPS.tracked_information(AXES_STEP_M, restart=False)
 
 
 def corridor(headings_rad: list[float]) -> np.ndarray:
