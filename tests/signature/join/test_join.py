@@ -89,7 +89,8 @@ def test_a_wing_that_comes_twice_is_ambiguous() -> None:
 def test_too_little_in_common_is_not_joined() -> None:
     """The west of the corridor, 2 m wide, and the east of the office: they share 1.5 m of the corridor."""
     left, right = part((0.0, 6.0, 10.5, 8.0)), part((9.0, 0.0, 20.0, 14.0))
-    assert join_maps(joinable(right), joinable(left)).status != "joined"
+    join = join_maps(joinable(right), joinable(left))
+    assert join.common_m2 < JOIN.least_m2 and join.status != "joined"
 
 
 def test_a_bent_map_is_joined_and_says_how_bent_it_is() -> None:
