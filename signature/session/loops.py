@@ -104,9 +104,9 @@ class LoopParameters:
         """Return the information (3, 3) of a tracked step between anchors. restart : tracking was lost in
         between.
 
-        However near they are, each anchor lies in the middle of its own local map: half of one drifts, too.
+        However near they are: an anchor stands for its local map, and half of that drifts.
         """
-        travel_m = self.lost_m if restart else 0.5 * self.travel_m + length_m
+        travel_m = self.lost_m if restart else max(length_m, 0.5 * self.travel_m)
         sigma = travel_m * np.array((self.drift_m, self.drift_m, self.drift_rad))
         return np.diag(sigma**-2)
 

@@ -155,7 +155,7 @@ def test_pc2grid_needs_no_signature(tmp_path: Path) -> None:
         "import pc2grid\n"
         "from pc2grid.settings import Config\n"
         f"grid = pc2grid.load_map({str(tmp_path / 'map.yaml')!r})\n"
-        "print(len(pc2grid.submaps_of(grid, Config().partition)) > 10, callable(pc2grid.build_map))\n"
+        "print(len(pc2grid.submaps_of(grid, Config().partition)) > 10, callable(pc2grid.follow))\n"
         "try:\n"
         "    pc2grid.convert\n"
         "except ImportError:\n"
