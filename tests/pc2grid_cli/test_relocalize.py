@@ -274,12 +274,12 @@ def assert_same(document: Any, expected: Expected) -> None:
         assert document[key] == rounded(expected[key]), key
 
 
-def rounded(value: Any) -> Any:
+def rounded(value: Any, to: float = 1e-9) -> Any:
     if isinstance(value, dict):
-        return {key: rounded(member) for key, member in value.items()}
+        return {key: rounded(member, to) for key, member in value.items()}
     if isinstance(value, list):
-        return [rounded(member) for member in value]
-    return pytest.approx(value, rel=1e-9, abs=1e-9) if isinstance(value, float) else value
+        return [rounded(member, to) for member in value]
+    return pytest.approx(value, rel=to, abs=to) if isinstance(value, float) else value
 
 
 def test_watch_locates_in_space(expected: tuple[Path, Expected]) -> None:
@@ -354,6 +354,8 @@ def test_a_right_pose_is_fine_and_a_wrong_one_tells_the_answer(expected: tuple[P
     assert document["off_m"] == pytest.approx(0.0, abs=1e-5)
     document = relocalize_at_once(folder, "--check", pose["x"] + 4.0, pose["y"], 0.0)
     assert document["status"] == "lost"
-    assert document["better"]["pose"] == rounded(pose) == rounded(watched["pose"])
+    # ICP ends within micrometres, from wherever a search has begun.
+    assert document["better"]["pose"] == rounded(pose, 1e-5)
+    assert pose == rounded(watched["pose"])
     # The pose that is checked was believed, so a little of the mass is there.
     assert document["better"]["confidence"] == pytest.approx(last["confidence"], abs=1e-3)
