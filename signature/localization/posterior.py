@@ -303,15 +303,13 @@ def with_mass(answer: Answer) -> tuple[Place, ...]:
 
 def _is_beside(fit: Fit, away: Place, T_odom_base: SE2) -> bool:
     """Return whether a fit puts the base where odometry has carried it beside the map."""
-    return agree(T_odom_base, away.fits[0], fit, away.fits[0].covariance)
+    return agree(T_odom_base, away.fits[0], fit)
 
 
 def mass_at(fits: Sequence[Fit], places: Iterable[Place], T_odom_base: SE2) -> float:
     """Return the mass of those of the places that put the base where one of the fits does."""
     return sum(
-        place.mass
-        for place in places
-        if any(agree(T_odom_base, h, fit, h.covariance) for h in place.fits for fit in fits)
+        place.mass for place in places if any(agree(T_odom_base, h, fit) for h in place.fits for fit in fits)
     )
 
 

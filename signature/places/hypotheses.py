@@ -67,6 +67,9 @@ MAP_COVARIANCE = hand_over(np.diag(np.square((HYPOTHESES.map_m, HYPOTHESES.map_m
 SAME = hand_over(np.diag(np.square((HYPOTHESES.around_m, HYPOTHESES.around_m, HYPOTHESES.around_rad))))
 """(3, 3) region of x, y, yaw around a pose: poses in it are one place."""
 
+_ONE_POSE = float(chdtri(3, 1.0 - 0.999))
+"""Squared Mahalanobis distance of x, y, yaw within which 99.9 % of all poses of one place lie."""
+
 SIGMAS = math.sqrt(chdtri(2, 1.0 - 0.99))
 """Mahalanobis distance within which 99 % of positions in the plane lie."""
 
@@ -211,9 +214,8 @@ def distinct(query: QueryMap, hypotheses: Iterable[Fit]) -> tuple[Fit, ...]:
     The best one takes over the `submap_id` of the others if it has none.
     """
     kept: list[Fit] = []
-    center = SE2(*query.center_m, 0.0)
     for candidate in sorted(hypotheses, key=lambda h: -h.score):
-        better = next((i for i, other in enumerate(kept) if agree(center, candidate, other)), None)
+        better = next((i for i, other in enumerate(kept) if _one_peak(query, candidate, other)), None)
         if better is None:
             kept.append(candidate)
         elif kept[better].submap_id < 0:
@@ -237,16 +239,23 @@ def is_inside(a: SE2, b: SE2, shape: F64) -> bool:
     return near and wrap_angle(a.yaw - b.yaw) ** 2 <= float(shape[2, 2])
 
 
-def one_place(a: SE2, b: SE2, covariance: F64 | float = 0.0) -> bool:
-    """Return whether two poses are one place. covariance : (3, 3) of x, y, yaw, how exactly they are known
-    beside each other, if not by walls."""
-    return is_inside(a, b, SAME + SIGMAS**2 * np.asarray(covariance))
+def one_place(a: SE2, b: SE2) -> bool:
+    """Return whether two poses are one place, because a search around one has seen the other."""
+    return is_inside(a, b, SAME)
 
 
-def agree(at: SE2, a: Fit, b: Fit, covariance: F64 | float = 0.0) -> bool:
-    """Return whether two fits put one point `at` of the query at one place of one map."""
-    here, there = a.T_map_query @ at, b.T_map_query @ at
-    return a.session_index == b.session_index and one_place(here, there, covariance)
+def _one_peak(query: QueryMap, a: Fit, b: Fit) -> bool:
+    """Return whether two hypotheses are one place of one map."""
+    return a.session_index == b.session_index and one_place(_at(query, a), _at(query, b))
+
+
+def agree(T_odom_base: SE2, a: Fit, b: Fit) -> bool:
+    """Return whether two fits put the base at one pose, by the covariances of both: over time odometry says
+    where a place is now, which is more exact than what a search sees."""
+    one, other = (h.T_map_query @ T_odom_base for h in (a, b))
+    off = np.array([one.x - other.x, one.y - other.y, wrap_angle(one.yaw - other.yaw)])
+    squared = float(off @ np.linalg.solve(a.covariance + b.covariance, off))
+    return a.session_index == b.session_index and squared <= _ONE_POSE
 
 
 def more_exact(a: Fit, b: Fit) -> bool:

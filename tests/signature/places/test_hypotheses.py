@@ -11,8 +11,8 @@ from pc2grid.matching.score import score_fit
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from signature.config import Config, RelocalizeConfig, ShortlistBy
-from signature.localization.answer import Place, ambiguous_line
-from signature.localization.posterior import by_place, decide, mass_at
+from signature.localization.answer import ambiguous_line
+from signature.localization.posterior import by_place, decide
 from signature.places import map_index
 from signature.places.hypotheses import (
     HYPOTHESES,
@@ -98,7 +98,7 @@ def test_a_shoulder_is_led_to_its_peak_and_is_no_place_of_its_own() -> None:
     ("off", "one"),
     [((0.6, -0.5, 0.06), True), ((0.9, 0.0, 0.0), False), ((0.0, 0.0, math.radians(7.0)), False)],
 )
-def test_what_is_one_place_is_so_in_a_map_in_two_over_time_and_for_a_prior(
+def test_what_is_one_place_is_so_in_a_map_in_two_and_for_a_prior(
     off: tuple[float, float, float], one: bool
 ) -> None:
     """What a search around one of two poses has seen."""
@@ -108,8 +108,6 @@ def test_what_is_one_place_is_so_in_a_map_in_two_over_time_and_for_a_prior(
     there = replace(here, T_map_query=SE2(*off))
     assert (len(distinct(query, (here, there))) == 1) is one
     assert (len(by_place(joined, query, (here, replace(there, session_index=1)))) == 1) is one
-    known = Place(fits=(here,), mass=0.5)
-    assert (mass_at([there], [known], query.T_odom_base) == 0.5) is one
     assert Prior.of_pose(SE2(), 1e-6 * np.eye(3)).allows(SE2(*off)) is one
 
 
