@@ -18,13 +18,11 @@ warned of where and how often odometry was an outlier (`check_odometry`).
 
 from __future__ import annotations
 
-import dataclasses
-import itertools
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from itertools import chain
+from itertools import chain, pairwise
 
 import numpy as np
 
@@ -184,7 +182,7 @@ class Tracker:
             health = Health.OVERRULED
         self._last = scan
         self._odometer.remember(scan, pose)
-        deskewed = dataclasses.replace(scan, points_m=points, offsets_s=None)
+        deskewed = replace(scan, points_m=points, offsets_s=None)
         return Tracked(
             registered=RegisteredScan(scan=deskewed, T_session_base=pose, health=health),
             planar_scan=planar_scan,
@@ -523,7 +521,7 @@ def check_odometry(stamps_ns: Sequence[int], disagreements: Sequence[Disagreemen
             distance_m=max(found.distance_m for _, found in group),
             turn_rad=max(found.turn_rad for _, found in group),
         )
-        for group in (overruled[first:end] for first, end in itertools.pairwise(cuts) if first < end)
+        for group in (overruled[first:end] for first, end in pairwise(cuts) if first < end)
     ]
     stretches.sort(key=lambda s: (-(s.distance_m + s.turn_rad), s.from_ns))
     return OdometryCheck(
@@ -558,6 +556,6 @@ def _followed(
     tracker = Tracker(config.registration, config.projection, in_hand=beginning.in_hand)
     if beginning.warning is not None:
         observer.on_warning(beginning.warning)
-    for scan in itertools.chain(beginning.scans, rest):
+    for scan in chain(beginning.scans, rest):
         tracked = tracker.track(scan)
         yield tracked.registered, tracked.planar_scan

@@ -1,10 +1,10 @@
 """Recognises places within a session while it is made, for loop closure.
 
 The session is its own database: some metres of travel make a place map with a few described places, and
-every new place map is looked up among those before it with the parts of a `MapIndex`.
-Signatures propose, the alignment of walls in both directions verifies, and the evidence
-(`pc2grid.matching.evidence`) is that of an answer. How likely each place is says loop closure
-(`signature.session.loops`), which knows the travel between them.
+every new place map is looked up among those before it as a query is in a database
+(`signature.places.hypotheses.look_up`). Signatures propose, the alignment of walls in both directions
+verifies, and the evidence (`pc2grid.matching.evidence`) is that of an answer. Loop closure
+(`signature.session.loops`), which knows the travel between the places, tells how likely each is.
 """
 
 from __future__ import annotations
