@@ -789,4 +789,4 @@ MEASURED = ("comparisons", "paper", "real")
 @pytest.mark.parametrize("page", MEASURED)
 def test_a_page_of_figures_names_the_program_that_made_them(page: str) -> None:
     head = "\n".join((ROOT / "examples" / f"{page}.md").read_text("utf-8").splitlines()[:8])
-    assert re.search(r"of commit [0-9a-f]{7}|\([0-9a-f]{7}\)", head)
+    assert re.search(r"of commit [0-9a-f]{7,12}|\([0-9a-f]{7,12}\)", head)
