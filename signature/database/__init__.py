@@ -7,10 +7,9 @@ postgresql:// URL. `signature.add_session` stores in it.
 from __future__ import annotations
 
 from signature.database.database import SubmapDatabase
-from signature.database.postgres import PostgresRows, is_url
+from signature.database.postgres import PostgresDatabase, is_url
 from signature.database.protocol import Label, Location, Problem, Provenance, SessionInfo
-from signature.database.rows import Rows
-from signature.database.sqlite import SqliteRows
+from signature.database.sqlite import SqliteDatabase
 
 __all__ = [
     "Label",
@@ -33,9 +32,9 @@ def open_database(path_or_url: Location) -> SubmapDatabase:
     ...     session, database.grid(session).resolution_m, len(database.signatures()) > 10
     ('monday', 0.05, True)
     """
-    return SubmapDatabase(engine_of(path_or_url).open(path_or_url))
+    return engine_of(path_or_url).open(path_or_url)
 
 
-def engine_of(place: Location) -> type[Rows]:
+def engine_of(place: Location) -> type[SubmapDatabase]:
     """Return the engine of a path or URL."""
-    return PostgresRows if is_url(place) else SqliteRows
+    return PostgresDatabase if is_url(place) else SqliteDatabase

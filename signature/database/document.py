@@ -26,7 +26,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Optional, get_type_hints
+from typing import Any, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
@@ -124,19 +124,12 @@ _UNCOMPRESSED = ("submaps",)
 _CONFIG = ConfigDict(arbitrary_types_allowed=True, extra="forbid", allow_inf_nan=False)
 
 
-def _adapter(kind: Any) -> TypeAdapter[Any]:
-    """Return the pydantic adapter of a type.
-
-    pydantic takes a configuration for a type that may be None, and none for a dataclass alone.
-    """
-    optional: Any = Optional[kind]  # noqa: UP045 - a type that is made here
-    return TypeAdapter(optional, config=_CONFIG)
-
-
-_ADAPTERS = {
-    name: _adapter(kind) for name, kind in get_type_hints(StoredSession, include_extras=True).items()
+_ADAPTERS: dict[str, TypeAdapter[Any]] = {
+    name: TypeAdapter(kind | None, config=_CONFIG)
+    for name, kind in get_type_hints(StoredSession, include_extras=True).items()
 }
-"""What turns a part into plain values and back, by the types of its fields."""
+"""What turns a part into plain values and back, by the types of its fields. pydantic takes a configuration
+for a type that may be None, and none for a dataclass alone."""
 
 
 def stored_session(entry: Entry) -> StoredSession:
@@ -166,7 +159,7 @@ def stored_session(entry: Entry) -> StoredSession:
         loops=session_map.loops,
         points=session_map.points,
         submaps=submaps,
-        seen=seen_from(submaps, grid, config),
+        seen=SeenPlaces.of(grid, submaps.center_m, config.partition.radius_m),
     )
 
 
@@ -189,13 +182,9 @@ def completed(parts: Mapping[str, Any]) -> StoredSession:
         found.pop("seen", None)
     if found["points"] is None:
         found["info"] = replace(found["info"], points=0)
-    found.setdefault("seen", seen_from(found["submaps"], grid, config))
+    if "seen" not in found:
+        found["seen"] = SeenPlaces.of(grid, found["submaps"].center_m, config.partition.radius_m)
     return StoredSession(**found)
-
-
-def seen_from(submaps: SubmapArrays, grid: OccupancyGrid, config: Config) -> SeenPlaces:
-    """Return the visible surroundings of the centres of submaps."""
-    return SeenPlaces.of(grid, submaps.center_m, config.partition.radius_m)
 
 
 def stored_name(name: str) -> str:

@@ -4,15 +4,26 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, OutputError
 from pc2grid.io.source import is_submap_file
-from signature.database import SubmapDatabase, engine_of, open_database
-from signature.database.document import DatabaseDamage, StoredSession, clean, stored_session
+from pc2grid.model import is_part_of
+from signature.database import SubmapDatabase, document, engine_of, open_database
+from signature.database.database import PART_COLUMNS, SESSION_COLUMNS, SessionRow
+from signature.database.document import (
+    PARTS,
+    DatabaseDamage,
+    StoredSession,
+    clean,
+    row_crc,
+    stored_name,
+    stored_session,
+)
 from signature.database.postgres import is_url, location
 from signature.database.protocol import BuildingFrame, Entry, Location, Problem, SessionInfo
-from signature.database.rows import Rows, refuse_other_settings
 
 
 def store(target: Location, entries: Iterable[Entry], *, keep: bool, overwrite: bool = False) -> None:
@@ -30,9 +41,10 @@ def store(target: Location, entries: Iterable[Entry], *, keep: bool, overwrite: 
     """
     names = [clean(session_map.session) for session_map, _, _ in entries] if overwrite else []
 
-    def write(rows: Rows) -> None:
-        rows.remove([part for name in names for part in rows.other_parts(name)])
-        rows.store(map(stored_session, entries), overwrite=overwrite)
+    def write(database: SubmapDatabase) -> None:
+        for row in [part for name in names for part in _other_parts(database, name)]:
+            _delete(database, row)
+        _add(database, map(stored_session, entries), overwrite=overwrite)
 
     engine_of(target).change(target, write, keep=keep, create=True)
 
@@ -42,7 +54,12 @@ def remove(target: Location, names: Sequence[str]) -> None:
 
     Raises DatabaseError for a name that no session has, OutputError, DatabaseBusy, and as `open_database`.
     """
-    engine_of(target).change(target, lambda rows: rows.remove(names))
+
+    def write(database: SubmapDatabase) -> None:
+        for row in [database.row(name) for name in dict.fromkeys(names)]:
+            _delete(database, row)
+
+    engine_of(target).change(target, write)
 
 
 def rename(target: Location, old: str, new: str) -> None:
@@ -51,7 +68,21 @@ def rename(target: Location, old: str, new: str) -> None:
     Raises DatabaseError if there is no session `old`, or if there is another session `new`; OutputError,
     DatabaseBusy, and as `open_database`.
     """
-    engine_of(target).change(target, lambda rows: rows.rename(old, new))
+
+    def write(database: SubmapDatabase) -> None:
+        name, row = stored_name(new), database.row(old)
+        if name != old and database.find(name) is not None:
+            raise DatabaseError(
+                f"{database.location}: holds a session {name!r} already", hint="choose another name"
+            )
+        text = document.encode_info(replace(database.info(row), name=name))
+        values = (row.building, row.id, row.floor, name, text)
+        database.execute(
+            "UPDATE session SET name = ?, document = ?, crc32 = ? WHERE building = ? AND id = ?",
+            name, text, row_crc(values), row.building, row.id,
+        )  # fmt: skip
+
+    engine_of(target).change(target, write)
 
 
 def store_frames(target: Location, frames: Mapping[str, BuildingFrame | None]) -> None:
@@ -60,7 +91,15 @@ def store_frames(target: Location, frames: Mapping[str, BuildingFrame | None]) -
     All else stays as it is. Raises DatabaseError for a name that no session has, OutputError, DatabaseBusy,
     and as `open_database`.
     """
-    engine_of(target).change(target, lambda rows: rows.store_frames(frames))
+
+    def write(database: SubmapDatabase) -> None:
+        for name, frame in frames.items():
+            row = database.row(name)
+            where = row.building, row.id, "frame"
+            database.execute("DELETE FROM part WHERE building = ? AND session_id = ? AND name = ?", *where)
+            _insert(database, "part", PART_COLUMNS, (*where, document.encode("frame", frame)))
+
+    engine_of(target).change(target, write)
 
 
 def exists(target: Location) -> bool:
@@ -83,8 +122,8 @@ def check(source: Location) -> tuple[Problem, ...]:
 
     Raises NotADatabase or DatabaseVersion if `source` is no database of the format that this version reads.
     """
-    with contextlib.closing(engine_of(source).open(source, damaged=True)) as rows:
-        return rows.all_problems()
+    with engine_of(source).open(source, damaged=True) as database:
+        return database.all_problems()
 
 
 def copy(
@@ -119,7 +158,7 @@ def merge(sources: Sequence[Location], target: Location, *, overwrite: bool = Fa
         with open_database(source) as database:
             for info in database.sessions():
                 first, _ = next(iter(chosen.values()), (info, source))
-                refuse_other_settings(first, info, shown(source))
+                _refuse_other_settings(first, info, shown(source))
                 known, origin = chosen.setdefault(info.name, (info, source))
                 if known != info:
                     raise DatabaseError(
@@ -156,13 +195,13 @@ def _write(
 
     def sessions() -> Iterator[StoredSession]:
         for source, names in sources:
-            with SubmapDatabase(engine_of(source).open(source, damaged=recover), damaged=recover) as database:
+            with engine_of(source).open(source, damaged=recover) as database:
                 for info in database.sessions(names):
                     with contextlib.suppress(*([DatabaseCorrupt] if recover else [])):
                         yield database.stored(info.name, recover=recover)
 
     engine_of(target).change(
-        target, lambda rows: rows.store(sessions(), overwrite=False), keep=False, create=True
+        target, lambda database: _add(database, sessions(), overwrite=False), keep=False, create=True
     )
 
 
@@ -179,3 +218,82 @@ def _refuse_repeated(sources: Sequence[Location]) -> None:
         if place in known:
             raise DatabaseError(f"{shown(source)}: named twice", hint="name each database once")
         known.add(place)
+
+
+# --- rows, within a transaction -----------------------------------------------------------------------
+
+
+def _add(database: SubmapDatabase, sessions: Iterable[StoredSession], *, overwrite: bool) -> None:
+    """Add sessions. One that is stored already is skipped.
+
+    overwrite : replace a session of the same name.
+
+    Raises DatabaseError for a session of that name with other content, or with signatures that cannot be
+    compared with those of the other sessions.
+    """
+    for session in sessions:
+        document.check("submaps", session.submaps, {"info": session.info, "grid": session.grid})
+        text = document.encode_info(session.info)
+        info = document.decode_info(text)
+        other = database.other(info)
+        if other is not None:
+            _refuse_other_settings(other, info, database.location)
+        known = database.find(info.name)
+        if known is not None and not overwrite:
+            if known.document == text:
+                continue
+            raise DatabaseError(
+                f"{database.location}: holds another session named {info.name!r} already",
+                hint="--force replaces it; --name gives this one another name",
+            )
+        if known is not None:
+            _delete(database, known)
+        label, number = info.provenance.label, database.new_id() if known is None else known.id
+        building, floor = label.building or "", label.floor or ""
+        _insert(database, "session", SESSION_COLUMNS, (building, number, floor, info.name, text))
+        for part in PARTS:
+            data = document.encode(part, getattr(session, part))
+            _insert(database, "part", PART_COLUMNS, (building, number, part, data))
+
+
+def _other_parts(database: SubmapDatabase, name: str) -> list[SessionRow]:
+    """Return the other parts of the recording of a session, which are sessions of their own."""
+    first = database.find(name)
+    if first is None:
+        return []
+    digest = database.info(first).digest
+    rows = database.rows("substr(name, 1, ?) = ?", len(name) + 1, f"{name}#")
+    return [row for row in rows if is_part_of(row.name, name) and database.info(row).digest == digest]
+
+
+def _delete(database: SubmapDatabase, row: SessionRow) -> None:
+    """Delete all rows of a session."""
+    database.execute("DELETE FROM part WHERE building = ? AND session_id = ?", row.building, row.id)
+    database.execute("DELETE FROM session WHERE building = ? AND id = ?", row.building, row.id)
+
+
+def _insert(database: SubmapDatabase, table: str, columns: Sequence[str], values: Sequence[Any]) -> None:
+    """Add a row with its checksum."""
+    marks = ", ".join("?" * (len(columns) + 1))
+    statement = f"INSERT INTO {table} ({', '.join(columns)}, crc32) VALUES ({marks})"
+    database.execute(statement, *values, row_crc(values))
+
+
+def _refuse_other_settings(known: SessionInfo, new: SessionInfo, location: str) -> None:
+    """Refuse to store signatures that cannot be compared with those of the session `known`.
+
+    All sessions of a database share the settings that shape signatures, and the resolution of the map.
+    Raises DatabaseError naming the first setting that differs.
+    """
+    pairs = [
+        (f"{section}.{key}", getattr(getattr(known.provenance.config, section), key), value)
+        for section in ("signature", "partition")
+        for key, value in getattr(new.provenance.config, section)
+    ]
+    pairs.append(("the map's resolution", known.resolution_m, new.resolution_m))
+    for name, was, now in pairs:
+        if was != now:
+            raise DatabaseError(
+                f"{location}: sessions made with {name} = {was!r} and with {now!r} cannot be compared",
+                hint="use the same settings, or another database",
+            )

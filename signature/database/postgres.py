@@ -1,4 +1,4 @@
-"""The rows of a database on a PostgreSQL server: one for a whole fleet, with many writers at once.
+"""A database on a PostgreSQL server: one for a whole fleet, with many writers at once.
 
 Everything is in a schema of its own, `pc2grid`, so the database may hold other tables, too.
 """
@@ -21,6 +21,7 @@ from pc2grid.errors import (
     Pc2GridError,
 )
 from pc2grid.libraries import require
+from signature.database.database import SubmapDatabase, definitions
 from signature.database.protocol import (
     APPLICATION_ID,
     BUSY_TIMEOUT_S,
@@ -32,54 +33,57 @@ from signature.database.protocol import (
     no_utf8,
     refuse_other_format,
 )
-from signature.database.rows import Rows, definitions
 
 if TYPE_CHECKING:
     from psycopg import Connection, Error
     from typing_extensions import Self
 
 
-class PostgresRows(Rows):
-    """The rows of a schema `pc2grid` on a PostgreSQL server; read in one snapshot."""
-
-    for_update = " FOR UPDATE"
+class PostgresDatabase(SubmapDatabase):
+    """A schema `pc2grid` on a PostgreSQL server; read in one snapshot."""
 
     @classmethod
     def open(cls, place: Location, *, damaged: bool = False) -> Self:
-        """Open the rows, see `Rows.open`."""
+        """Open the database for reading, see `SubmapDatabase.open`."""
         with contextlib.ExitStack() as undo:
-            rows = cls._connected(place)
-            undo.callback(rows.close)
-            inspect(rows.connection, rows.location)
-            rows.connection.set_autocommit(False)
-            rows.connection.set_isolation_level(driver().IsolationLevel.REPEATABLE_READ)
-            rows.connection.set_read_only(True)
-            rows.execute("SELECT 1 FROM about")  # takes the snapshot
+            database = cls(*connect(str(place)), damaged=damaged)
+            undo.callback(database.close)
+            inspect(database.connection, database.location)
+            database.connection.set_autocommit(False)
+            database.connection.set_isolation_level(driver().IsolationLevel.REPEATABLE_READ)
+            database.connection.set_read_only(True)
+            database.execute("SELECT 1 FROM about")  # takes the snapshot
             undo.pop_all()
-        return rows
+        return database
 
     @classmethod
     def change(
-        cls, place: Location, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
+        cls,
+        place: Location,
+        action: Callable[[SubmapDatabase], None],
+        *,
+        keep: bool = True,
+        create: bool = False,
     ) -> None:
-        """Change the rows, see `Rows.change`.
+        """Change the rows, see `SubmapDatabase.change`.
 
         Any number of processes may write at once; they wait for each other only if they store sessions of one
         name, or while the database is empty.
         """
         errors = driver().errors
-        with contextlib.closing(cls._connected(place)) as rows:
+        with cls(*connect(str(place))) as database:
+            database.for_update = " FOR UPDATE"
             if create:
-                initialise(rows.connection, rows.location)
-            inspect(rows.connection, rows.location)
+                initialise(database.connection, database.location)
+            inspect(database.connection, database.location)
             while True:
                 try:
-                    with served(rows.location), rows.connection.transaction():
+                    with served(database.location), database.connection.transaction():
                         if not keep:
-                            rows.execute("SELECT 1 FROM about FOR UPDATE")
-                            rows.execute("DELETE FROM part")
-                            rows.execute("DELETE FROM session")
-                        action(rows)
+                            database.execute("SELECT 1 FROM about FOR UPDATE")
+                            database.execute("DELETE FROM part")
+                            database.execute("DELETE FROM session")
+                        action(database)
                     return
                 except DatabaseError as error:
                     # Another writer has just stored a session of that name: compare with it.
@@ -90,18 +94,14 @@ class PostgresRows(Rows):
     def exists(cls, place: Location) -> bool:
         """Return True if the database holds sessions. Raises DatabaseUnreachable if the server does not
         answer."""
-        with contextlib.closing(cls._connected(place)) as rows:
+        with cls(*connect(str(place))) as database:
             try:
-                inspect(rows.connection, rows.location)
+                inspect(database.connection, database.location)
             except NotADatabase:
                 return False
-            return next(rows.select("SELECT 1 FROM session LIMIT 1"), None) is not None
+            return next(database._select("SELECT 1 FROM session LIMIT 1"), None) is not None
 
-    @classmethod
-    def _connected(cls, place: Location) -> Self:
-        return cls(place, location(str(place)), connect(str(place)))
-
-    def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
+    def _select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query. Raises the errors of `served`."""
         with served(self.location), self.connection.cursor(binary=True) as cursor:
             found = cursor.execute(statement.replace("?", "%s"), values).fetchall()
@@ -114,7 +114,7 @@ class PostgresRows(Rows):
 
     def new_id(self) -> int:
         """Return a number for a further session."""
-        ((number,),) = self.select("SELECT nextval('session_id')")
+        ((number,),) = self._select("SELECT nextval('session_id')")
         return int(number)
 
     def other(self, info: SessionInfo) -> SessionInfo | None:
@@ -132,7 +132,7 @@ class PostgresRows(Rows):
         self.execute("SELECT 1 FROM about FOR UPDATE")
         return super().other(info)
 
-    def orphans(self) -> Iterator[Problem]:
+    def _orphans(self) -> Iterator[Problem]:
         """Yield nothing: a foreign key excludes orphaned parts."""
         return iter(())
 
@@ -193,8 +193,11 @@ def served(where: str) -> Iterator[None]:
         raise no_utf8(where) from None
 
 
-def connect(url: str) -> Connection[Any]:
-    """Open a connection in autocommit mode. Raises DatabaseUnreachable or NotADatabase."""
+def connect(url: str) -> tuple[str, Connection[Any]]:
+    """Return the `location` of a URL, and a connection to it in autocommit mode.
+
+    Raises DatabaseUnreachable or NotADatabase.
+    """
     psycopg, where = driver(), location(url)
     parts = psycopg.conninfo.conninfo_to_dict(url)
     defaults = {"connect_timeout": round(CONNECT_TIMEOUT_S), "application_name": "pc2grid"}
@@ -207,7 +210,7 @@ def connect(url: str) -> Connection[Any]:
     with served(where):
         connection.execute(f"SET lock_timeout = '{BUSY_TIMEOUT_S:.0f}s'")
         connection.execute("SET search_path = pc2grid")
-    return connection
+    return where, connection
 
 
 def inspect(connection: Connection[Any], where: str) -> None:

@@ -176,8 +176,13 @@ class BuildingFrame:
         return self.around(np.array([(x_m, y_m)]))[0]
 
     def around(self, points_m: F64) -> list[SE2]:
-        """Return T_building_session around points (N, 2) of the session's map."""
-        return [self.T_building_session @ T for T in rigid_motions(self.bend, points_m)]
+        """Return T_building_session around points (N, 2) of the session's map, each good near its point."""
+        found = []
+        for (x, y), (dx, dy, yaw) in zip(
+            points_m.tolist(), motions(self.bend, points_m).tolist(), strict=True
+        ):
+            found.append(self.T_building_session @ (SE2(x + dx, y + dy, yaw) @ SE2(-x, -y, 0.0)))
+        return found
 
     def placed(self, T_session_base: SE2) -> SE2:
         """Transform a pose in the session's map into the building."""
@@ -185,12 +190,15 @@ class BuildingFrame:
 
     def apply(self, points_m: F64) -> F64:
         """Transform points (N, 2) or (N, 3) of the session's map into the building."""
-        plane_m = self.T_building_session.apply(deformed(self.bend, points_m[:, :2]))
-        return np.column_stack((plane_m, points_m[:, 2:]))
+        bent_m = points_m[:, :2] + motions(self.bend, points_m[:, :2])[:, :2]
+        return np.column_stack((self.T_building_session.apply(bent_m), points_m[:, 2:]))
 
     def to_session(self, points_m: F64) -> F64:
         """Transform points (N, 2) of the building into the session's map."""
-        return undeformed(self.bend, self.T_building_session.inverse().apply(points_m))
+        bent_m = drawn_m = self.T_building_session.inverse().apply(points_m)
+        for _ in range(_ROUNDS if self.bend else 0):
+            drawn_m = bent_m - motions(self.bend, drawn_m)[:, :2]
+        return drawn_m
 
 
 def by_building(frames: Mapping[str, BuildingFrame]) -> dict[str, dict[str, BuildingFrame]]:
@@ -227,28 +235,6 @@ def motions(deformation: Deformation, points_m: F64) -> F64:
     moved[..., 0] -= moved[..., 2] * away[..., 1]
     moved[..., 1] += moved[..., 2] * away[..., 0]
     return np.asarray((weight[..., None] * moved).sum(axis=1))
-
-
-def deformed(deformation: Deformation, points_m: F64) -> F64:
-    """Return the positions (M, 2) of points (M, 2) of a map after its deformation."""
-    return np.asarray(points_m + motions(deformation, points_m)[:, :2])
-
-
-def undeformed(deformation: Deformation, points_m: F64) -> F64:
-    """Return the points (M, 2) of a map that its deformation moves to `points_m` (M, 2)."""
-    drawn_m = points_m
-    for _ in range(_ROUNDS if deformation else 0):
-        drawn_m = points_m - motions(deformation, drawn_m)[:, :2]
-    return drawn_m
-
-
-def rigid_motions(deformation: Deformation, points_m: F64) -> list[SE2]:
-    """Return the rigid motions of a map about points (M, 2) of it, T_deformed_drawn, each good near its
-    point."""
-    found = []
-    for (x, y), (dx, dy, yaw) in zip(points_m.tolist(), motions(deformation, points_m).tolist(), strict=True):
-        found.append(SE2(x + dx, y + dy, yaw) @ SE2(-x, -y, 0.0))
-    return found
 
 
 def largest_m(deformation: Deformation) -> float:

@@ -1,4 +1,4 @@
-"""The rows of one SQLite file, which is changed as a whole: in a copy that replaces it when it is complete.
+"""A database in one SQLite file, which is changed as a whole: in a copy that replaces it when it is complete.
 
 A finished `*.submaps` file is never written to again. A reader keeps the file it opened, complete and
 unlocked, on any file system and any read-only medium; a file opened later has the new content. A writer that
@@ -26,6 +26,7 @@ from typing_extensions import Self
 from pc2grid.errors import DatabaseBusy, DatabaseCorrupt, DatabaseError, NotADatabase, OutputError
 from pc2grid.io.atomic import is_at, replace_file
 from pc2grid.io.source import LFS_HINT, is_lfs_pointer
+from signature.database.database import SubmapDatabase, definitions
 from signature.database.document import SALVAGE, DatabaseDamage
 from signature.database.protocol import (
     APPLICATION_ID,
@@ -36,44 +37,75 @@ from signature.database.protocol import (
     no_utf8,
     refuse_other_format,
 )
-from signature.database.rows import Rows, definitions
 
 _MAPPED_BYTES = 1 << 30
 """How much of a file SQLite maps into memory at most; chosen by hand."""
 
 
-class SqliteRows(Rows):
-    """The rows of a `*.submaps` file. Finished files are never written again, so readers need no locks."""
+class SqliteDatabase(SubmapDatabase):
+    """A `*.submaps` file. Finished files are never written again, so readers need no locks."""
 
     @classmethod
     def open(cls, place: Location, *, damaged: bool = False) -> Self:
-        """Open the rows, see `Rows.open`."""
+        """Open the file for reading, see `SubmapDatabase.open`. The connection cannot change it."""
         path = local(place)
         with contextlib.suppress(*[DatabaseCorrupt] if damaged else []):
             inspect_header(path)
-        rows = cls(path, str(path), _connect(path))
-        if not damaged:
-            with contextlib.ExitStack() as undo:
-                undo.callback(rows.close)
-                inspect_tables(rows.connection, path)
-                undo.pop_all()
-        return rows
+        connection = sqlite3.connect(
+            f"file:{quote(os.path.realpath(path))}?mode=ro&immutable=1",
+            uri=True,
+            isolation_level=None,
+            check_same_thread=False,
+        )
+        with contextlib.ExitStack() as undo:
+            undo.callback(connection.close)
+            connection.execute("PRAGMA trusted_schema = OFF")
+            connection.execute(f"PRAGMA mmap_size = {_MAPPED_BYTES}")
+            if not damaged:
+                inspect_tables(connection, path)
+            undo.pop_all()
+        return cls(str(path), connection, damaged=damaged)
 
     @classmethod
     def change(
-        cls, place: Location, action: Callable[[Rows], None], *, keep: bool = True, create: bool = False
+        cls,
+        place: Location,
+        action: Callable[[SubmapDatabase], None],
+        *,
+        keep: bool = True,
+        create: bool = False,
     ) -> None:
-        """Change the rows, see `Rows.change`. Deleted rows take no place in the new file."""
+        """Change a copy of the file that replaces it, see `SubmapDatabase.change`. Deleted rows take no place
+        in it.
+
+        Raises DatabaseBusy if another writer does not finish within `BUSY_TIMEOUT_S`.
+        """
         path = local(place)
         if not create:
             inspect_header(path)
-        with rewrite(path, keep=keep) as connection:
-            action(cls(path, str(path), connection))
-            # The copy that is worked on is nobody else's: the change may end before the file is made compact.
-            connection.execute("COMMIT")
-            if connection.execute("PRAGMA freelist_count").fetchone() != (0,):
-                connection.execute("VACUUM")
-            connection.execute("BEGIN")
+        target = Path(os.path.realpath(path))
+        with hold(target, BUSY_TIMEOUT_S), replace_file(target, alone=True) as copy:
+            kept = keep and target.exists() and target.stat().st_size > 0
+            if kept:
+                inspect_header(target)
+                shutil.copyfile(target, copy)
+            with (
+                contextlib.closing(sqlite3.connect(copy, isolation_level=None)) as connection,
+                _explained(path),
+            ):
+                if kept:
+                    inspect_tables(connection, path)
+                # Journal and fsync are off: the temporary copy is renamed only when it is complete.
+                connection.execute("PRAGMA journal_mode = OFF")
+                connection.execute("PRAGMA synchronous = OFF")
+                connection.execute("PRAGMA trusted_schema = OFF")
+                if not kept:
+                    initialise(connection)
+                connection.execute("BEGIN")
+                action(cls(str(path), connection))
+                connection.execute("COMMIT")
+                if connection.execute("PRAGMA freelist_count").fetchone() != (0,):
+                    connection.execute("VACUUM")
 
     @classmethod
     def exists(cls, place: Location) -> bool:
@@ -81,7 +113,7 @@ class SqliteRows(Rows):
         path = local(place)
         return path.exists() and not (path.is_file() and path.stat().st_size == 0)
 
-    def select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
+    def _select(self, statement: str, *values: Any) -> Iterator[tuple[Any, ...]]:
         """Yield the rows of a query. Raises DatabaseCorrupt if SQLite finds the file damaged."""
         try:
             # `yield from` would close the cursor of an unfinished generator, perhaps after the connection.
@@ -95,23 +127,23 @@ class SqliteRows(Rows):
             raise DatabaseDamage(self.location, "file", f"{type(error).__name__}: {error}") from error
 
     def execute(self, statement: str, *values: Any) -> None:
-        """Change rows. Raises sqlite3.Error, which `rewrite` explains."""
+        """Change rows. Raises sqlite3.Error, which `change` explains."""
         self.connection.execute(statement, values)
 
     def new_id(self) -> int:
         """Return a number for a further session."""
-        ((largest,),) = self.select("SELECT coalesce(max(id), 0) FROM session")
+        ((largest,),) = self._select("SELECT coalesce(max(id), 0) FROM session")
         return int(largest) + 1
 
-    def damaged_structure(self) -> Iterator[Problem]:
+    def _damaged_structure(self) -> Iterator[Problem]:
         """Yield a wrong header, tables that are not those of the format, and the findings of SQLite
         itself."""
         try:
-            inspect_header(local(self.source))
-            inspect_tables(self.connection, local(self.source))
+            inspect_header(Path(self.location))
+            inspect_tables(self.connection, Path(self.location))
         except DatabaseCorrupt as error:
             yield Problem("file", error.message)
-        for (message,) in self.select("PRAGMA integrity_check"):
+        for (message,) in self._select("PRAGMA integrity_check"):
             yield from (Problem("file", line) for line in str(message).splitlines() if line != "ok")
 
 
@@ -126,52 +158,9 @@ def local(place: Location) -> Path:
     return Path(place)
 
 
-def _connect(path: Path) -> sqlite3.Connection:
-    """Open a connection that cannot change the file."""
-    connection = sqlite3.connect(
-        f"file:{quote(os.path.realpath(path))}?mode=ro&immutable=1",
-        uri=True,
-        isolation_level=None,
-        check_same_thread=False,
-    )
-    connection.execute("PRAGMA trusted_schema = OFF")
-    connection.execute(f"PRAGMA mmap_size = {_MAPPED_BYTES}")
-    return connection
-
-
 # --- writing ------------------------------------------------------------------------------------------
 
 _POLL_S = 0.05
-
-
-@contextlib.contextmanager
-def rewrite(path: Path, *, keep: bool) -> Iterator[sqlite3.Connection]:
-    """Yield a connection to change; when the body ends without an error, `path` holds the result.
-
-    keep : start from the content of `path`; otherwise, or if there is none yet, from an empty database.
-
-    Raises DatabaseBusy if another writer does not finish within `BUSY_TIMEOUT_S`, OutputError if the file
-    cannot be written, and NotADatabase, DatabaseVersion or DatabaseCorrupt if the content of `path` cannot be
-    kept.
-    """
-    target = Path(os.path.realpath(path))
-    with hold(target, BUSY_TIMEOUT_S), replace_file(target, alone=True) as copy:
-        kept = keep and target.exists() and target.stat().st_size > 0
-        if kept:
-            inspect_header(target)
-            shutil.copyfile(target, copy)
-        with contextlib.closing(sqlite3.connect(copy, isolation_level=None)) as connection, _explained(path):
-            if kept:
-                inspect_tables(connection, path)
-            # Journal and fsync are off: the temporary copy is renamed only when it is complete.
-            connection.execute("PRAGMA journal_mode = OFF")
-            connection.execute("PRAGMA synchronous = OFF")
-            connection.execute("PRAGMA trusted_schema = OFF")
-            if not kept:
-                initialise(connection)
-            connection.execute("BEGIN")
-            yield connection
-            connection.execute("COMMIT")
 
 
 @contextlib.contextmanager

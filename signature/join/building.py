@@ -41,6 +41,7 @@ from pc2grid.model import (
     Trajectory,
 )
 from pc2grid.observer import Observer
+from signature.database.database import no_session
 from signature.database.protocol import (
     BuildingFrame,
     Covariance,
@@ -49,7 +50,6 @@ from signature.database.protocol import (
     by_building,
     largest_m,
 )
-from signature.database.rows import no_session
 from signature.join.join import (
     Link,
     Names,

@@ -32,9 +32,9 @@ from pc2grid.submaps.submaps import view_at
 from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database import Label, Provenance, SubmapDatabase, open_database
+from signature.database.database import PART_COLUMNS, SESSION_COLUMNS
 from signature.database.document import row_crc, unpack
 from signature.database.protocol import Entry
-from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
 from signature.freespace import freespace_bins
 from signature.paper import Signature
 from signature.sessions import add_sessions, provenance

@@ -235,12 +235,12 @@ def test_signal_in_the_middle_of_writing(inputs: Path, tmp_path: Path, number: i
     shutil.copyfile(inputs / "drive.submaps", output)
     at_the_second_row = (
         "import os\n"
-        "from signature.database.rows import Rows\n"
-        "plain, calls = Rows._insert, []\n"
+        "from signature.database import maintenance\n"
+        "plain, calls = maintenance._insert, []\n"
         "def insert(*arguments):\n"
         f"    calls.append(1); len(calls) == 2 and os.kill(os.getpid(), {int(number)})\n"
         "    return plain(*arguments)\n"
-        "Rows._insert = insert\n"
+        "maintenance._insert = insert\n"
     )
     process = Convert(inputs / "house.yaml", "-o", output, "--add", cwd=tmp_path, before=at_the_second_row)
     found, said = process.wait(), process.said()

@@ -47,10 +47,10 @@ from signature.database import (
     postgres,
     sqlite,
 )
+from signature.database.database import PART_COLUMNS, SESSION_COLUMNS
 from signature.database.document import PARTS
 from signature.database.maintenance import check, copy, merge, store
 from signature.database.protocol import APPLICATION_ID
-from signature.database.rows import PART_COLUMNS, SESSION_COLUMNS
 from signature.database.sqlite import hold
 from signature.paper import describe
 from signature.sessions import add_session, provenance
