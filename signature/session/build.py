@@ -38,7 +38,7 @@ from signature.session.part_maps import (
     part_reports,
     with_track_warnings,
 )
-from signature.session.recognition import recognizer_for
+from signature.session.recognition import SessionRecognizer
 
 if TYPE_CHECKING:
     from pc2grid.io.recording import Log
@@ -196,7 +196,7 @@ def _map(
             stack.enter_context(closing(points))
         closer = LoopCloser(
             keyframes,
-            recognizer=recognizer_for(config),
+            recognizer=SessionRecognizer(config) if config.loops.recognize else None,
             projection=projection,
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )

@@ -135,7 +135,10 @@ class LoopCloser:
         self._parameters = parameters
         self._keyframes = keyframes
         self._local_maps = LocalMaps(keyframes, local_map_parameters)
-        self._graph = SessionGraph(parameters)
+        # The pose graph over the anchors of local maps, as it was solved last.
+        self._nodes: F64 = np.empty((0, 3))  # x, y, yaw of each in the session
+        self._edges: list[Edge] = []  # tracked steps and loops, in the order in which they were found
+        self._walls: list[WallDirection] = []  # of each local map
         self._place_maps = PlaceMaps(self._local_maps, parameters.maps_per_place, recognizer, projection)
         self._travel_m = 0.0  # in the local map that is not complete yet
         self._travelled_m = array("d")  # at each local map; a lost part counts as `lost_m`
@@ -162,7 +165,7 @@ class LoopCloser:
 
     def _complete_local_map(self) -> None:
         """Make a local map of the last keyframes: place it by tracking, then compare it with older ones."""
-        newest = len(self._graph)
+        newest = len(self._nodes)
         self._local_maps.complete()
         restart = self._local_maps.runs[newest].start in self._keyframes.restarts
         self._travel_m = 0.0
@@ -175,41 +178,50 @@ class LoopCloser:
         self._close_recognized(self._place_maps.extend(restart=restart, known=known))
 
     def _place(self, newest: int, restart: bool) -> None:
-        """Add the newest local map to the pose graph, by tracking."""
-        walls = wall_direction(self._local_maps[newest].normal_rad)
-        pose = self._tracked(newest)
-        if not newest:
-            self._graph.add(pose, walls)
-            self._travelled_m.append(0.0)
-            return
-        step = self._tracked(newest - 1).inverse() @ pose
-        drift_m = self._parameters.lost_m if restart else math.hypot(step.x, step.y)
-        self._drift_m += drift_m
-        self._travelled_m.append(self._travelled_m[-1] + drift_m)
-        self._graph.extend(step, walls, restart=restart)
+        """Add the newest local map to the pose graph, a tracked step from the one before. restart : tracking
+        was lost in between."""
+        anchors, travelled_m = self._local_maps.anchors, 0.0
+        pose = self._keyframes.pose(anchors[newest])
+        if newest:
+            step = self._keyframes.pose(anchors[newest - 1]).inverse() @ pose
+            length_m = math.hypot(step.x, step.y)
+            drift_m = self._parameters.lost_m if restart else length_m
+            self._drift_m += drift_m
+            travelled_m = self._travelled_m[-1] + drift_m
+            information = self._parameters.tracked_information(length_m, restart)
+            self._edges.append(Edge(newest - 1, newest, step, information))
+            pose = pose_at(self._nodes, newest - 1) @ step
+        self._travelled_m.append(travelled_m)
+        self._nodes = np.vstack((self._nodes, (pose.x, pose.y, pose.yaw)))
+        self._walls.append(wall_direction(self._local_maps[newest].normal_rad))
 
-    def _tracked(self, number: int) -> SE2:
-        """Return the pose of a local map as tracked."""
-        return self._keyframes.pose(self._local_maps.anchors[number])
+    def _relative(self, first: int, second: int) -> SE2:
+        """Return T_first_second of two local maps by the present poses."""
+        return pose_at(self._nodes, first).inverse() @ pose_at(self._nodes, second)
+
+    def _solve(self) -> Solution:
+        """Solve the pose graph for the poses that agree best with all edges."""
+        solution = optimise(self._nodes, self._edges, self._walls)
+        self._nodes = solution.poses
+        return solution
 
     def _close(self, loops: list[Edge]) -> None:
         """Add loops to the pose graph, and solve it again."""
         if loops:
             self._drift_m *= 1.0 - max(loop.counts for loop in loops)
-            self._graph.edges += loops
-            self._graph.solve()
+            self._edges += loops
+            self._solve()
 
     def _overlaps(self, newest: int) -> Iterator[Edge]:
         """Yield verified overlaps of the newest local map with older ones, near its tracked pose."""
         window = self._parameters.window(self._drift_m)
-        nodes = self._graph.nodes
         # The local map before the newest is left out: tracking matched both against the same walls.
-        before = nodes[: max(newest - 1, 0), :2]
-        distance_m = np.hypot(*(before - nodes[newest, :2]).T)
+        before = self._nodes[: max(newest - 1, 0), :2]
+        distance_m = np.hypot(*(before - self._nodes[newest, :2]).T)
         near = np.flatnonzero(distance_m < self._parameters.near_m + window[0]).tolist()
         # A robot that drives up and down passes a place dozens of times: some of all visits are chosen.
         for older in (near[k] for k in evenly(len(near), self._parameters.compared)):
-            yield from self._compare(older, newest, self._graph.relative(older, newest), window)
+            yield from self._compare(older, newest, self._relative(older, newest), window)
 
     def _compare(
         self, older: int, newer: int, guess: SE2, window: tuple[float, float], mass: float = 1.0
@@ -230,45 +242,53 @@ class LoopCloser:
         """Close the loops to the places that the newest place map may show; each counts as it is likely."""
         p = self._parameters
         loops: list[Edge] = []
-        for place, mass in zip(found, masses([f.evidence for f in found], self._prior(found)), strict=True):
+        ways_m = [self._way_m(place) for place in found]
+        prior = [self._prior(place, way_m) for place, way_m in zip(found, ways_m, strict=True)]
+        mass = masses([place.evidence for place in found], prior)
+        for place, way_m, likely in zip(found, ways_m, mass.tolist(), strict=True):
             # Places a short way apart show nothing but that tracking is smooth.
-            if mass < LEFT or self._way_m(place) < 2 * p.maps_per_place * p.travel_m:
+            if likely < LEFT or way_m < 2 * p.maps_per_place * p.travel_m:
                 continue
             for older, newer, guess in self._place_maps.guesses(place)[: p.compared]:
-                loops += self._compare(older, newer, guess, p.window(0.0), float(mass))
+                loops += self._compare(older, newer, guess, p.window(0.0), likely)
         self._close(loops)
         if loops:
             # The newest place map is where it belongs now: loops that the search near the tracked pose missed
             # are near.
-            self._close([edge for number in self._place_maps.latest() for edge in self._overlaps(number)])
-
-    def _prior(self, found: Sequence[Recognition]) -> list[float]:
-        """Return how likely tracking has drifted to each place; 1 where it is tracked.
-
-        The drift since the older place is a Gaussian. Its standard deviations are the window in which loops
-        are searched after so much travel: in killian, aces, csail, intel and the workshop tracking alone is
-        off by up to 1.7 % of the travel, 10.4 m and 10 degrees.
-        """
-        prior = []
-        for place in found:
-            older, newer = self._place_maps.middle(place.older), self._place_maps.middle(place.newer)
-            window_m, window_rad = self._parameters.window(self._way_m(place))
-            drift = place.T_older_newer.inverse() @ self._graph.relative(older, newer)
-            off = math.hypot(drift.x / window_m, drift.y / window_m, drift.yaw / window_rad)
-            prior.append(max(math.exp(-0.5 * off**2), sys.float_info.min))
-        return prior
+            self._close([edge for number in self._place_maps.asked[-1] for edge in self._overlaps(number)])
 
     def _way_m(self, place: Recognition) -> float:
-        """Return the travel between the two place maps; a lost part counts as `lost_m`."""
-        older, newer = self._place_maps.middle(place.older), self._place_maps.middle(place.newer)
-        return self._travelled_m[newer] - self._travelled_m[older]
+        """Return the travel from a recognised place to the newest one; a lost part counts as `lost_m`."""
+        older, newest = self._place_maps.middles(place)
+        return self._travelled_m[newest] - self._travelled_m[older]
+
+    def _prior(self, place: Recognition, way_m: float) -> float:
+        """Return how likely tracking has drifted to a recognised place on the way from it; 1 where it is
+        tracked.
+
+        The drift is a Gaussian. Its standard deviations are the window in which loops are searched after so
+        much travel: in killian, aces, csail, intel and the workshop tracking alone is off by up to 1.7 % of
+        the travel, 10.4 m and 10 degrees.
+        """
+        window_m, window_rad = self._parameters.window(way_m)
+        drift = place.T_older_newer.inverse() @ self._relative(*self._place_maps.middles(place))
+        off = math.hypot(drift.x / window_m, drift.y / window_m, drift.yaw / window_rad)
+        return max(math.exp(-0.5 * off**2), sys.float_info.min)
 
     # --- at the end of the session ------------------------------------------------------------------------
 
     def _optimised_keyframes(self) -> OptimisedKeyframes:
-        """Solve the pose graph; returns its poses, loops and parts."""
-        solution = self._optimise()
-        scans, anchors = self._keyframes.scans, self._local_maps.anchors
+        """Solve the pose graph, measure its overlaps again, and solve it again; returns its poses, loops and
+        parts.
+
+        The overlaps were measured on local maps that are bent by the drift of tracking. So these are drawn
+        again with the optimised poses, and compared again.
+        """
+        self._solve()
+        self._local_maps.redraw(self._optimised())
+        self._edges = [self._again(edge) if edge.loop else edge for edge in self._edges]
+        solution = self._solve()
+        scans, anchors, runs = self._keyframes.scans, self._local_maps.anchors, self._local_maps.runs
         loops = tuple(
             Loop(
                 older=scans[anchors[edge.first]],
@@ -277,36 +297,28 @@ class LoopCloser:
                 information=edge.information,
                 accepted=bool(accepted),
             )
-            for edge, accepted in zip(self._graph.edges, solution.accepted, strict=True)
+            for edge, accepted in zip(self._edges, solution.accepted, strict=True)
             if edge.loop
         )
-        part = self._parts(solution)
-        lengths = [len(run) for run in self._local_maps.runs]
+        begins = [number > 0 and run.start in self._keyframes.restarts for number, run in enumerate(runs)]
+        segment = np.cumsum(begins, dtype=np.int64)
+        edges = list(compress(self._edges, solution.accepted))
+        part = connected(segment, [edge for edge in edges if edge.loop])
+        lengths = [len(run) for run in runs]
         return OptimisedKeyframes(
             scans=np.array(scans, dtype=np.int64),
             poses=self._optimised(),
             loops=loops,
-            segments=np.repeat(self._segments(), lengths),
+            segments=np.repeat(segment, lengths),
             parts=np.repeat(part, lengths),
             anchors=np.array(anchors, dtype=np.int64),
-            sigma_m=self._graph.sigmas(solution, part),
+            sigma_m=self._sigmas(edges, part),
         )
-
-    def _optimise(self) -> Solution:
-        """Solve the pose graph, measure its overlaps again, and solve it again.
-
-        The overlaps were measured on local maps that are bent by the drift of tracking. So these are drawn
-        again with the optimised poses, and compared again.
-        """
-        self._graph.solve()
-        self._local_maps.redraw(self._optimised())
-        self._graph.edges = [self._again(edge) if edge.loop else edge for edge in self._graph.edges]
-        return self._graph.solve()
 
     def _again(self, edge: Edge) -> Edge:
         """Measure an overlap again on the present local maps; return the old one if they no longer
         overlap."""
-        guess = self._graph.relative(edge.first, edge.second)
+        guess = self._relative(edge.first, edge.second)
         return next(iter(self._compare(edge.first, edge.second, guess, self._parameters.window(0.0))), edge)
 
     def _optimised(self) -> F64:
@@ -319,7 +331,7 @@ class LoopCloser:
         known: dict[int, SE2] = {}
         for number, run in enumerate(self._local_maps.runs):
             anchor = self._local_maps.anchors[number]
-            correction = pose_at(self._graph.nodes, number) @ pose_at(tracked, anchor).inverse()
+            correction = pose_at(self._nodes, number) @ pose_at(tracked, anchor).inverse()
             restarts = self._keyframes.restarts
             ends = [k for k, at in ((run[0], run.start), (run[-1], run.stop)) if at in restarts]
             for k in sorted({anchor, *ends}):
@@ -328,18 +340,20 @@ class LoopCloser:
             tracked, list(known), np.array([(p.x, p.y, p.yaw) for p in known.values()])
         )
 
-    # --- segments and parts -------------------------------------------------------------------------------
-
-    def _segments(self) -> I64:
-        """Return the number (N,) of the segment of each local map; a new one begins at each restart."""
-        restarts = self._keyframes.restarts
-        begins = [number > 0 and run.start in restarts for number, run in enumerate(self._local_maps.runs)]
-        return np.cumsum(begins, dtype=np.int64)
-
-    def _parts(self, solution: Solution) -> I64:
-        """Return the number (N,) of the part of each local map."""
-        loops = [edge for edge in compress(self._graph.edges, solution.accepted) if edge.loop]
-        return connected(self._segments(), loops)
+    def _sigmas(self, edges: Sequence[Edge], part: I64) -> F64:
+        """Return the standard deviation (N,) in metres of the position of each local map within its part
+        (N,). edges : those that are accepted."""
+        sigma_m = np.zeros(len(part))
+        number = np.empty(len(part), np.int64)  # of each local map within its part
+        for own in (np.flatnonzero(part == k) for k in range(int(part.max(initial=-1)) + 1)):
+            number[own] = np.arange(len(own))
+            within = [
+                replace(edge, first=int(number[edge.first]), second=int(number[edge.second]))
+                for edge in edges
+                if part[edge.first] == part[edge.second] == part[own[0]]
+            ]
+            sigma_m[own] = position_sigmas(self._nodes[own], within, [self._walls[k] for k in own])
+        return sigma_m
 
 
 _JOINING = 2
@@ -370,61 +384,6 @@ def connected(segment: I64, loops: Sequence[Edge]) -> I64:
     return np.asarray(np.argsort(np.argsort(first))[part], dtype=np.int64)
 
 
-class SessionGraph:
-    """The pose graph over the anchors of local maps, which grows with the session.
-
-    nodes : (N, 3) x, y, yaw of each anchor in the session, by the last optimisation. edges : tracked steps
-    and loops, in the order in which they were found.
-    """
-
-    def __init__(self, parameters: LoopParameters) -> None:
-        self._parameters = parameters
-        self.nodes: F64 = np.empty((0, 3))
-        self.edges: list[Edge] = []
-        self._walls: list[WallDirection] = []  # of each local map
-
-    def __len__(self) -> int:
-        return len(self.nodes)
-
-    def add(self, pose: SE2, walls: WallDirection) -> None:
-        """Add a local map at a pose."""
-        self.nodes = np.vstack((self.nodes, (pose.x, pose.y, pose.yaw)))
-        self._walls.append(walls)
-
-    def extend(self, step: SE2, walls: WallDirection, *, restart: bool) -> None:
-        """Add the next local map, a tracked step from the last one. restart : tracking was lost before it."""
-        newest = len(self)
-        information = self._parameters.tracked_information(math.hypot(step.x, step.y), restart)
-        self.edges.append(Edge(newest - 1, newest, step, information))
-        self.add(pose_at(self.nodes, newest - 1) @ step, walls)
-
-    def relative(self, first: int, second: int) -> SE2:
-        """Return T_first_second by the present poses."""
-        return pose_at(self.nodes, first).inverse() @ pose_at(self.nodes, second)
-
-    def solve(self) -> Solution:
-        """Solve for the poses that agree best with all edges."""
-        solution = optimise(self.nodes, self.edges, self._walls)
-        self.nodes = solution.poses
-        return solution
-
-    def sigmas(self, solution: Solution, part: I64) -> F64:
-        """Return the standard deviation (N,) in metres of the position of each local map within its part
-        (N,)."""
-        sigma_m = np.zeros(len(part))
-        number = np.empty(len(part), np.int64)  # of each local map within its part
-        for own in (np.flatnonzero(part == k) for k in range(int(part.max(initial=-1)) + 1)):
-            number[own] = np.arange(len(own))
-            within = [
-                replace(edge, first=int(number[edge.first]), second=int(number[edge.second]))
-                for edge in compress(self.edges, solution.accepted)
-                if part[edge.first] == part[edge.second] == part[own[0]]
-            ]
-            walls = [self._walls[local_map] for local_map in own]
-            sigma_m[own] = position_sigmas(solution.poses[own], within, walls)
-        return sigma_m
-
-
 # --- place recognition --------------------------------------------------------------------------------
 
 
@@ -433,6 +392,7 @@ class PlaceMaps:
 
     maps : consecutive local maps in a place map.
     recognizer : None: there are no place maps. projection : how their grids are drawn.
+    asked : the local maps of each that was passed on.
     """
 
     def __init__(
@@ -444,7 +404,7 @@ class PlaceMaps:
     ) -> None:
         self._local_maps, self._maps = local_maps, maps
         self._recognizer, self._projection = recognizer, projection
-        self._asked: list[range] = []  # the local maps of each
+        self.asked: list[range] = []
         self._known_places: list[bool] = []  # whether each local map overlaps one of an earlier visit
         self._begin = 0  # first local map of the place that is not complete yet
 
@@ -471,22 +431,18 @@ class PlaceMaps:
         stop = len(self._known_places)
         return self._ask(range(max(stop - self._maps, 0), stop)) if self._begin < stop else ()
 
-    def latest(self) -> range:
-        """Return the local maps of the last place map that was passed on."""
-        return self._asked[-1]
-
-    def middle(self, index: int) -> int:
-        """Return the local map in whose frame a place map is drawn."""
-        return _middle(self._asked[index])
+    def middles(self, found: Recognition) -> tuple[int, int]:
+        """Return the local maps in whose frames a recognised place map and the newest one are drawn."""
+        return _middle(self.asked[found.older]), _middle(self.asked[-1])
 
     def guesses(self, found: Recognition) -> list[tuple[int, int, SE2]]:
-        """Return the pairs of local maps of two place maps, the nearest first.
+        """Return the pairs of local maps of a recognised place map and the newest one, the nearest first.
 
         Each is the older, the newer, and T_older_newer by the recognition.
         """
         pairs = []
-        for older, T_place_older in self._within(self._asked[found.older]):
-            for newer, T_place_newer in self._within(self._asked[found.newer]):
+        for older, T_place_older in self._within(self.asked[found.older]):
+            for newer, T_place_newer in self._within(self.asked[-1]):
                 # The last place map overlaps the one before. Neighbours are matched by tracking already.
                 if newer - older < 2:
                     continue
@@ -501,24 +457,21 @@ class PlaceMaps:
         return list(zip(place, poses, strict=True))
 
     def _ask(self, place: range) -> Sequence[Recognition]:
-        """Pass a place map to the recognizer, unless all of its local maps are known."""
+        """Draw the place map of consecutive local maps, in the frame of the anchor of the middle one, and
+        pass it to the recognizer, unless all of them are known."""
         if self._recognizer is None or all(self._known_places[k] for k in place):
             return ()
-        self._asked.append(place)
-        return self._recognizer.recognize(self._draw(len(self._asked) - 1, place))
-
-    def _draw(self, index: int, numbers: range) -> PlaceMap:
-        """Draw the place map of consecutive local maps, in the frame of the anchor of the middle one."""
+        self.asked.append(place)
         runs = self._local_maps.runs
         keyframes, poses = self._local_maps.keyframes(
-            range(runs[numbers[0]].start, runs[numbers[-1]].stop), self._local_maps.anchors[_middle(numbers)]
+            range(runs[place[0]].start, runs[place[-1]].stop), self._local_maps.anchors[_middle(place)]
         )
-        return PlaceMap(
-            index=index,
+        place_map = PlaceMap(
             grid=grid_of(zip(keyframes, poses, strict=True), self._projection),
             poses=np.array([(pose.x, pose.y, pose.yaw) for pose in poses]),
             scans=np.array([keyframe.index for keyframe in keyframes]),
         )
+        return self._recognizer.recognize(place_map)
 
 
 def _middle(numbers: range) -> int:

@@ -50,14 +50,13 @@ RECOGNITION = RecognitionParameters()
 class PlaceMap:
     """The map of a few metres of travel, long enough to be recognised.
 
-    index : number of this place map in its session, from 0, in the order of travel. The last one may be
-        shorter, and overlap the one before.
+    The last one of a session may be shorter, and overlap the one before.
+
     grid : its occupancy grid, in its own frame: the base at one of its keyframes, in the middle.
     poses : (K, 3) x, y, yaw of its keyframes in the same frame, metres and radians.
     scans : (K,) number of each keyframe's scan within the session.
     """
 
-    index: int
     grid: OccupancyGrid
     poses: F64
     scans: I64
@@ -65,18 +64,17 @@ class PlaceMap:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recognition:
-    """Two place maps of the same place, and their relative pose.
+    """An earlier place map that shows the place of the newest one, and their relative pose.
 
-    older, newer : their indices.
-    T_older_newer : the frame of the newer place map in that of the older one. Exact to some decimetres; loop
+    older : its number in the order of travel, from 0.
+    T_older_newer : the frame of the newest place map in that of the older one. Exact to some decimetres; loop
         closure refines it on the local maps.
     evidence : that both show the same place, by their appearance.
 
-    At most one recognition of a newer place map is right, or those at one place that several older ones show.
+    At most one recognition of a place map is right, or those at one place that several older ones show.
     """
 
     older: int
-    newer: int
     T_older_newer: SE2
     evidence: Evidence
 
@@ -114,12 +112,7 @@ class SessionRecognizer:
         maps = LazySequence(self._map, len(self._stored), most=0)
         found = next(look_up(query, [places.areas(rows)], places, maps, self._config))
         return [
-            Recognition(
-                older=h.session_index,
-                newer=len(self._stored),
-                T_older_newer=h.T_map_query,
-                evidence=evidence,
-            )
+            Recognition(older=h.session_index, T_older_newer=h.T_map_query, evidence=evidence)
             for h, evidence in zip(found, evidence_of(found, query.likeness), strict=True)
             if masses([evidence])[0] >= LEFT
         ]
@@ -146,13 +139,3 @@ class SessionRecognizer:
     def _grid(self, index: int) -> OccupancyGrid:
         grid: OccupancyGrid = pickle.loads(zlib.decompress(self._stored[index]))
         return grid
-
-
-def recognizer_for(config: Config) -> SessionRecognizer | None:
-    """Return a recognizer for one session, or None if the configuration turns it off.
-
-    >>> import signature
-    >>> recognizer_for(signature.Config()) is None
-    False
-    """
-    return SessionRecognizer(config) if config.loops.recognize else None

@@ -200,7 +200,7 @@ class KnowsTheTruth:
             true = frame.inverse() @ self.frames[-1]
             if math.hypot(true.x, true.y) < 8.0:
                 found += [
-                    Recognition(older=older, newer=newest.index, T_older_newer=true @ off, evidence=evidence)
+                    Recognition(older=older, T_older_newer=true @ off, evidence=evidence)
                     for off, evidence in self._off
                 ]
         return found
