@@ -8,6 +8,8 @@ from contextlib import ExitStack, closing
 from itertools import chain
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from pc2grid.errors import NoScans
 from pc2grid.estimation.spatial import begin
 from pc2grid.estimation.tracker import Tracker
@@ -17,15 +19,12 @@ from pc2grid.model import (
     SENSOR_MODELS,
     Loop,
     OccupancyGrid,
-    ReadReport,
     Scan,
-    SensorKind,
     SessionMap,
     Trajectory,
     part_name,
 )
 from pc2grid.observer import Observer, TimeSpan
-from pc2grid.settings import PartitionConfig
 from pc2grid.submaps.submaps import divide
 from signature.config import Config
 from signature.session.keyframes import Keyframe, KeyframePoints, Keyframes, Track, TrackRecord
@@ -112,22 +111,13 @@ def build_maps(
     reports = part_reports(
         with_track_warnings(log.report(), track), session, parts, kept, track.walls_changed_ns
     )
-    maps = tuple(
-        _divided(part, report, session=part_name(session, k), sensor=sensor, config=config.partition)
-        for k, (part, report) in enumerate(zip(kept, reports, strict=True))
-    )
+    maps = []
+    for k, (part, report) in enumerate(zip(kept, reports, strict=True)):
+        graph, submaps = divide(part.grid, config.partition)
+        named = dataclasses.replace(part, session=part_name(session, k), sensor=sensor, report=report)
+        maps.append(dataclasses.replace(named, submaps=submaps, graph=graph))
     observer.on_progress(1.0)
-    return maps
-
-
-def _divided(
-    part: SessionMap, report: ReadReport, *, session: str, sensor: SensorKind, config: PartitionConfig
-) -> SessionMap:
-    """Return the map of a part under its name, divided into submaps."""
-    graph, submaps = divide(part.grid, config)
-    return dataclasses.replace(
-        part, session=session, sensor=sensor, submaps=submaps, graph=graph, report=report
-    )
+    return tuple(maps)
 
 
 def longest_of(maps: Sequence[SessionMap]) -> SessionMap:
@@ -205,7 +195,8 @@ def _map(
         track = record.track(beginning.left_out, beginning.warning)
         closed = closer.finish()
         if whole:
-            closed = closed.undivided()
+            together = np.zeros(len(closed.scans), np.int64)
+            closed = dataclasses.replace(closed, segments=together, parts=together)
         parts = draw_parts(keyframes, track, closed, projection, points)
     return parts, track
 

@@ -68,9 +68,6 @@ class Keyframes:
     def __len__(self) -> int:
         return len(self.scans)
 
-    def __iter__(self) -> Iterator[Keyframe]:
-        return (self[k] for k in range(len(self)))
-
     def __getitem__(self, number: int) -> Keyframe:
         planar_scan = pickle.loads(self._planar_scans[number])
         return Keyframe(self.scans[number], planar_scan, self.pose(number), number in self.restarts)
@@ -134,14 +131,12 @@ class KeyframePoints:
         self._clouds.append(step_m.tobytes() + np.rint(points_m / step_m).astype("<i2").tobytes())
         self._scans.append(index)
 
-    def __getitem__(self, number: int) -> tuple[int, F32]:
-        """Return the number of a scan in the session, and its points (N, 3) in the base frame."""
-        record = self._clouds[number]
-        steps = np.frombuffer(record, "<i2", offset=np.float32().itemsize).reshape(-1, 3)
-        return self._scans[number], steps * np.frombuffer(record, np.float32, count=1)
-
     def __iter__(self) -> Iterator[tuple[int, F32]]:
-        return (self[number] for number in range(len(self._scans)))
+        """Yield the number of each scan in the session, and its points (N, 3) in the base frame."""
+        for number, index in enumerate(self._scans):
+            record = self._clouds[number]
+            steps = np.frombuffer(record, "<i2", offset=np.float32().itemsize).reshape(-1, 3)
+            yield index, steps * np.frombuffer(record, np.float32, count=1)
 
     def registered(self, T_session_base: F64, chosen: BoolGrid | None = None) -> PointMap | None:
         """Return the points at the poses (N, 4, 4) of their scans, one a voxel; None if there are none.
@@ -185,13 +180,6 @@ class Track:
     def with_odometry(self) -> bool:
         """Return True if any scan has an odometry pose."""
         return bool(np.isfinite(self.readings).any())
-
-    @property
-    def heights_m(self) -> F64:
-        """Return the heights (N,) of odometry, as a base on wheels is tracked in the plane; without odometry
-        as tracked."""
-        poses = self.readings if self.with_odometry else self.trajectory.T_session_base
-        return poses[:, 2, 3]
 
 
 class TrackRecord:

@@ -15,7 +15,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,11 +67,6 @@ class OptimisedKeyframes:
         none = np.empty(0, np.int64)
         return cls(none, np.empty((0, 3)), (), segments=none, parts=none, anchors=none, sigma_m=np.empty(0))
 
-    def undivided(self) -> OptimisedKeyframes:
-        """Return the same keyframes as one part of one segment."""
-        together = np.zeros(len(self.scans), np.int64)
-        return replace(self, segments=together, parts=together)
-
 
 def interpolate_corrections(tracked: F64, known: Sequence[int] | I64, corrected: F64) -> F64:
     """Return poses (N, 3) of all scans, from the corrected poses (K, 3) of those of them that are `known`.
@@ -117,7 +112,11 @@ def draw_parts(
     drawn = []
     for number in range(int(part.max(initial=0)) + 1):
         scans = np.flatnonzero(part == number)
-        trajectory = _of_scans(everywhere, scans)
+        trajectory = Trajectory(
+            stamps_ns=everywhere.stamps_ns[scans],
+            T_session_base=T_part_base[scans],
+            health=tuple(everywhere.health[k] for k in scans.tolist()),
+        )
         own = np.flatnonzero(closed.parts == number).tolist()
         poses = [SE2.from_matrix(T_part_base[closed.scans[k]]) for k in own]
         grid = grid_of(zip((keyframes[k] for k in own), poses, strict=True), projection)
@@ -285,15 +284,6 @@ def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
     )
 
 
-def _of_scans(trajectory: Trajectory, scans: I64) -> Trajectory:
-    """Select some scans of a trajectory, by their numbers (M,)."""
-    return Trajectory(
-        stamps_ns=trajectory.stamps_ns[scans],
-        T_session_base=trajectory.T_session_base[scans],
-        health=tuple(trajectory.health[k] for k in scans.tolist()),
-    )
-
-
 # --- reports and warnings -----------------------------------------------------------------------------
 
 _MANY = 0.2
@@ -421,7 +411,9 @@ def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
         warnings.append(track.warning)
     if track.left_out:
         skipped["before one that shows the floor"] = track.left_out
-    warnings += height_warnings(track.heights_m, track.trajectory)
+    # A base on wheels is tracked in the plane: odometry knows its height.
+    poses = track.readings if track.with_odometry else track.trajectory.T_session_base
+    warnings += height_warnings(poses[:, 2, 3], track.trajectory)
     warnings += odometry_warnings(track.trajectory, track.readings)
     return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))
 
