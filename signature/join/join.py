@@ -131,7 +131,7 @@ class JoinableMap:
     @property
     def grid(self) -> OccupancyGrid:
         """Return the map."""
-        return self.index.grids[0]
+        return self.index.grid_of(0)
 
     @cached_property
     def walls(self) -> Walls:
@@ -156,7 +156,7 @@ class JoinableMap:
     @property
     def search_map(self) -> SearchMap:
         """Return the map, prepared to be searched."""
-        return self.index.maps[0]
+        return self.index.map_of(0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -410,7 +410,7 @@ class Piece:
 
 def pieces_of(index: MapIndex) -> tuple[Piece, ...]:
     """Cut the map of one session into squares, and keep those with enough walls."""
-    grid = index.grids[0]
+    grid = index.grid_of(0)
     side = round(JOIN.side_m / grid.resolution_m)
     height, width = grid.cells.shape
     squares = (

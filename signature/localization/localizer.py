@@ -270,7 +270,7 @@ def _told(index: MapIndex, answer: Answer, history: Iterable[Answer], clock: Clo
     best = answer.best
     return replace(
         answer,
-        map=None if best is None else index.grids[best.session_index],
+        map=None if best is None else index.grid_of(best.session_index),
         history=(*history, answer.moment),
         timing_ms=dict(clock.total_ms),
     )

@@ -137,7 +137,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     session = near.prior.session
     number = index.sessions.index(session)
     T_map_query = T_map_base @ seen.T_odom_base.inverse()
-    walls = index.maps_for(seen)[number].walls
+    walls = index.maps_for(seen)(number).walls
     believed = replace(score_fit(walls, seen.walls, T_map_query, np.zeros((3, 3))), session_index=number)
     # All mass was near the pose before what was seen lately. So of two equal rooms it is in the nearer one.
     _, answer = localizer.search(

@@ -196,11 +196,11 @@ def by_place(index: MapIndex, query: QueryMap, hypotheses: Iterable[Fit]) -> lis
 
 def _one_place(index: MapIndex, query: QueryMap, a: Fit, b: Fit) -> bool:
     """Return whether two hypotheses in the maps of two sessions are one pose of the building of both."""
-    frames = index.joined(a.session_index, b.session_index)
-    if frames is None:
+    frame, other = (index.frames.get(index.sessions[h.session_index]) for h in (a, b))
+    if frame is None or other is None or frame.name != other.name:
         return False
-    here, there = (at.placed(h.T_map_query @ query.T_odom_base) for at, h in zip(frames, (a, b), strict=True))
-    return one_place(here, there)
+    here, there = (h.T_map_query @ query.T_odom_base for h in (a, b))
+    return one_place(frame.placed(here), other.placed(there))
 
 
 # --- Slips, and what is beside the map ---
@@ -213,7 +213,7 @@ def slip_of(index: MapIndex, query: QueryMap, answer: Answer) -> tuple[float, in
     if answer.best is None:
         return 0.0, 0
     T_map_query = answer.best.T_map_query
-    walls = index.maps_for(query)[answer.best.session_index].walls
+    walls = index.maps_for(query)(answer.best.session_index).walls
     above = query.walls.facing(walls).only_explain
     likelihood = points = 0.0
     levels, steps, weak = [], [], []
@@ -368,7 +368,7 @@ class Belief:
             known = [_carried(place, query, odds) for place in past.places]
         for place in known:
             h = place.fits[0]
-            walls = index.maps_for(query)[h.session_index].walls
+            walls = index.maps_for(query)(h.session_index).walls
             fit = score_fit(walls, query.walls, h.T_map_query, h.covariance)
             if place.mass >= 1.0 - POSTERIOR.certain and fit.overlap < POSTERIOR.shown:
                 here = replace(fit, session_index=h.session_index, submap_id=h.submap_id)

@@ -78,7 +78,7 @@ def look_up(
     query: QueryMap,
     batches: Iterable[Iterable[Area]],
     places: Places,
-    maps: Sequence[SearchMap],
+    map_of: Callable[[int], SearchMap],
     config: RelocalizeConfig,
     known: Iterable[Fit] = (),
     allows: Callable[[Fit], bool] = lambda h: True,
@@ -89,7 +89,7 @@ def look_up(
     ones, refined, and what fits there with any heading.
 
     batches : likeliest first; what is clearly less than the best so far is not looked for in the next.
-    maps : prepared map of each session, by session_index.
+    map_of : prepared map of a session, by its session_index.
     allows : those that it excludes are kept beside the others, and do not compete with them.
     """
 
@@ -97,14 +97,14 @@ def look_up(
         found: list[Fit] = []
         for inside in (True, False):
             of_new, of_before = ([h for h in some if allows(h) is inside] for some in (new, before))
-            found += _worth_keeping(query, of_new, maps, config.hypotheses, of_before)
+            found += _worth_keeping(query, of_new, map_of, config.hypotheses, of_before)
         return tuple(sorted(found, key=lambda h: -h.score))
 
     refined = [
-        fitted(query, h.session_index, h.submap_id, maps[h.session_index], h.T_map_query) for h in known
+        fitted(query, h.session_index, h.submap_id, map_of(h.session_index), h.T_map_query) for h in known
     ]
     found = kept(refined)
-    for fits in _align(query, batches, places, maps, config):
+    for fits in _align(query, batches, places, map_of, config):
         found = kept(fits, found)
         yield found
 
@@ -113,7 +113,7 @@ def _align(
     query: QueryMap,
     batches: Iterable[Iterable[Area]],
     places: Places,
-    maps: Sequence[SearchMap],
+    map_of: Callable[[int], SearchMap],
     config: RelocalizeConfig,
 ) -> Iterator[tuple[Fit, ...]]:
     """Align the query with any heading wherever the robot may stand; yields what fits in each batch of
@@ -124,7 +124,7 @@ def _align(
     for areas in batches:
         coarse: list[tuple[float, int, int, SE2]] = []
         for session, squares_m in areas:
-            target = maps[session]
+            target = map_of(session)
             poses = search_windows(
                 target,
                 coarse_points(query.walls.facing(target.walls).points_m, query.center_m),
@@ -143,7 +143,7 @@ def _align(
             scores = sorted((*scores, *poses[:, 3].tolist()), reverse=True)[:most]
             enough = max(config.coarse_keep * scores[0], scores[-1])
         yield tuple(
-            fitted(query, session, number, maps[session], T_map_query)
+            fitted(query, session, number, map_of(session), T_map_query)
             for score, session, number, T_map_query in coarse
             if score >= enough
         )
@@ -168,7 +168,11 @@ def best_around(query: QueryMap, h: Fit, target: SearchMap) -> Fit:
 
 
 def _worth_keeping(
-    query: QueryMap, new: Iterable[Fit], maps: Sequence[SearchMap], most: int, kept: Sequence[Fit] = ()
+    query: QueryMap,
+    new: Iterable[Fit],
+    map_of: Callable[[int], SearchMap],
+    most: int,
+    kept: Sequence[Fit] = (),
 ) -> tuple[Fit, ...]:
     """Return the new and the earlier hypotheses that score enough beside the best one to be reported
     (`EvidenceParameters.longest_lead`), best first, each the best around itself; at most so many."""
@@ -176,7 +180,7 @@ def _worth_keeping(
     best = max((h.score for h in found), default=0.0)
     for h in sorted(new, key=lambda h: -h.score):
         if h.score >= share * best:
-            found.append(best_around(query, h, maps[h.session_index]))
+            found.append(best_around(query, h, map_of(h.session_index)))
             best = max(best, found[-1].score)
     enough = (h for h in distinct(query, found) if h.score >= share * best)
     return tuple(islice(enough, most))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from itertools import chain
@@ -25,15 +25,7 @@ from signature.config import Config
 from signature.database.protocol import BuildingFrame, Label
 from signature.paper import PlaceTable
 from signature.places.hypotheses import look_up
-from signature.places.places import (
-    AT_ONCE_M2,
-    FIRST_PLACES,
-    SQUARE_M,
-    Area,
-    DatabaseGrids,
-    LazySequence,
-    Places,
-)
+from signature.places.places import AT_ONCE_M2, FIRST_PLACES, SQUARE_M, Area, Places
 from signature.places.prior import Prior
 from signature.places.query import QueryMap
 from signature.visible import SeenPlaces
@@ -50,6 +42,8 @@ class MapIndex:
     prior : what is known of the pose beforehand, see `within`. whole : the index without it.
     look : number of the look of a robot that is searched for, see `at_look`.
     surface_of : the points of the maps, which answers are refined and checked with; None if they have none.
+    grid_of, map_of : the map of a session, by its index, and the same prepared to be searched; `True` : for a
+        query in a lower plane, to which its free space is unknown.
     """
 
     prior: Prior | None = None
@@ -59,7 +53,8 @@ class MapIndex:
 
     def __init__(
         self,
-        grids: Mapping[str, OccupancyGrid],
+        sessions: Iterable[str],
+        grid: Callable[[str], OccupancyGrid],
         table: PlaceTable,
         made_with: Config,
         config: Config,
@@ -71,7 +66,7 @@ class MapIndex:
     ) -> None:
         """Prepare the places of some maps.
 
-        grids : map of each session, in the order of `table.session_index`.
+        sessions : in the order of `table.session_index`. grid : the map of a session.
 
         made_with : how the places were cut and described; queries are described in the same way.
         config : its relocalize section says how to search and when to be sure.
@@ -85,33 +80,28 @@ class MapIndex:
         self.frames = dict(frames or {})
         self.made_with = made_with
         self.config = config.relocalize
-        self.sessions = tuple(grids)
-        self.labels = tuple((labels or {}).get(name, Label()) for name in grids)
-        count = len(grids)
-        areas_m2 = areas_m2 or {name: grid.free_m2 for name, grid in grids.items()}
-        self._areas_m2 = tuple(areas_m2[name] for name in self.sessions)
+        self.sessions = names = tuple(sessions)
+        self.labels = tuple((labels or {}).get(name, Label()) for name in names)
+        areas = [areas_m2[name] if areas_m2 else grid(name).free_m2 for name in names]
         # Of a large database, about as many grids are kept as are searched at once, and as many prepared
         # maps, which take ten times as much memory, as one look uses.
-        area_m2 = sum(self._areas_m2)
         most = most_prepared = None
-        if area_m2 > AT_ONCE_M2:
-            most = math.ceil(count * AT_ONCE_M2 / area_m2)
+        if sum(areas) > AT_ONCE_M2:
+            most = math.ceil(len(names) * AT_ONCE_M2 / sum(areas))
             most_prepared = FIRST_PLACES + self.config.hypotheses
-        self.grids: LazySequence[OccupancyGrid] = LazySequence(lambda i: grids[self.sessions[i]], count, most)
-        self.maps: LazySequence[SearchMap] = LazySequence(
-            lambda i: SearchMap.of(self.grids[i], drawn=self.sessions[i] in drawn), count, most_prepared
-        )
-        self._from_above: LazySequence[SearchMap] = LazySequence(
-            lambda i: SearchMap.of(self.grids[i], from_below=True, drawn=self.sessions[i] in drawn),
-            count,
-            most_prepared,
-        )
+
+        @lru_cache(most)
+        def grid_of(number: int) -> OccupancyGrid:
+            return grid(names[number])
+
+        @lru_cache(most_prepared)
+        def map_of(number: int, from_below: bool = False) -> SearchMap:
+            return SearchMap.of(grid_of(number), from_below=from_below, drawn=names[number] in drawn)
+
+        self.grid_of: Callable[[int], OccupancyGrid] = grid_of
+        self.map_of: Callable[..., SearchMap] = map_of
         self.places = Places(
-            table,
-            self.grids,
-            made_with.partition.radius_m,
-            self._areas_m2,
-            stored=lambda i: stored(self.sessions[i]),
+            table, grid_of, made_with.partition.radius_m, areas, lambda number: stored(names[number])
         )
 
     @staticmethod
@@ -127,10 +117,6 @@ class MapIndex:
         """
         infos = {info.name: info for info in database.sessions()}
         areas_m2 = {name: info.area_m2 for name, info in infos.items()}
-        grids: Mapping[str, OccupancyGrid] = DatabaseGrids(database, tuple(infos))
-        is_large = sum(areas_m2.values()) > AT_ONCE_M2
-        if not is_large:
-            grids = dict(grids)
         labels = {name: info.provenance.label for name, info in infos.items()}
         lacking: list[str] = []
 
@@ -146,7 +132,12 @@ class MapIndex:
         with contextlib.suppress(DatabaseCorrupt):  # without them a search takes longer, and finds the same
             frames = database.frames()
         drawn = {name for name, info in infos.items() if info.sensor == "map"}
-        index = MapIndex(grids, places, made_with, config, labels, areas_m2, stored, frames, drawn)
+        index = MapIndex(
+            infos, database.grid, places, made_with, config, labels, areas_m2, stored, frames, drawn
+        )
+        if sum(areas_m2.values()) <= AT_ONCE_M2:
+            for number in range(len(infos)):
+                index.grid_of(number)
         if any(info.points for info in infos.values()):
 
             def surface_of(name: str) -> MapSurface | None:
@@ -156,7 +147,7 @@ class MapIndex:
             # As many as an answer may compare.
             index.surface_of = lru_cache(index.config.hypotheses)(surface_of)
         with observer.step("prepare places"):
-            index.places.index(observer.on_progress)
+            index.places.index(on_progress=observer.on_progress)
         if lacking:
             observer.on_warning(
                 f"{database.location}: lacks what is seen from the places of {len(lacking)} of its"
@@ -169,7 +160,7 @@ class MapIndex:
         """Return the index of one session of a database by itself, without points."""
         table, config = database.signatures(session).places, database.config()
         table = replace(table, session_index=np.zeros(len(table), np.int32))
-        return MapIndex({session: database.grid(session)}, table, config, config, stored=database.seen_places)
+        return MapIndex([session], database.grid, table, config, config, stored=database.seen_places)
 
     def surface(self, session_index: int) -> MapSurface | None:
         """Return the points of a session in space; None if it has none."""
@@ -236,32 +227,25 @@ class MapIndex:
     def _look_up(
         self, query: QueryMap, areas: Iterable[Iterable[Area]], known: tuple[Fit, ...]
     ) -> Iterator[tuple[Fit, ...]]:
-        maps = self.maps_for(query)
-        return look_up(query, areas, self.places, maps, self.config, known, lambda h: self.allows(query, h))
+        map_of = self.maps_for(query)
+        return look_up(query, areas, self.places, map_of, self.config, known, lambda h: self.allows(query, h))
 
     def _allowed(self, query: QueryMap) -> Iterator[Area]:
         """Yield the region of the prior, if there is one that applies."""
         prior = self.prior_for(query)
         if prior is not None and prior.session is not None:
             number = self.sessions.index(prior.session)
-            yield Area(number, prior.squares(query, self.places.ground[number][0], SQUARE_M))
+            yield Area(number, prior.squares(query, self.places.ground(number)[0], SQUARE_M))
 
-    def maps_for(self, query: QueryMap) -> Sequence[SearchMap]:
-        """Return the maps as they are searched for a query: to one in a lower plane, their free space is
-        unknown."""
+    def maps_for(self, query: QueryMap) -> Callable[[int], SearchMap]:
+        """Return what prepares the map of a session, by its index, as it is searched for a query."""
 
-        def facing(i: int) -> SearchMap:
-            below = query.walls.facing(self.maps[i].walls).only_explain
-            return (self._from_above if below else self.maps)[i]
+        def facing(number: int) -> SearchMap:
+            prepared = self.map_of(number)
+            below = query.walls.facing(prepared.walls).only_explain
+            return self.map_of(number, True) if below else prepared
 
-        return LazySequence(facing, len(self.maps), 0)
-
-    def joined(self, a: int, b: int) -> tuple[BuildingFrame, BuildingFrame] | None:
-        """Return where two sessions lie in the building in which they are joined; None if they are not."""
-        frame, other = (self.frames.get(self.sessions[number]) for number in (a, b))
-        if frame is None or other is None or frame.name != other.name:
-            return None
-        return frame, other
+        return facing
 
 
 def _batches(count: int) -> list[I64]:

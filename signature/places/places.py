@@ -7,11 +7,12 @@ maps are read and prepared when they are first needed.
 from __future__ import annotations
 
 import functools
+import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, NamedTuple, TypeVar, overload
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,11 +28,6 @@ from signature.weights import seen_spread, seen_weights
 if TYPE_CHECKING:
     from scipy.spatial import cKDTree
 
-    from signature.database import SubmapDatabase
-
-
-T = TypeVar("T")
-
 FIRST_PLACES = 100
 """So many places are searched before it is asked whether one is certain, then ten times as many each time. By
 hand, by the time: places that are searched later share tiles of the search with those before."""
@@ -41,7 +37,7 @@ the time of a look-up."""
 SQUARE_M = 0.8
 """Side of the squares of free ground that are searched. By hand."""
 _KEPT_SESSIONS = 1000
-"""Sessions whose viewpoints are kept: 0.5 MB each, of floors of 40 x 60 m."""
+"""Sessions whose free ground is kept: 0.1 MB each, of floors of 40 x 60 m."""
 _APART_M = 1e6
 """Puts the places of different sessions far apart in one KD-tree."""
 
@@ -80,35 +76,31 @@ class Places:
     """All places of a database, ready for retrieval.
 
     table : where they are. sight_m : length of the rays by which they are described.
+    ground : of a session, by its index, the squares (K, 2) that hold free ground, and the places next to them
+        (K,).
     """
 
     def __init__(
         self,
         table: PlaceTable,
-        grids: Sequence[OccupancyGrid],
+        grid_of: Callable[[int], OccupancyGrid],
         sight_m: float,
         areas_m2: Sequence[float],
-        fewer: Places | None = None,
         stored: Callable[[int], SeenPlaces | None] = lambda session: None,
     ) -> None:
         """Prepare the places of some sessions.
 
-        grids, areas_m2 : the map of each session and its free space in m^2, by session_index.
-
-        fewer : the places of the first of these sessions; viewpoints that it has computed are taken over.
+        grid_of, areas_m2 : the map of each session and its free space in m^2, by session_index.
         stored : what is seen from the places of a session, if it need not be computed from the map.
         """
         self.table = table
         self.sight_m = sight_m
-        self._grids, self._stored = grids, stored
-        self._index: PlaceIndex | None = None
+        self._grid_of, self._stored = grid_of, stored
         self._chance = np.random.default_rng(0)
-        self._described: dict[int, SeenPlaces] = {} if fewer is None else dict(fewer._described)
         self._areas_m2 = np.asarray(areas_m2, np.float64)
         self._session_of_block = np.unique(table.session_index)
-        self.ground: LazySequence[tuple[F64, I64]] = LazySequence(self._ground, len(grids), _KEPT_SESSIONS)
-        """By session, the squares (K, 2) that hold free ground, and the places next to them (K,)."""
-        self._controls: dict[ShortlistBy, PlaceIndex] = {}
+        self.ground = functools.lru_cache(_KEPT_SESSIONS)(self._ground)
+        self._indexes: dict[ShortlistBy, PlaceIndex] = {}
         self._ordered: tuple[Sequence[View], RelocalizeConfig, Order] | None = None
 
     def order(self, views: Sequence[View], base_m: tuple[float, float], config: RelocalizeConfig) -> Order:
@@ -126,22 +118,9 @@ class Places:
             return self._at_once(every, np.zeros(len(every)))
         if config.shortlist_by == "random":
             return self._at_once(self._chance.permutation(every), np.zeros(len(every)))
-        likelihood = self.next_to(self._searched(config.shortlist_by).poses(views, base_m))
+        likelihood = self.next_to(self.index(config.shortlist_by).poses(views, base_m))
         rows = np.argsort(-likelihood, kind="stable")
         return self._at_once(rows, likelihood[rows])
-
-    def _searched(self, by: ShortlistBy) -> PlaceIndex:
-        """Return the viewpoints with all signatures, or as a control wants them."""
-        if by == "signatures":
-            return self.index()
-        if by not in self._controls:
-            names = by.split("+")
-            self._controls[by] = (
-                self.index().shuffled(self._chance)
-                if by == "shuffled"
-                else PlaceIndex.of(self.blocks(), seen_weights(*names), seen_spread(*names))
-            )
-        return self._controls[by]
 
     def next_to(self, poses: Poses) -> F64:
         """Return the log-likelihood (N,) of the likeliest pose next to each place. Without a pose there, it
@@ -165,46 +144,43 @@ class Places:
         mass = (1.0 - ORDER.astray) * mass / mass.sum() + ORDER.astray / max(len(mass), 1)
         return Order(rows, mass)
 
-    def index(self, on_progress: Callable[[float], None] = lambda share: None) -> PlaceIndex:
-        """Return the viewpoints of all places with their signatures; made by the first call.
+    def index(
+        self, by: ShortlistBy = "signatures", on_progress: Callable[[float], None] = lambda share: None
+    ) -> PlaceIndex:
+        """Return the viewpoints of all places with all their signatures, or as a control wants them; made by
+        the first call.
 
         on_progress : is told the share of the places that is done.
         """
-        if self._index is None:
-            self._index = PlaceIndex.of(self.blocks(on_progress))
-        return self._index
+        if by not in self._indexes:
+            names = [] if by == "signatures" else by.split("+")
+            self._indexes[by] = (
+                self.index().shuffled(self._chance)
+                if by == "shuffled"
+                else PlaceIndex.of(self.blocks(on_progress), seen_weights(*names), seen_spread(*names))
+            )
+        return self._indexes[by]
 
     def blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[PlaceBlock]:
         """Yield the isovists of the places of each session: as stored, or else computed from the map."""
-        starts = np.flatnonzero(np.diff(self.table.session_index, prepend=-1))
-        for begin in starts.tolist():
-            seen = self._seen(int(self.table.session_index[begin]))
+        starts = np.flatnonzero(np.diff(self.table.session_index, prepend=-1)).tolist()
+        # Those of a session are side by side.
+        for begin, end in itertools.pairwise((*starts, len(self.table))):
+            session = int(self.table.session_index[begin])
+            seen = self._stored(session)
+            if seen is None or (len(seen) and seen.place[-1] >= end - begin):
+                grid, centers_m = self._grid_of(session), self.table.center_m[begin:end]
+                seen = SeenPlaces.of(grid, centers_m, self.sight_m)
             on_progress((begin + len(np.unique(seen.place))) / len(self.table))
             yield PlaceBlock(seen, begin)
         on_progress(1.0)
-
-    def _seen(self, session: int) -> SeenPlaces:
-        """Return the isovists of the places of a session; they are kept."""
-        if session not in self._described:
-            rows = self._rows(session)
-            seen = self._stored(session)
-            if seen is None or (len(seen) and seen.place[-1] >= rows.stop - rows.start):
-                seen = SeenPlaces.of(self._grids[session], self.table.center_m[rows], self.sight_m)
-            _forget(self._described, _KEPT_SESSIONS - 1)
-            self._described[session] = seen
-        return self._described[session]
-
-    def _rows(self, session: int) -> slice:
-        """Return the rows of a session in the table, which are side by side."""
-        first, end = np.searchsorted(self.table.session_index, (session, session + 1))
-        return slice(int(first), int(end))
 
     def areas(self, rows: I64) -> Iterator[Area]:
         """Yield the free ground next to the places `rows`, in the order of their sessions."""
         chosen = np.zeros(len(self.table), bool)
         chosen[rows] = True
         for session in dict.fromkeys(self.table.session_index[rows].tolist()):
-            squares_m, nearest = self.ground[session]
+            squares_m, nearest = self.ground(session)
             yield Area(session, squares_m[chosen[nearest]])
 
     def nearest(self, session: int | NDArray[np.integer], at_m: NDArray[np.floating]) -> tuple[F64, I64]:
@@ -221,59 +197,13 @@ class Places:
         return cKDTree(np.column_stack((self.table.center_m, self.table.session_index * _APART_M)))
 
     def _ground(self, session: int) -> tuple[F64, I64]:
-        squares_m = ground_squares(self._grids[session])
+        """Return the centres (K, 2) of the squares of `SQUARE_M` of a map that hold any ground, and the
+        places next to them (K,)."""
+        grid = self._grid_of(session)
+        n = max(1, round(SQUARE_M / grid.resolution_m))
+        height, width = grid.cells.shape
+        ground = np.zeros((math.ceil(height / n), math.ceil(width / n)), bool)
+        ground[tuple((cells_of(grid.ground) // n).T)] = True
+        corners = cells_of(ground)[:, ::-1] * (n * grid.resolution_m)
+        squares_m = np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
         return squares_m, self.nearest(session, squares_m)[1]
-
-
-def ground_squares(grid: OccupancyGrid) -> F64:
-    """Return the centres (K, 2) of the squares of `SQUARE_M` of a grid that hold any ground, map frame."""
-    n = max(1, round(SQUARE_M / grid.resolution_m))
-    height, width = grid.cells.shape
-    ground = np.zeros((math.ceil(height / n), math.ceil(width / n)), bool)
-    ground[tuple((cells_of(grid.ground) // n).T)] = True
-    corners = cells_of(ground)[:, ::-1] * (n * grid.resolution_m)
-    return np.asarray(corners + 0.5 * n * grid.resolution_m + np.asarray(grid.origin_m))
-
-
-def _forget(kept: dict[int, T], most: int) -> None:
-    """Leave the `most` entries that were added last."""
-    for key in list(kept)[: max(0, len(kept) - most)]:
-        del kept[key]
-
-
-class LazySequence(Sequence[T]):
-    """A sequence of `count` items, each made when it is first asked for; the `most` used last are kept."""
-
-    def __init__(self, make: Callable[[int], T], count: int, most: int | None = None) -> None:
-        """Prepare without making any. most : None: all are kept."""
-        self._made, self._count = functools.lru_cache(maxsize=most)(make), count
-
-    def __len__(self) -> int:
-        return self._count
-
-    @overload
-    def __getitem__(self, index: int) -> T: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> tuple[T, ...]: ...
-
-    def __getitem__(self, index: int | slice) -> T | tuple[T, ...]:
-        if isinstance(index, slice):
-            return tuple(self[i] for i in range(*index.indices(self._count)))
-        return self._made(range(self._count)[index])
-
-
-class DatabaseGrids(Mapping[str, OccupancyGrid]):
-    """The map of each session of a database, by name, read whenever it is asked for."""
-
-    def __init__(self, database: SubmapDatabase, sessions: Sequence[str]) -> None:
-        self._database, self._sessions = database, sessions
-
-    def __getitem__(self, session: str) -> OccupancyGrid:
-        return self._database.grid(session)
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._sessions)
-
-    def __len__(self) -> int:
-        return len(self._sessions)

@@ -24,8 +24,9 @@ from pc2grid.model import OccupancyGrid
 from signature.config import Config
 from signature.paper import PlaceTable
 from signature.places.hypotheses import look_up
-from signature.places.places import LazySequence, Places
+from signature.places.places import Places
 from signature.places.query import QueryMap, query_of
+from signature.visible import SeenPlaces
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +98,8 @@ class SessionRecognizer:
         self._parameters = parameters
         # Grids are kept compressed: some 10 kB each, so that a long session needs little memory.
         self._stored: list[bytes] = []
-        self._map = lru_cache(parameters.maps)(lambda index: SearchMap.of(self._grid(index)))
+        self._seen: list[SeenPlaces] = []  # what is seen from the places of each
+        self._map_of = lru_cache(parameters.maps)(lambda number: SearchMap.of(self._grid_of(number)))
         self._places: Places | None = None
 
     def recognize(self, newest: PlaceMap) -> Sequence[Recognition]:
@@ -109,8 +111,7 @@ class SessionRecognizer:
 
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:
         rows = places.order(query.views, query.center_m, self._config).rows[: self._parameters.shortlist]
-        maps = LazySequence(self._map, len(self._stored), most=0)
-        found = next(look_up(query, [places.areas(rows)], places, maps, self._config))
+        found = next(look_up(query, [places.areas(rows)], places, self._map_of, self._config))
         return [
             Recognition(older=h.session_index, T_older_newer=h.T_map_query, evidence=evidence)
             for h, evidence in zip(found, evidence_of(found, query.likeness), strict=True)
@@ -119,23 +120,21 @@ class SessionRecognizer:
 
     def _remember(self, grid: OccupancyGrid, query: QueryMap) -> None:
         """Add the newest place map to the places that later ones are looked up in."""
-        index = len(self._stored)
-        self._stored.append(zlib.compress(pickle.dumps(grid), 1))
-        count = len(query.views)
+        count, sight_m = len(query.views), self._made_with.partition.radius_m
         table = PlaceTable(
-            session_index=np.full(count, index, np.int32),
+            session_index=np.full(count, len(self._stored), np.int32),
             submap_id=np.arange(count, dtype=np.int32),
             center_m=np.array([view.center_m for view in query.views]).reshape(-1, 2),
         )
-        if not len(table):
+        self._stored.append(zlib.compress(pickle.dumps(grid), 1))
+        self._seen.append(SeenPlaces.of(grid, table.center_m, sight_m))
+        if not count:
             return
-        known = self._places
-        if known is not None:
-            table = PlaceTable.concatenated((known.table, table))
-        count = len(self._stored)
-        grids = LazySequence(self._grid, count, most=0)
-        self._places = Places(table, grids, self._made_with.partition.radius_m, [0.0] * count, known)
+        if self._places is not None:
+            table = PlaceTable.concatenated((self._places.table, table))
+        areas_m2 = [0.0] * len(self._stored)
+        self._places = Places(table, self._grid_of, sight_m, areas_m2, self._seen.__getitem__)
 
-    def _grid(self, index: int) -> OccupancyGrid:
-        grid: OccupancyGrid = pickle.loads(zlib.decompress(self._stored[index]))
+    def _grid_of(self, number: int) -> OccupancyGrid:
+        grid: OccupancyGrid = pickle.loads(zlib.decompress(self._stored[number]))
         return grid

@@ -175,7 +175,7 @@ def building(
         name: BuildingFrame(name="building", T_building_session=T, covariance=exact)
         for name, T in (joined or {}).items()
     }
-    return MapIndex(grids, table, config, config, labels, frames=frames, drawn=drawn)
+    return MapIndex(grids, grids.__getitem__, table, config, config, labels, frames=frames, drawn=drawn)
 
 
 def cut(grid: OccupancyGrid, x0: float, y0: float, x1: float, y1: float) -> OccupancyGrid:

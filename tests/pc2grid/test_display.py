@@ -26,7 +26,6 @@ from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_lab.truth import read_relations, relation_errors
 from signature.config import Config
 from signature.paper import Signature, SignatureTable
-from signature.places.places import LazySequence
 from tests.helpers.recordings import drive, write_mcap
 from tests.helpers.session_maps import LOOPS, session, way
 from tests.helpers.simulated_drives import office
@@ -302,13 +301,3 @@ def test_relations_that_a_trajectory_says_nothing_of(tmp_path: Path) -> None:
     nothing = Trajectory(stamps_ns=np.empty(0), T_session_base=np.empty((0, 4, 4)))
     for trajectory in (STILL, nothing):
         assert len(relations) == 1 and relation_errors(trajectory, relations).shape == (0, 2)
-
-
-def test_things_made_lazily_are_made_once_and_only_when_asked_for() -> None:
-    made: list[int] = []
-    things = LazySequence(lambda i: made.append(i) or i * i, 10)
-    assert len(things) == 10 and made == []
-    assert (things[-1], things[2:5], things[9]) == (81, (4, 9, 16), 81)
-    assert made == [9, 2, 3, 4]
-    with pytest.raises(IndexError):
-        things[10]

@@ -152,7 +152,7 @@ def index_of(name: str, grid: OccupancyGrid, config: Config) -> MapIndex:
     submaps = partition(grid, config.partition)
     signatures = [describe(submap, config.signature) for submap in submaps]
     centers_m = [submap.center_m for submap in submaps]
-    return MapIndex({name: grid}, SignatureTable.of(signatures, centers_m), config, config)
+    return MapIndex([name], lambda _: grid, SignatureTable.of(signatures, centers_m), config, config)
 
 
 PlanMap = tuple[OccupancyGrid, SE2]
@@ -298,7 +298,7 @@ def located_rows(
         if answer.best is not None:
             pose = answer.best.T_map_query @ answer.T_odom_base
             right, error_m = is_right(pose, T_map_base, JUDGEMENT.right_m)
-        mapped = own and score_fit(index.maps[0].walls, query.walls, T_map_query, np.eye(3)).overlap
+        mapped = own and score_fit(index.map_of(0).walls, query.walls, T_map_query, np.eye(3)).overlap
         yield QueryRow(
             window=count,
             start_s=0.0,

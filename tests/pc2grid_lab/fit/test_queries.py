@@ -48,6 +48,6 @@ def test_windows_are_taken_one_at_a_time_where_the_map_knows_them(monkeypatch: p
     monkeypatch.setattr(queries, "index_of_database", lambda _: OFFICE)
     asked = queries.in_maps(known(), Folder(Path("data"), Path("work")))
     _, T_map_query, ((grid, _),) = next(asked)
-    assert taken == [False, True] and grid is OFFICE.grids[0]
+    assert taken == [False, True] and grid is OFFICE.grid_of(0)
     assert T_map_query.apply(np.array([query.center_m]))[0] == pytest.approx((end.x, end.y))
     assert len(list(asked)) == 1

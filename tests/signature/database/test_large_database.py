@@ -50,7 +50,7 @@ def large(maps: Mapping[str, OccupancyGrid]) -> MapIndex:
     """All maps as a database gives them: with their areas, and what is seen in them."""
     areas_m2 = {name: grid.free_m2 for name, grid in MAPS.items()}
     made = whole().places.table, whole().made_with, Config()
-    return MapIndex(maps, *made, areas_m2=areas_m2, stored=seen().get)
+    return MapIndex(maps, maps.__getitem__, *made, areas_m2=areas_m2, stored=seen().get)
 
 
 class _Counted(Mapping[str, OccupancyGrid]):
@@ -108,7 +108,7 @@ def test_the_maps_that_were_used_last_are_kept(monkeypatch: pytest.MonkeyPatch) 
     maps = _Counted()
     index = large(maps)
     for number in (0, 1, 0, 2, 0, 1):  # two of seven are kept
-        assert index.grids[number] is not None
+        assert index.grid_of(number) is not None
     assert maps.read == ["other0", "other1", "other2", "other1"]
 
 

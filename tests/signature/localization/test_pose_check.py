@@ -129,7 +129,7 @@ def real_queries() -> Iterator[tuple[Driven, SE2]]:
 def test_a_real_log_in_the_nav2_map_of_the_floor() -> None:
     # Without places that are described (20 s): the map is searched as a whole.
     grids = {"fr079": load_map(DATA / "maps/fr079.yaml")}
-    index = MapIndex(grids, SignatureTable.of([], []), Config(), Config())
+    index = MapIndex(grids, grids.__getitem__, SignatureTable.of([], []), Config(), Config())
     told = []
     for driven, truth in real_queries():
         scans = [(r, s) for r, s, _ in driven]

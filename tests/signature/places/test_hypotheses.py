@@ -68,7 +68,7 @@ def test_tables_that_a_lidar_has_seen_over_and_under_hide_no_place_from_a_laser(
     def agreement(query: OccupancyGrid, target: OccupancyGrid) -> float:
         config = Config()
         asked = query_of(query, np.empty((0, 2)), config, config.relocalize)
-        searched = building({"map": target}, config).maps_for(asked)[0]
+        searched = building({"map": target}, config).maps_for(asked)(0)
         return fitted(asked, 0, -1, searched, at_map).known_agreement_both_ways
 
     plain = replace(of_lidar, heights=None)

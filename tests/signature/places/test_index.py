@@ -97,7 +97,7 @@ def test_the_free_ground_next_to_a_place_is_searched() -> None:
     away_m, row = places.nearest(0, area.squares_m)
     assert len(area.squares_m) and (row == 3).all() and away_m.min() <= SQUARE_M
     (whole,) = places.areas(np.arange(PLACES))
-    assert len(whole.squares_m) == len(places.ground[0][0])
+    assert len(whole.squares_m) == len(places.ground(0)[0])
 
 
 def test_maps_do_not_mix() -> None:

@@ -260,10 +260,11 @@ def _error(
 
 def _blanked(index: MapIndex, window: KnownWindow) -> MapIndex:
     """Return the index with all that the window sees made unknown."""
-    query, grids = window.whole, dict(zip(index.sessions, index.grids, strict=True))
+    query, grids = window.whole, {name: index.grid_of(k) for k, name in enumerate(index.sessions)}
     for name, T_map_base in window.truth.items():
         grids[name] = unseen_by(query, grids[name], T_map_base @ query.T_odom_base.inverse())
-    return MapIndex(grids, index.places.table, index.made_with, Config(relocalize=index.config))
+    made = index.places.table, index.made_with, Config(relocalize=index.config)
+    return MapIndex(grids, grids.__getitem__, *made)
 
 
 def unseen_by(query: QueryMap, grid: OccupancyGrid, T_map_query: SE2) -> OccupancyGrid:
@@ -308,7 +309,7 @@ def in_maps(known: Iterable[KnownWindow], folder: Folder) -> Iterator[Asked]:
         if window.covered:
             index = index_of_database(folder.map(window.pair.map_name))
             session, T_map_base = next(iter(window.truth.items()))
-            grid = index.grids[index.sessions.index(session)]
+            grid = index.grid_of(index.sessions.index(session))
             yield window.whole, T_map_base @ window.whole.T_odom_base.inverse(), [(grid, SE2())]
 
 
@@ -370,7 +371,7 @@ def weights(
     floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
     floors += [grid for grid, _ in drawn.values()]
     floors += [
-        index_of_database(folder.map(name)).grids[0] for name in sorted({pair.map_name for pair in asked})
+        index_of_database(folder.map(name)).grid_of(0) for name in sorted({pair.map_name for pair in asked})
     ]
     known = windows(replace(catalogue, pairs=tuple(asked)), folder)
     pairs = pairs_of(chain(in_logs(drawn, config), in_maps(known, folder)), floors, config)
