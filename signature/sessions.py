@@ -304,23 +304,19 @@ def provenance(
     >>> origin.source, len(origin.digest), origin.versions["pc2grid"] == pc2grid.__version__
     ('monday.mcap', 64, True)
     """
+    versions = {"pc2grid": __version__, "python": platform.python_version()}
+    for name in _LIBRARIES:
+        with contextlib.suppress(metadata.PackageNotFoundError):
+            versions[name] = metadata.version(name)
     return Provenance(
         source=Path(source).name,
         digest=digest,
         config=config,
         start_s=span.start_s,
         duration_s=span.duration_s,
-        versions={"pc2grid": __version__, "python": platform.python_version(), **_versions()},
+        versions=versions,
         label=label or Label(),
     )
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for name in _LIBRARIES:
-        with contextlib.suppress(metadata.PackageNotFoundError):
-            versions[name] = metadata.version(name)
-    return versions
 
 
 def build_session(

@@ -58,7 +58,7 @@ registration was lost; by hand."""
 class Localizer:
     """Takes in the scans of a recording or of a running robot, and says where it is.
 
-    Memory does not grow with the travel.
+    Memory does not grow with the travel. uses_points : whether scans must be given with their points.
 
     index : where to look; `MapIndex.within` restricts it to what is known beforehand: answers from the time
     of the prior on, or, if it has none, `answer` alone.
@@ -83,17 +83,13 @@ class Localizer:
         self._belief = Belief(index.config.accept)
         self._history: deque[Answer] = deque(maxlen=MOST_KEPT)
         prior_ns = prior_ns if index.prior is None else index.prior.stamp_ns
+        self.uses_points = index.surface_of is not None
         self.query = Query(index.made_with, index.config, prior_ns=prior_ns, in_space=self.uses_points)
         # Of the last search: part of the query, metres driven in it, and hypotheses.
         self._part, self._last_m, self._known = 0, 0.0, tuple[Fit, ...]()
         self._answer: Answer | None = None  # of the last scan
         self._clock = Clock()
         self._stood = False
-
-    @property
-    def uses_points(self) -> bool:
-        """Return whether scans must be given with their points."""
-        return self.index.surface_of is not None
 
     @one_blas_thread
     def add(
@@ -286,10 +282,7 @@ class Follows(Protocol[ResultT_co]):
     uses_points : whether the scans that `ViewSpacing` takes are needed with their points.
     """
 
-    @property
-    def uses_points(self) -> bool:
-        """See above."""
-        ...
+    uses_points: bool
 
     def add(
         self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True

@@ -200,6 +200,8 @@ def _within_tolerance(off_m: float, off_rad: float) -> bool:
 class PoseWatch:
     """Takes in scans for as long as the robot runs, and judges what it believes. Its memory does not grow.
 
+    uses_points : whether scans must be given with their points.
+
     index : where to look. believed : the newest pose in the map that the robot believes in, None before the
     first. session : whose map frame that is; may be None if there is only one.
     """
@@ -208,13 +210,9 @@ class PoseWatch:
         self, index: MapIndex, believed: Callable[[], MapPose | None], session: str | None = None
     ) -> None:
         self._index, self._believed, self._session = index, believed, session
+        self.uses_points = index.surface_of is not None
         self._received: MapPose | None = None
         self.restart()
-
-    @property
-    def uses_points(self) -> bool:
-        """Return whether scans must be given with their points."""
-        return self._localizer.uses_points
 
     def restart(self) -> None:
         """Begin anew: the next scans do not continue those before."""

@@ -271,7 +271,7 @@ def _together(
     for away in sorted(off_map, key=lambda away: -away.mass):
         here = away.fits[0]
         for k, place in enumerate(places):
-            if any(more_exact(h, here) and _is_beside(h, away, T_odom_base) for h in place.fits):
+            if any(more_exact(h, here) and agree(T_odom_base, here, h) for h in place.fits):
                 places[k] = replace(place, mass=place.mass + away.mass, beside=place.beside or away)
                 break
         else:
@@ -288,7 +288,7 @@ def with_mass(answer: Answer) -> tuple[Place, ...]:
     off_map, places = list(answer.off_map), list[Place]()
     for place in answer.places:
         first, beside = place.fits[0], place.beside
-        here = [k for k, away in enumerate(off_map) if _is_beside(first, away, answer.T_odom_base)]
+        here = [k for k, away in enumerate(off_map) if agree(answer.T_odom_base, away.fits[0], first)]
         if beside is None and here:
             beside = off_map.pop(here[0])
             place = replace(place, mass=place.mass + beside.mass)
@@ -299,11 +299,6 @@ def with_mass(answer: Answer) -> tuple[Place, ...]:
             at = answer.T_odom_base
             places.append(replace(place, beside=None, seen_m=answer.path_m, T_odom_seen=at, seen=covariances))
     return (*places, *off_map)
-
-
-def _is_beside(fit: Fit, away: Place, T_odom_base: SE2) -> bool:
-    """Return whether a fit puts the base where odometry has carried it beside the map."""
-    return agree(T_odom_base, away.fits[0], fit)
 
 
 def mass_at(fits: Sequence[Fit], places: Iterable[Place], T_odom_base: SE2) -> float:

@@ -219,7 +219,15 @@ def distinct(query: QueryMap, hypotheses: Iterable[Fit]) -> tuple[Fit, ...]:
     """
     kept: list[Fit] = []
     for candidate in sorted(hypotheses, key=lambda h: -h.score):
-        better = next((i for i, other in enumerate(kept) if _one_peak(query, candidate, other)), None)
+        better = next(
+            (
+                i
+                for i, other in enumerate(kept)
+                if other.session_index == candidate.session_index
+                and one_place(_at(query, candidate), _at(query, other))
+            ),
+            None,
+        )
         if better is None:
             kept.append(candidate)
         elif kept[better].submap_id < 0:
@@ -246,11 +254,6 @@ def is_inside(a: SE2, b: SE2, shape: F64) -> bool:
 def one_place(a: SE2, b: SE2) -> bool:
     """Return whether two poses are one place, because a search around one has seen the other."""
     return is_inside(a, b, SAME)
-
-
-def _one_peak(query: QueryMap, a: Fit, b: Fit) -> bool:
-    """Return whether two hypotheses are one place of one map."""
-    return a.session_index == b.session_index and one_place(_at(query, a), _at(query, b))
 
 
 def agree(T_odom_base: SE2, a: Fit, b: Fit) -> bool:
