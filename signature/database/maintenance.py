@@ -261,9 +261,10 @@ def _other_parts(database: SubmapDatabase, name: str) -> list[SessionRow]:
     first = database.find(name)
     if first is None:
         return []
-    digest = database.info(first).digest
+    digest = database.info(first).provenance.digest
     rows = database.rows("substr(name, 1, ?) = ?", len(name) + 1, f"{name}#")
-    return [row for row in rows if is_part_of(row.name, name) and database.info(row).digest == digest]
+    parts = [row for row in rows if is_part_of(row.name, name)]
+    return [row for row in parts if database.info(row).provenance.digest == digest]
 
 
 def _delete(database: SubmapDatabase, row: SessionRow) -> None:

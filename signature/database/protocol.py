@@ -121,21 +121,6 @@ class SessionInfo:
             f" {self.submaps} submaps)"
         )
 
-    @property
-    def digest(self) -> str:
-        """Return the sha256 of the recording, hex."""
-        return self.provenance.digest
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Return the warnings of reading and mapping."""
-        return self.report.warnings
-
-    @property
-    def lossy(self) -> bool:
-        """Return True if data was lost while reading."""
-        return self.report.lossy
-
 
 Entry = tuple[SessionMap, Sequence[Signature], Provenance]
 """Everything that is stored of one session: the map, the signature of each submap, the provenance."""

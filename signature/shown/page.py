@@ -201,11 +201,11 @@ def _facts(info: SessionInfo, poses: Trajectory) -> dict[str, Any]:
         "path_m": round(info.path_m, 1),
         "duration_s": round(info.duration_s, 1),
         "scans": info.scans,
-        "lossy": info.lossy,
+        "lossy": info.report.lossy,
         "agreement": None if info.consistency is None else round(1.0 - info.consistency.contradicted, 4),
         "bent": info.consistency is not None and info.consistency.bent,
         "worst_m": None if info.precision is None else round(info.precision.worst_m, 2),
-        "warnings": list(info.warnings),
+        "warnings": list(info.report.warnings),
     }
 
 

@@ -123,12 +123,12 @@ def assert_holds(database: SubmapDatabase, entry: Entry) -> None:
     name = session_map.session
     index = [info.name for info in database.sessions()].index(name)
     info = database.sessions()[index]
-    assert (info.digest, info.provenance.config, info.submaps) == (
+    assert (info.provenance.digest, info.provenance.config, info.submaps) == (
         origin.digest,
         origin.config,
         len(signatures),
     )
-    assert info.warnings == session_map.report.warnings
+    assert info.report.warnings == session_map.report.warnings
     grid = database.grid(name)
     assert np.array_equal(grid.cells, session_map.grid.cells)
     assert (grid.resolution_m, grid.origin_m) == (session_map.grid.resolution_m, session_map.grid.origin_m)

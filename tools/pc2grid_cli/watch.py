@@ -264,7 +264,7 @@ def _document(answer: Answer, drive: ScanSource, robot: _Robot, published: list[
             "session": session,
             "building": answer.label.building,
             "floor": answer.label.floor,
-            "digest": robot.sessions[session].digest,
+            "digest": robot.sessions[session].provenance.digest,
         }
     document = {
         "state": answer.state,

@@ -506,7 +506,7 @@ def test_words_that_are_no_text_are_shown(empty: maintenance.Location) -> None:
         assert (info.name, info.provenance.source) == (r"fri\xffday", r"fri\xffday.mcap")
         assert info.provenance.label == Label(building=r"north\xff", floor=r"\xff")
         assert info.report.scans_skipped == {r"of \xff": 2}
-        assert info.warnings == (r"odd\xff.pcd: empty",)
+        assert info.report.warnings == (r"odd\xff.pcd: empty",)
         assert maintenance.check(database.location) == ()
         with pytest.raises(DatabaseError, match=r"no session|UTF-8 only"):
             database.grid("fri\udcffday")
