@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, closing
 from itertools import chain
@@ -12,11 +13,12 @@ import numpy as np
 
 from pc2grid.errors import NoScans
 from pc2grid.estimation.spatial import begin
-from pc2grid.estimation.tracker import Tracker
+from pc2grid.estimation.tracker import Disagreement, Tracker
 from pc2grid.geometry import SE2
 from pc2grid.libraries import one_blas_thread
 from pc2grid.model import (
     SENSOR_MODELS,
+    Health,
     Loop,
     OccupancyGrid,
     Scan,
@@ -27,7 +29,7 @@ from pc2grid.model import (
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid.submaps.submaps import divide
 from signature.config import Config
-from signature.session.keyframes import Keyframe, KeyframePoints, Keyframes, Track, TrackRecord
+from signature.session.keyframes import Keyframe, KeyframePoints, Keyframes, Track
 from signature.session.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
 from signature.session.loops import LoopCloser
 from signature.session.part_maps import (
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
 
 _SHARE_BEFORE_LOOPS = 0.8
 """Share of the work of `build_map` that is done when the last scan has been tracked; chosen by hand."""
+_NO_READING = np.full((4, 4), np.nan)
 
 
 def build_map(
@@ -191,8 +194,8 @@ def _map(
             local_map_parameters=CAMERA_LOCAL_MAPS if narrow else LOCAL_MAPS,
         )
         tracker = Tracker(config.registration, config.projection, in_hand=beginning.in_hand)
-        record = _track(chain(beginning.scans, rest), tracker, closer, points, observer)
-        track = record.track(beginning.left_out, beginning.warning)
+        track = _track(chain(beginning.scans, rest), tracker, closer, points, observer)
+        track = dataclasses.replace(track, left_out=beginning.left_out, warning=beginning.warning)
         closed = closer.finish()
         if whole:
             together = np.zeros(len(closed.scans), np.int64)
@@ -207,17 +210,29 @@ def _track(
     closer: LoopCloser,
     points: KeyframePoints | None,
     observer: Observer,
-) -> TrackRecord:
+) -> Track:
     """Track all scans, keep the keyframes, and close loops on the way."""
-    record = TrackRecord()
+    stamps_ns, poses, readings = array("q"), array("d"), array("d")
+    health, disagreements, changed_ns = list[Health](), list[Disagreement | None](), list[int]()
     for scan in scans:
         tracked = tracker.track(scan)
         registered = tracked.registered
         if tracked.keyframe:
             pose = SE2.from_matrix(registered.T_session_base)
-            closer.add(Keyframe(len(record), tracked.planar_scan, pose, tracked.restart))
+            closer.add(Keyframe(len(stamps_ns), tracked.planar_scan, pose, tracked.restart))
             if points is not None:
-                points.append(len(record), registered.scan)
-        record.append(scan, tracked)
+                points.append(len(stamps_ns), registered.scan)
+        stamps_ns.append(scan.stamp_ns)
+        poses.extend(registered.T_session_base.ravel())
+        readings.extend((_NO_READING if scan.T_odom_base is None else scan.T_odom_base).ravel())
+        health.append(registered.health)
+        disagreements.append(tracked.disagreement)
+        if tracked.walls_changed:
+            changed_ns.append(scan.stamp_ns)
         observer.on_scan(registered)
-    return record
+    trajectory = Trajectory(
+        stamps_ns=np.array(stamps_ns, dtype=np.int64),
+        T_session_base=np.frombuffer(poses).reshape(-1, 4, 4),
+        health=tuple(health),
+    )
+    return Track(trajectory, disagreements, np.frombuffer(readings).reshape(-1, 4, 4), tuple(changed_ns))

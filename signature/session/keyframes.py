@@ -9,14 +9,12 @@ surfaces that were observed.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import pickle
 import tempfile
 from array import array
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -26,11 +24,8 @@ from pc2grid.errors import OutputError
 from pc2grid.estimation.tracker import Disagreement
 from pc2grid.geometry import F32, F64, SE2, BoolGrid, transform_points
 from pc2grid.grids.occupancy import GridBuilder
-from pc2grid.model import SENSOR_MODELS, Health, OccupancyGrid, PointMap, Scan, Trajectory
+from pc2grid.model import SENSOR_MODELS, OccupancyGrid, PointMap, Scan, Trajectory
 from pc2grid.settings import ProjectionConfig
-
-if TYPE_CHECKING:
-    from pc2grid.estimation.tracker import Tracked
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,10 +151,7 @@ class KeyframePoints:
         self._clouds.close()
 
 
-_NO_READING = np.full((4, 4), np.nan)
-
-
-@dataclasses.dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True)
 class Track:
     """The results of tracking for all scans of a session.
 
@@ -180,40 +172,6 @@ class Track:
     def with_odometry(self) -> bool:
         """Return True if any scan has an odometry pose."""
         return bool(np.isfinite(self.readings).any())
-
-
-class TrackRecord:
-    """Collects a track scan by scan: the pose, the reading of odometry and the health."""
-
-    def __init__(self) -> None:
-        self._stamps, self._poses, self._readings = array("q"), array("d"), array("d")
-        self._health: list[Health] = []
-        self._disagreements: list[Disagreement | None] = []
-        self._walls_changed_ns: list[int] = []
-
-    def __len__(self) -> int:
-        return len(self._stamps)
-
-    def append(self, scan: Scan, tracked: Tracked) -> None:
-        """Add the next scan."""
-        self._stamps.append(scan.stamp_ns)
-        self._poses.extend(tracked.registered.T_session_base.ravel())
-        self._health.append(tracked.registered.health)
-        self._disagreements.append(tracked.disagreement)
-        if tracked.walls_changed:
-            self._walls_changed_ns.append(scan.stamp_ns)
-        self._readings.extend((_NO_READING if scan.T_odom_base is None else scan.T_odom_base).ravel())
-
-    def track(self, left_out: int, warning: str | None) -> Track:
-        """Return the track of all scans; `left_out` and `warning` as of a `Track`."""
-        trajectory = Trajectory(
-            stamps_ns=np.array(self._stamps, dtype=np.int64),
-            T_session_base=np.frombuffer(self._poses).reshape(-1, 4, 4),
-            health=tuple(self._health),
-        )
-        readings = np.frombuffer(self._readings).reshape(-1, 4, 4)
-        changed_ns = tuple(self._walls_changed_ns)
-        return Track(trajectory, self._disagreements, readings, changed_ns, left_out, warning)
 
 
 IN_MEMORY_BYTES = 32 << 20  # chosen by hand: about an hour of the keyframes of a 2D laser
