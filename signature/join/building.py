@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F64, SE2, BoolGrid, hand_over, lever_arm, wrap_angle
+from pc2grid.geometry import F64, SE2, hand_over, lever_arm, wrap_angle
 from pc2grid.libraries import one_blas_thread
 from pc2grid.model import (
     FREE,
@@ -41,7 +41,7 @@ from pc2grid.model import (
     Trajectory,
 )
 from pc2grid.observer import Observer
-from signature.database.database import no_session
+from signature.database.database import SubmapDatabase, no_session
 from signature.database.protocol import (
     BuildingFrame,
     Covariance,
@@ -55,7 +55,6 @@ from signature.join.join import (
     Names,
     SessionPair,
     compare_pairs,
-    told_apart,
 )
 from signature.session.graph import Edge, information_matrix, optimise
 from signature.session.local_maps import pose_at
@@ -64,8 +63,6 @@ from signature.session.quality import position_sigmas
 
 if TYPE_CHECKING:
     import networkx as nx
-
-    from signature.database import SubmapDatabase
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -143,7 +140,8 @@ def buildings_of(
     import networkx as nx
 
     def two_buildings(a: str, b: str) -> bool:
-        return told_apart(infos[a], infos[b]) or (a in stay and b in stay and stay[a].name != stay[b].name)
+        label, other = infos[a].provenance.label, infos[b].provenance.label
+        return label.contradicts(other) or (a in stay and b in stay and stay[a].name != stay[b].name)
 
     trees = nx.Graph()
     trees.add_nodes_from(infos)
@@ -257,19 +255,15 @@ _LEAST_SIGMA_M = 0.005
 
 @dataclass(frozen=True, slots=True)
 class SessionBody:
-    """A session as a part of the pose graph. nodes : (N, 3) poses of its way, in its map; one, at the origin,
-    if it is rigid. edges : between them, at rest."""
+    """A session as a part of the pose graph. nodes : (N, 3) poses of its way, in its map. edges : between
+    them, at rest."""
 
     nodes: F64
     edges: tuple[Edge, ...] = ()
 
-    @property
-    def rigid(self) -> bool:
-        """Tell whether nothing can bend it."""
-        return len(self.nodes) == 1
-
 
 RIGID = SessionBody(np.zeros((1, 3)))
+"""A session that nothing can bend: one node, at the origin of its map."""
 
 
 def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision | None) -> SessionBody:
@@ -288,8 +282,8 @@ def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision 
     number = {scan: k for k, scan in enumerate(scans.tolist())}
     lengths_m = np.diff(trajectory.path_m()[scans]).tolist()
     measured = [
-        (k, k + 1, LOOPS.tracked_information(length_m, restart=_lost(trajectory, *scans[k : k + 2])))
-        for k, length_m in enumerate(lengths_m)
+        (k, k + 1, LOOPS.tracked_information(length_m, restart=Health.LOST in trajectory.health[a : b + 1]))
+        for k, (length_m, a, b) in enumerate(zip(lengths_m, scans, scans[1:], strict=False))
     ]
     measured += [(number[loop.older], number[loop.newer], loop.information) for loop in closed]
     edges = [
@@ -301,11 +295,6 @@ def body_of(trajectory: Trajectory, loops: Sequence[Loop], precision: Precision 
     return SessionBody(
         nodes, tuple(replace(edge, information=variance / known * edge.information) for edge in edges)
     )
-
-
-def _lost(trajectory: Trajectory, begin: int, end: int) -> bool:
-    """Tell whether tracking was lost from one scan to another."""
-    return Health.LOST in trajectory.health[begin : end + 1]
 
 
 def bodies_of(
@@ -332,9 +321,9 @@ def straighten(
     Sessions that would hardly be bent (`_LEAST_M`) are rigid, and the others are solved for again. If none is
     bent, the frames stay as they are.
     """
-    while not all(body.rigid for body in bodies.values()):
+    while not all(body is RIGID for body in bodies.values()):
         found = _lying_straight(bodies, frames, _solved(bodies, frames, links, held), held)
-        straight = {name for name, body in bodies.items() if not body.rigid and not found[name].bend}
+        straight = {name for name, body in bodies.items() if body is not RIGID and not found[name].bend}
         if not straight:
             return found
         bodies = {name: RIGID if name in straight else body for name, body in bodies.items()}
@@ -366,8 +355,11 @@ def _solved(
         replace(edge, first=edge.first + first[a], second=edge.second + first[b])
         for a, b, edge in (*within, *between)
     ]
-    begin = np.concatenate([_moved(frames[name].T_building_session, bodies[name].nodes) for name in frames])
-    poses = optimise(begin, edges).poses
+    begin = []
+    for name, frame in frames.items():
+        T, nodes = frame.T_building_session, bodies[name].nodes
+        begin.append(np.column_stack((T.apply(nodes[:, :2]), nodes[:, 2] + T.yaw)))
+    poses = optimise(np.concatenate(begin), edges).poses
     return dict(zip(frames, np.split(poses, np.cumsum(counts)[:-1]), strict=True))
 
 
@@ -390,11 +382,6 @@ def _lying_straight(
         bend = _bend(bodies[name].nodes, solved[name], T[name])
         found[name] = replace(frames[name], T_building_session=at, bend=bend)
     return found
-
-
-def _moved(T: SE2, poses: F64) -> F64:
-    """Return poses (N, 3), each x, y, yaw, in another frame."""
-    return np.column_stack((T.apply(poses[:, :2]), poses[:, 2] + T.yaw))
 
 
 def _edge(
@@ -475,14 +462,10 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> Occupan
     cells = whole.cells.copy()
     for window, told in _drawn(maps, whole):
         here = cells[window]
-        chosen = _sure(told) | ((told != UNKNOWN) & (here == UNKNOWN))
+        sure = (told >= OCCUPIED_FROM) | (told == THING) | ((told >= FREE) & (told < FREE_BELOW))
+        chosen = sure | ((told != UNKNOWN) & (here == UNKNOWN))
         here[chosen] = told[chosen]
     return replace(whole, cells=hand_over(cells))
-
-
-def _sure(cells: Cells) -> BoolGrid:
-    """Return where a map is sure: of an obstacle, of a thing, or of nothing."""
-    return np.asarray((cells >= OCCUPIED_FROM) | (cells == THING) | ((cells >= FREE) & (cells < FREE_BELOW)))
 
 
 def _around(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGrid:

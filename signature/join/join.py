@@ -20,7 +20,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations, islice
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -32,13 +32,11 @@ from pc2grid.matching.search import SearchMap
 from pc2grid.matching.walls import LIKELIHOOD, Walls
 from pc2grid.model import UNKNOWN, OccupancyGrid
 from pc2grid.observer import Observer
+from signature.database import SubmapDatabase
 from signature.database.protocol import SessionInfo
 from signature.places.hypotheses import MAP_COVARIANCE, moved_to_origin, one_place
 from signature.places.map_index import MapIndex
 from signature.places.query import QueryMap, map_as_query
-
-if TYPE_CHECKING:
-    from signature.database import SubmapDatabase
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,11 +90,6 @@ class SessionPair:
         return self.target, self.source
 
 
-def told_apart(a: SessionInfo, b: SessionInfo) -> bool:
-    """Tell whether labels exclude that two sessions are of one floor of one building."""
-    return a.provenance.label.contradicts(b.provenance.label)
-
-
 def compare_pairs(
     database: SubmapDatabase, infos: Mapping[str, SessionInfo], only: Collection[str], observer: Observer
 ) -> Iterator[SessionPair]:
@@ -104,8 +97,9 @@ def compare_pairs(
 
     only : one of each pair, at least, is of these.
     """
+    labels = {name: info.provenance.label for name, info in infos.items()}
     pairs = [
-        (a, b) for a, b in combinations(infos, 2) if {a, b} & {*only} and not told_apart(infos[a], infos[b])
+        (a, b) for a, b in combinations(infos, 2) if {a, b} & {*only} and not labels[a].contradicts(labels[b])
     ]
 
     @functools.cache
@@ -128,15 +122,10 @@ class JoinableMap:
 
     index: MapIndex
 
-    @property
-    def grid(self) -> OccupancyGrid:
-        """Return the map."""
-        return self.index.grid_of(0)
-
     @cached_property
     def walls(self) -> Walls:
         """Return its walls."""
-        return Walls.of(self.grid)
+        return Walls.of(self.index.grid_of(0))
 
     @cached_property
     def likeness(self) -> float:
@@ -152,11 +141,6 @@ class JoinableMap:
     def mirrored_pieces(self) -> tuple[Piece, ...]:
         """Return the same pieces of the mirror image, with x turned into -x."""
         return tuple(mirrored(piece, self.index) for piece in self.pieces)
-
-    @property
-    def search_map(self) -> SearchMap:
-        """Return the map, prepared to be searched."""
-        return self.index.map_of(0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -229,11 +213,11 @@ def _refined(
     target: JoinableMap, points_m: F32, pieces: Sequence[Piece], proposal: Proposal
 ) -> _ExactTransform:
     """Make the transform that one piece proposes exact by the walls of all."""
-    pose = proposal.T_target_source
-    fits = align_pieces(target.search_map, pieces, pose, proposal.at_m)
+    prepared = target.index.map_of(0)
+    fits = align_pieces(prepared, pieces, proposal.T_target_source, proposal.at_m)
     links = links_of(pieces, fits)
     T_target_source, bend_m = rigid(links)
-    whole, covariance = refine(target.search_map.field, points_m, T_target_source, proposal.at_m)
+    whole, covariance = refine(prepared.field, points_m, T_target_source, proposal.at_m)
     if bend_m < LIKELIHOOD.sigma_m:  # all walls are within reach of theirs at once, which is more exact
         T_target_source = whole
     covariance = covariance + MAP_COVARIANCE + np.diag([bend_m**2, bend_m**2, 0.0])
@@ -306,12 +290,14 @@ def _judged(
 
     number : its row in `fits`; the other rows are of its rivals. evidence : see `_evidence`.
     """
-    part = known_part(source.grid, target.grid, candidate.T_target_source)
-    common_m2 = free_in_both(part, target.grid, candidate.T_target_source)
+    whole, other = source.index.grid_of(0), target.index.grid_of(0)
+    part = known_part(whole, other, candidate.T_target_source)
+    free_m = candidate.T_target_source.apply(part.to_point(np.argwhere(part.free)))
+    common_m2 = float(other.look_up(other.free, free_m, outside=False).sum()) * part.resolution_m**2
     forward, backward, scores = fits.of_part(number)
     evidence = replace(evidence, likeness=self_similarity(Walls.of(part)))
     # The part was chosen: of so many parts of the smaller session, this one fits best.
-    share = min(common_m2 / max(min(source.grid.free_m2, target.grid.free_m2), 1e-9), 1.0)
+    share = min(common_m2 / max(min(whole.free_m2, other.free_m2), 1e-9), 1.0)
     odds = max(share, 1e-9)
     # Transforms that fit equally well share the mass.
     equal = int(np.count_nonzero(np.abs(scores - scores[number]) <= EVIDENCE.alike))
@@ -345,12 +331,6 @@ def known_part(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE
     return replace(source, cells=left)
 
 
-def free_in_both(source: OccupancyGrid, target: OccupancyGrid, T_target_source: SE2) -> float:
-    """Return how many square metres are free in both."""
-    points_m = T_target_source.apply(source.to_point(np.argwhere(source.free)))
-    return float(target.look_up(target.free, points_m, outside=False).sum()) * source.resolution_m**2
-
-
 _MIRROR = np.array((-1.0, 1.0), np.float32)
 """Turns x into -x."""
 
@@ -369,18 +349,16 @@ _TransformT = TypeVar("_TransformT", Proposal, _ExactTransform)
 
 
 def proposals(target: MapIndex, pieces: Sequence[Piece]) -> list[Proposal]:
-    """Return how a source may lie in a target, the likeliest transform first, no two alike."""
-    every = [one for piece in pieces for one in _places_of(target, piece)]
+    """Look the pieces of a source up in a target. Return how the source may lie there, the likeliest
+    transform first, no two alike."""
+    every = []
+    for piece in pieces:
+        found, _ = next(target.search(piece.query))
+        every += [
+            Proposal(T_target_source=fit.T_map_query, at_m=piece.center_m, log_odds=evidence.log_odds())
+            for fit, evidence in zip(found, evidence_of(found, piece.query.likeness), strict=True)
+        ]
     return list(islice(_distinct(sorted(every, key=lambda one: -one.log_odds)), JOIN.proposed))
-
-
-def _places_of(target: MapIndex, piece: Piece) -> list[Proposal]:
-    """Look a piece up in the target."""
-    found, _ = next(target.search(piece.query))
-    return [
-        Proposal(T_target_source=fit.T_map_query, at_m=piece.center_m, log_odds=evidence.log_odds())
-        for fit, evidence in zip(found, evidence_of(found, piece.query.likeness), strict=True)
-    ]
 
 
 def _distinct(transforms: Iterable[_TransformT]) -> Iterator[_TransformT]:

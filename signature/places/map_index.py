@@ -9,7 +9,6 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from itertools import chain
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from pc2grid.matching.search import SearchMap
 from pc2grid.model import OccupancyGrid
 from pc2grid.observer import Observer
 from signature.config import Config
+from signature.database import SubmapDatabase
 from signature.database.protocol import BuildingFrame, Label
 from signature.paper import PlaceTable
 from signature.places.hypotheses import look_up
@@ -29,9 +29,6 @@ from signature.places.places import AT_ONCE_M2, FIRST_PLACES, SQUARE_M, Area, Pl
 from signature.places.prior import Prior
 from signature.places.query import QueryMap
 from signature.visible import SeenPlaces
-
-if TYPE_CHECKING:
-    from signature.database import SubmapDatabase
 
 
 class MapIndex:

@@ -37,8 +37,8 @@ def test_two_halves_of_an_office_are_joined_by_their_common_strip() -> None:
 
 
 def test_a_map_that_tells_heights_is_cut_in_the_same_pieces() -> None:
-    heights = np.where(west.grid.occupied, 1, 0).astype(np.uint8)
-    tells = joinable(replace(west.grid, heights=heights))
+    heights = np.where(west.index.grid_of(0).occupied, 1, 0).astype(np.uint8)
+    tells = joinable(replace(west.index.grid_of(0), heights=heights))
     assert len(tells.pieces) == len(west.pieces) > 1  # the map is larger than a piece
     for piece, same in zip(tells.pieces, west.pieces, strict=True):
         # Where walls meet, they are solid, and have no points inside.
@@ -48,7 +48,7 @@ def test_a_map_that_tells_heights_is_cut_in_the_same_pieces() -> None:
 @pytest.mark.parametrize("lidar_asked", [True, False])
 def test_tables_of_a_lidar_do_not_part_it_from_a_laser(lidar_asked: bool) -> None:
     """They contradict its free space if nothing tells at which heights they stand."""
-    tables = with_tables(west.grid)
+    tables = with_tables(west.index.grid_of(0))
     flat = replace(tables, heights=None)
     told, untold = (
         join_maps(*((joinable(grid), east) if lidar_asked else (east, joinable(grid))))
