@@ -31,7 +31,7 @@ from pc2grid.submaps.submaps import divide
 from signature.config import Config
 from signature.session.keyframes import Keyframe, KeyframePoints, Keyframes, Track
 from signature.session.local_maps import CAMERA_LOCAL_MAPS, LOCAL_MAPS
-from signature.session.loops import LoopCloser
+from signature.session.loops import LoopCloser, SessionRecognizer
 from signature.session.part_maps import (
     check_followed,
     draw_parts,
@@ -39,7 +39,6 @@ from signature.session.part_maps import (
     part_reports,
     with_track_warnings,
 )
-from signature.session.recognition import SessionRecognizer
 
 if TYPE_CHECKING:
     from pc2grid.io.recording import Log

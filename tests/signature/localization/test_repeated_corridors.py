@@ -11,8 +11,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from signature.config import Config
 from signature.session.keyframes import Keyframe, Keyframes
-from signature.session.loops import LoopCloser
-from signature.session.recognition import SessionRecognizer
+from signature.session.loops import LoopCloser, SessionRecognizer
 from tests.helpers.simulated_drives import look, plan
 
 PITCH_M, APART_M, STEP_M = 7.0, 16.0, 0.3

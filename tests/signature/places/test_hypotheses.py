@@ -23,8 +23,7 @@ from signature.places.hypotheses import (
 )
 from signature.places.prior import Prior
 from signature.places.query import query_of
-from signature.session.loops import PlaceMap
-from signature.session.recognition import RecognitionParameters, SessionRecognizer
+from signature.session.loops import PlaceMap, RecognitionParameters, SessionRecognizer
 from tests.helpers.simulated_drives import building, office, office_part, with_tables
 
 CENTER_M = (3.0, -2.0)
