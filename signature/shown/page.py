@@ -8,7 +8,7 @@ frame of each session. The page shows
   before y;
 - the answer: the walls of the query at each hypothesis, coloured by what the map shows there;
 - why the best place, and why not the next one: for each view of the query the histograms that can be drawn on
-  those of the map, and the log-likelihood ratio that `signature.places.index` adds up.
+  those of the map, and the log-likelihood ratio that `signature.places.places` adds up.
 
 Nothing here decides.
 """
@@ -44,7 +44,7 @@ from signature.database import SessionInfo, SubmapDatabase, open_database
 from signature.freespace import PATH_BINS, freespace_nodes, freespace_seen, visibility_graph
 from signature.localization.answer import Answer
 from signature.paper import SignatureTable, score_matrix
-from signature.places.index import POSES
+from signature.places.places import POSES
 from signature.shown.picture import (
     FURNITURE,
     PALETTE,

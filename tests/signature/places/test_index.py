@@ -10,8 +10,7 @@ from pc2grid.geometry import SE2
 from pc2grid.model import OccupancyGrid
 from pc2grid.simulate import office_floorplan
 from signature.config import RelocalizeConfig, ShortlistBy
-from signature.places.index import PlaceBlock, PlaceIndex, best_headings
-from signature.places.places import ORDER, SQUARE_M, Places
+from signature.places.places import ORDER, SQUARE_M, PlaceBlock, PlaceIndex, Places, best_headings
 from signature.places.query import Query, QueryMap
 from signature.shown.page import compare_views
 from tests.helpers.simulated_drives import building, drive, office
