@@ -76,8 +76,7 @@ if TYPE_CHECKING:
     )
     from signature.localization.answer import Answer as Answer
     from signature.localization.localizer import Localizer as Localizer
-    from signature.places.map_index import MapIndex as MapIndex
-    from signature.places.prior import Prior as Prior
+    from signature.places.map_index import MapIndex as MapIndex, Prior as Prior
     from signature.session.build import (
         build_map as build_map,
         build_maps as build_maps,
@@ -123,7 +122,7 @@ _HOMES = {
     "Answer": "signature.localization.answer",
     "Found": "signature.shown.page",
     "MapIndex": "signature.places.map_index",
-    "Prior": "signature.places.prior",
+    "Prior": "signature.places.map_index",
     "Localizer": "signature.localization.localizer",
 }
 __all__ = ["__version__", *_HOMES]

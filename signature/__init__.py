@@ -55,8 +55,7 @@ if TYPE_CHECKING:
         describe as signature_of,  # noqa: F401
         distances as distances,
     )
-    from signature.places.map_index import MapIndex as MapIndex
-    from signature.places.prior import Prior as Prior
+    from signature.places.map_index import MapIndex as MapIndex, Prior as Prior
     from signature.sessions import (
         add_session as add_session,
         build_session as build_session,
@@ -82,7 +81,7 @@ _HOMES = {
     "MapIndex": "signature.places.map_index",
     "PoseCheck": "signature.localization.pose_check",
     "check_pose": "signature.localization.pose_check",
-    "Prior": "signature.places.prior",
+    "Prior": "signature.places.map_index",
     "Localizer": "signature.localization.localizer",
     "locate_map": "signature.localization.localizer",
     "add_session": "signature.sessions",

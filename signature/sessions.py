@@ -37,8 +37,7 @@ from signature.localization.answer import Answer, corrected_path
 from signature.localization.localizer import Localizer, locate_map
 from signature.localization.pose_check import PoseCheck
 from signature.paper import Signature, describe
-from signature.places.map_index import MapIndex
-from signature.places.prior import Prior
+from signature.places.map_index import MapIndex, Prior
 from signature.session.build import build_maps, longest_of
 from signature.session.part_maps import lost_warnings
 from signature.shown.page import Found

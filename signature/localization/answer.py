@@ -25,7 +25,7 @@ from pc2grid.matching.score import Fit
 from pc2grid.model import Health, OccupancyGrid, Trajectory
 from signature.database.protocol import BuildingFrame, Label
 from signature.places.hypotheses import HYPOTHESES, SAME, is_inside
-from signature.places.prior import drifted
+from signature.places.map_index import drifted
 
 Status = Literal["located", "ambiguous", "not_found"]
 SpaceStatus = Literal["agrees", "unsure", "contradicts"]

@@ -34,8 +34,7 @@ from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
 from signature.localization.localizer import MOST_KEPT, Localizer
 from signature.localization.posterior import kept
-from signature.places.map_index import MapIndex
-from signature.places.prior import Prior
+from signature.places.map_index import MapIndex, Prior
 
 CheckStatus = Literal["fine", "lost", "unsure"]
 

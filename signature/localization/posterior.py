@@ -84,8 +84,7 @@ from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, Unfit, registe
 from pc2grid.matching.score import Fit, score_fit
 from signature.localization.answer import LIKELY, Answer, Place, PoseInSpace, SpaceStatus, State, Status
 from signature.places.hypotheses import HYPOTHESES, SIGMAS, agree, more_exact, one_place
-from signature.places.map_index import MapIndex
-from signature.places.prior import drifted
+from signature.places.map_index import MapIndex, drifted
 from signature.places.query import QueryInSpace, QueryMap
 
 

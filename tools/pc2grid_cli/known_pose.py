@@ -24,8 +24,7 @@ from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.localization.answer import pose_text
 from signature.localization.pose_check import PoseCheck, check_pose
-from signature.places.map_index import MapIndex
-from signature.places.prior import Prior
+from signature.places.map_index import MapIndex, Prior
 from signature.sessions import about_query, open_database_or_map, query_config, tracked
 
 

@@ -35,8 +35,7 @@ from signature.join.building import map_of
 from signature.localization.answer import Answer, answer_in_building, pose_text
 from signature.localization.localizer import Follower, Localizer, ResetPolicy
 from signature.localization.pose_check import PoseCheck, PoseWatch
-from signature.places.map_index import MapIndex
-from signature.places.prior import Prior
+from signature.places.map_index import MapIndex, Prior
 from signature.sessions import query_config
 
 ResultT = TypeVar("ResultT")

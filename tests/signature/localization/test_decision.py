@@ -15,8 +15,7 @@ from signature.config import Config, RelocalizeConfig
 from signature.localization.answer import Answer
 from signature.localization.localizer import Localizer
 from signature.localization.posterior import POSTERIOR, decide, slip_of
-from signature.places.map_index import MapIndex
-from signature.places.prior import Prior
+from signature.places.map_index import MapIndex, Prior
 from signature.places.query import Query, QueryMap
 from tests.helpers.simulated_drives import TWINS, building, drive, office
 

@@ -19,7 +19,7 @@ from signature.localization import localizer as follower_module
 from signature.localization.answer import Answer, Place, fits_changed
 from signature.localization.localizer import Follower, Localizer
 from signature.localization.posterior import Belief, decide, weighed
-from signature.places.prior import Prior
+from signature.places.map_index import Prior
 from signature.places.query import query_of
 from tests.helpers.simulated_drives import building, drive, office, plan
 

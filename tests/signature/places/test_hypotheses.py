@@ -21,7 +21,7 @@ from signature.places.hypotheses import (
     distinct,
     fitted,
 )
-from signature.places.prior import Prior
+from signature.places.map_index import Prior
 from signature.places.query import query_of
 from signature.session.loops import PlaceMap, RecognitionParameters, SessionRecognizer
 from tests.helpers.simulated_drives import building, office, office_part, with_tables
