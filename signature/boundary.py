@@ -119,12 +119,7 @@ def shares(at: NDArray[np.int64], valid: NDArray[np.bool_], bins: int) -> F64:
     """Return which share of the valid entries of each row of `at` (N, M) lies in each bin, (N, bins); all 0
     without a valid entry."""
     rows = np.arange(len(at))[:, None] * bins
-    counts = np.bincount((rows + at)[valid], minlength=len(at) * bins)
-    return as_shares(counts.reshape(len(at), bins))
-
-
-def as_shares(counts: NDArray[np.number]) -> F64:
-    """Return counts (N, bins) as shares of their row; all 0 stays all 0."""
+    counts = np.bincount((rows + at)[valid], minlength=len(at) * bins).reshape(len(at), bins)
     return np.asarray(counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0), np.float64)
 
 

@@ -7,14 +7,13 @@ each other.
 
 from __future__ import annotations
 
-import functools
 import math
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pc2grid.geometry import F32, F64, I64, BoolGrid, cells_of
+from pc2grid.geometry import F32, F64, I64, cells_of
 from pc2grid.libraries import compiled
 from pc2grid.model import OccupancyGrid, Submap
 from pc2grid.submaps.junction_graph import ROUNDING, sample_evenly, skeleton_of
@@ -49,17 +48,12 @@ def freespace_nodes(submap: Submap, config: SignatureConfig) -> I64:
     """
     grid = submap.grid
     block = max(1, round(config.freespace_cell_m / grid.resolution_m))
-    free = _all_in_blocks(grid.free, block)
+    height, width = (side // block for side in grid.cells.shape)  # incomplete blocks at the edges are dropped
+    whole = grid.free[: height * block, : width * block].reshape(height, block, width, block)
+    free = np.asarray(whole.all(axis=(1, 3)))
     cell_m = block * grid.resolution_m
     skeleton = skeleton_of(free, cell_m, config.freespace_clearance_m, config.freespace_thinning)
     return sample_evenly(cells_of(skeleton), config.freespace_spacing_m / cell_m) * block + block // 2
-
-
-def _all_in_blocks(mask: BoolGrid, block: int) -> BoolGrid:
-    """Return which blocks of block x block cells are all set; incomplete blocks at the edges are dropped."""
-    height, width = mask.shape[0] // block * block, mask.shape[1] // block * block
-    rows = functools.reduce(np.logical_and, [mask[k:height:block] for k in range(block)])
-    return np.asarray(functools.reduce(np.logical_and, [rows[:, k:width:block] for k in range(block)]))
 
 
 def freespace_graph(submap: Submap, config: SignatureConfig = SignatureConfig()) -> nx.Graph:

@@ -394,6 +394,11 @@ def session_of_map(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
     """Make a session of a map, in the frame of that map and without a trajectory."""
     no_poses = Trajectory(stamps_ns=np.empty(0, np.int64), T_session_base=np.empty((0, 4, 4)))
     graph, submaps = divide(drawn.grid, config.partition)
+    voxel_m, points = config.projection.points_voxel_m, None
+    if voxel_m is not None and len(drawn.level_points_m):  # of a cloud or mesh; never finer than the map
+        cloud = VoxelCloud(max(voxel_m, config.projection.resolution_m))
+        cloud.add(drawn.level_points_m)
+        points = PointMap.of(cloud.points_m(), cloud.edge_m, cloud.corner_m)
     return SessionMap(
         session=name,
         sensor="map",
@@ -401,19 +406,9 @@ def session_of_map(drawn: DrawnMap, name: str, config: Config) -> SessionMap:
         submaps=submaps,
         trajectory=no_poses,
         graph=graph,
-        points=_points(drawn, config),
+        points=points,
         report=ReadReport(warnings=drawn.warnings),
     )
-
-
-def _points(drawn: DrawnMap, config: Config) -> PointMap | None:
-    """Return the points of a cloud or mesh in space, if they are to be kept; never finer than the map."""
-    voxel_m = config.projection.points_voxel_m
-    if voxel_m is None or not len(drawn.level_points_m):
-        return None
-    cloud = VoxelCloud(max(voxel_m, config.projection.resolution_m))
-    cloud.add(drawn.level_points_m)
-    return PointMap.of(cloud.points_m(), cloud.edge_m, cloud.corner_m)
 
 
 def digest_of(path: Path, config: Config) -> str:

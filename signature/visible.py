@@ -33,28 +33,23 @@ _AT_ONCE = 4096
 """Isovists whose pairs are in memory at the same time."""
 
 
-def parts() -> dict[str, slice]:
-    """Return which columns of `seen_signatures` belong to which of the three signatures."""
-    sizes = {
-        "boundary": RANGE_BINS + 1 + sum(len(rim_columns(rim)) for rim in RIMS),
-        "freespace": PATH_BINS + DETOUR_BINS + len(STEPS_M) + 1,
-        "symmetry": len(BESIDE) + 2 + len(QUANTILES) + 1,
-    }
-    ends = np.cumsum(list(sizes.values())).tolist()
-    return {name: slice(end - size, end) for (name, size), end in zip(sizes.items(), ends, strict=True)}
-
-
-def signature_columns() -> slice:
-    """Return all columns of the three signatures; the last one, the share of rays that were seen, is left
-    out."""
-    return slice(0, -1)
+_SIZES = {
+    "boundary": RANGE_BINS + 1 + sum(len(rim_columns(rim)) for rim in RIMS),
+    "freespace": PATH_BINS + DETOUR_BINS + len(STEPS_M) + 1,
+    "symmetry": len(BESIDE) + 2 + len(QUANTILES) + 1,
+}
+_ENDS = np.cumsum(list(_SIZES.values())).tolist()
+PARTS = {name: slice(end - size, end) for (name, size), end in zip(_SIZES.items(), _ENDS, strict=True)}
+"""Which columns of `seen_signatures` belong to which of the three signatures."""
+WITHOUT_SHARE = slice(0, -1)
+"""All columns of the three signatures; the last one, the share of rays that were seen, is left out."""
 
 
 def seen_signatures(ranges_m: F32, ends: NDArray[np.int8], sight_m: float) -> F32:
     """Return the signatures of what was seen, side by side, and the share that was seen: (N, K) float32.
 
     ranges_m, ends : (N, B) of isovists, as of `pc2grid.submaps.submaps.look_around` with `sight_m`, B a
-    multiple of 8. The columns of each signature are those of `parts`. Histograms are square roots of shares,
+    multiple of 8. The columns of each signature are those of `PARTS`. Histograms are square roots of shares,
     so that their Euclidean distance is that of Hellinger, and 0 where nothing was seen. The last column is
     the share of the rays, 0..1, whose ends are known.
     """
@@ -84,7 +79,7 @@ CLEARANCE_M = 0.5 * LATTICE_M
 """A viewpoint is at least so far from walls and unknown cells: what is nearest to it is free."""
 SIGNATURE_UNITS = np.iinfo(np.uint8).max
 """Units of a column of a signature up to 1."""
-SIGNATURE_COLUMNS = 1 + max(part.stop for part in parts().values())
+SIGNATURE_COLUMNS = 1 + _ENDS[-1]
 """Columns of the three signatures of what was seen, and of the share that was seen."""
 
 

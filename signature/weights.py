@@ -29,7 +29,7 @@ import numpy as np
 
 from pc2grid.geometry import F32, F64, I64, frozen_arrays
 from pc2grid.io.atomic import replace_file
-from signature.visible import parts, signature_columns
+from signature.visible import PARTS, WITHOUT_SHARE
 
 DIMENSIONS = 24
 """Length of the vectors. On real windows of buildings that were left out, 48, 96 and all, which is
@@ -48,7 +48,7 @@ _FOLDS = 8
 the pairs that weights are learned from are nearer to each other than those of another building."""
 _TOO_LITTLE = 0.15
 """Share of the rays; a view that has seen less is not used to learn how much a distance says."""
-COMBINATIONS = tuple(c for n in (1, 2, 3) for c in itertools.combinations(parts(), n))
+COMBINATIONS = tuple(c for n in (1, 2, 3) for c in itertools.combinations(PARTS, n))
 """The names of all combinations of the signatures; the last one is all three."""
 _FILE = Path(__file__).with_name("statistics.npz")
 
@@ -96,9 +96,9 @@ class SeenStatistics:
     def without_spreads(pairs: Pairs) -> SeenStatistics:
         """Return the moments that the weights are made of, alone."""
         enough = (pairs.queries[:, -1] >= _LEAST_SEEN) & (pairs.same[:, -1] >= _LEAST_SEEN)
-        queries, same = (rows[enough][:, signature_columns()].astype(np.float64) for rows in pairs[:2])
+        queries, same = (rows[enough][:, WITHOUT_SHARE].astype(np.float64) for rows in pairs[:2])
         apart = (queries - queries.mean(axis=0)) - (same - same.mean(axis=0))
-        places = np.concatenate((pairs.other[:, signature_columns()], same)).astype(np.float64)
+        places = np.concatenate((pairs.other[:, WITHOUT_SHARE], same)).astype(np.float64)
         every = places - places.mean(axis=0)
         return SeenStatistics(
             query_mean=queries.mean(axis=0),
@@ -110,11 +110,11 @@ class SeenStatistics:
 
     def columns(self, names: Sequence[str] = ()) -> I64:
         """Return the columns of the signatures `names`, by default of all."""
-        return np.concatenate([np.r_[part] for name, part in parts().items() if not names or name in names])
+        return np.concatenate([np.r_[part] for name, part in PARTS.items() if not names or name in names])
 
     def spread(self, names: Sequence[str] = ()) -> Spread:
         """Return the evidence of the distance by some of the signatures."""
-        chosen = tuple(name for name in parts() if not names or name in names)
+        chosen = tuple(name for name in PARTS if not names or name in names)
         a, b, c, d, e, one, two = self.spreads[COMBINATIONS.index(chosen)].tolist()
         return Spread(one_place=(a, b, c), two_places=(d, e), one_shape=one, two_shape=two)
 
@@ -155,7 +155,7 @@ class SeenWeights:
     @staticmethod
     def of(statistics: SeenStatistics, names: Sequence[str] = ()) -> SeenWeights:
         """Return the best weights of the signatures `names`, by default of all of
-        `signature.visible.parts`."""
+        `signature.visible.PARTS`."""
         from scipy.linalg import eigh
 
         columns = statistics.columns(names)
@@ -167,11 +167,11 @@ class SeenWeights:
 
     def of_queries(self, signatures: F32) -> F32:
         """Return vectors (N, D) of views of queries, given as (N, K)."""
-        return np.asarray((signatures[:, signature_columns()] - self.query_mean) @ self.matrix, np.float32)
+        return np.asarray((signatures[:, WITHOUT_SHARE] - self.query_mean) @ self.matrix, np.float32)
 
     def of_places(self, signatures: F32) -> F32:
         """Return vectors (N, D) of places of maps, given as (N, K)."""
-        return np.asarray((signatures[:, signature_columns()] - self.place_mean) @ self.matrix, np.float32)
+        return np.asarray((signatures[:, WITHOUT_SHARE] - self.place_mean) @ self.matrix, np.float32)
 
 
 learned = functools.cache(SeenStatistics.load)

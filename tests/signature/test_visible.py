@@ -17,10 +17,10 @@ from signature.freespace import DETOUR_BINS, PATH_BINS, path_lengths, seen_nodes
 from signature.visible import (
     AROUND_M,
     LATTICE_M,
+    PARTS,
     PROFILE_BEARINGS,
     SIGNATURE_COLUMNS,
     SeenPlaces,
-    parts,
     seen_signatures,
     viewpoints_of,
 )
@@ -52,7 +52,7 @@ def test_turning_a_view_changes_nothing() -> None:
 
 def test_each_histogram_is_a_share_of_what_was_seen() -> None:
     found = seen_signatures(*random_views(), SIGHT_M)
-    columns = parts()
+    columns = PARTS
     assert found.shape[1] == columns["symmetry"].stop + 1
     squares = found.astype(np.float64) ** 2
     ranges = RANGE_BINS + 1

@@ -7,7 +7,7 @@ import pytest
 
 from pc2grid.geometry import F32
 from signature import weights as seen_likelihood
-from signature.visible import parts
+from signature.visible import PARTS
 from signature.weights import (
     DIMENSIONS,
     Pairs,
@@ -19,7 +19,7 @@ from signature.weights import (
 )
 
 SPREAD = SeenStatistics.load().spread()
-COLUMNS = parts()["symmetry"].stop
+COLUMNS = PARTS["symmetry"].stop
 
 
 def made_up_pairs(count: int = 3000) -> Pairs:
@@ -64,7 +64,7 @@ def test_statistics_come_back_from_their_file(tmp_path: Path) -> None:
 
 def test_each_signature_has_weights_of_its_own() -> None:
     assert seen_weights().matrix.shape == (COLUMNS, DIMENSIONS)
-    for name, part in parts().items():
+    for name, part in PARTS.items():
         alone = seen_weights(name).matrix
         assert alone[part].any() and not np.delete(alone, np.r_[part], axis=0).any()
 
