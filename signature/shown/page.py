@@ -313,6 +313,10 @@ def _bands(poses: Trajectory, info: SessionInfo) -> list[list[float]]:
 def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dict[str, Any]:
     document = answer.to_json()
     pose = document["pose"]
+    sigmas = None
+    if answer.covariance is not None and answer.session is not None:
+        resolution_m = database.session(answer.session).resolution_m
+        sigmas = deviation(answer.covariance, resolution_m, database.config().partition.radius_m)
     compared = agreements(answer, database)
     # The wall points are the same for all hypotheses; only what the map says about them differs.
     walls_m = compared[0].points_m if compared else np.empty((0, 2))
@@ -320,7 +324,7 @@ def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dic
         "status": answer.status,
         "session": answer.session,
         "pose": pose and {key: pose[key] for key in ("x", "y", "yaw")},
-        "deviation": None if pose is None else _short(_deviation(answer, database), 4),
+        "deviation": None if sigmas is None else _short(sigmas, 4),
         "confidence": round(answer.confidence, 4),
         "accept": answer.accept,
         "space": document["in_space"],
@@ -343,12 +347,6 @@ def _answer(answer: Found, database: SubmapDatabase, truth_m: F64 | None) -> dic
         "path": runs(answer.poses, answer.local_map.resolution_m),
         "truth": [] if truth_m is None else _short(np.ravel(truth_m), 2),
     }
-
-
-def _deviation(answer: Answer, database: SubmapDatabase) -> tuple[float, float, float]:
-    assert answer.covariance is not None and answer.session is not None
-    (info,) = database.sessions([answer.session])
-    return deviation(answer.covariance, info.resolution_m, database.config().partition.radius_m)
 
 
 def deviation(covariance: F64, resolution_m: float, radius_m: float) -> tuple[float, float, float]:
@@ -468,7 +466,7 @@ def why_here(answer: Answer, database: SubmapDatabase) -> dict[str, Any] | None:
     views : where they lie in the query's frame. told_apart : the number of the view whose likelihoods differ
     most between the two, of those that stand on free floor at both. places : of each, the number of its
     hypothesis and for each view `log_ratio`, and [query, map] of each of the three signatures of
-    `DrawnSignatures`.
+    `described`.
     """
     if not answer.places or not answer.views_m:
         return None
@@ -489,47 +487,30 @@ def why_here(answer: Answer, database: SubmapDatabase) -> dict[str, Any] | None:
         "places": [
             {
                 "hypothesis": number,
-                "views": [_document(view) for view in views],
+                "views": [
+                    {
+                        "log_ratio": None if view.log_ratio is None else round(view.log_ratio, 2),
+                        **{n: [_short(side[n], 3) for side in (view.query, view.map)] for n in view.query},
+                    }
+                    for view in views
+                ],
             }
             for number, views in compared
         ],
     }
 
 
-def _document(view: ComparedView) -> dict[str, Any]:
-    names = ("boundary", "freespace", "symmetry")
-    drawn = {name: [_short(getattr(side, name), 3) for side in (view.query, view.map)] for name in names}
-    return {"log_ratio": None if view.log_ratio is None else round(view.log_ratio, 2)} | drawn
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DrawnSignatures:
-    """What is seen from one point, as shares that a person can read.
-
-    boundary : (Nb + 2,) of pairs of wall points by their distance, in equal bins up to twice the limit of
-        sight; then of pairs of which one ray, and of which both, meet no wall within sight.
-    freespace : (Nf,) of pairs of free places by the length of the shortest path, in equal bins up to twice
-        the limit of sight.
-    symmetry : (B,) agreement of the walls with their mirror image, 0..1, at axes pi k / B from the map's x.
-    """
-
-    boundary: F64
-    freespace: F64
-    symmetry: F64
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComparedView:
     """One view of a query where a hypothesis puts it.
 
-    at_m : (x, y) in the query's frame. log_ratio : natural logarithm of the ratio of the likelihoods that
-    both show one place, and that they show two, no less than `PoseParameters.least`; None where the map has
-    no free floor, which counts as 0.
+    query, map : the signatures of both there, see `described`. log_ratio : natural logarithm of the ratio of
+    the likelihoods that both show one place, and that they show two, no less than `PoseParameters.least`;
+    None where the map has no free floor, which counts as 0.
     """
 
-    at_m: tuple[float, float]
-    query: DrawnSignatures
-    map: DrawnSignatures
+    query: dict[str, F64]
+    map: dict[str, F64]
     log_ratio: float | None
 
 
@@ -550,31 +531,38 @@ def compare_views(
     points_m = np.array(views_m, np.float64)
     turned = round(T_map_query.yaw * PROFILE_BEARINGS / math.pi)
     there_m = T_map_query.apply(points_m)
-    own, at_own = _described(query, points_m, sight_m, turned)
-    theirs, at_theirs = _described(grid, there_m, sight_m, 0)
+    own, at_own = described(query, points_m, sight_m, turned)
+    theirs, at_theirs = described(grid, there_m, sight_m, 0)
     weights = seen_weights()
     squared = ((weights.of_queries(at_own) - weights.of_places(at_theirs)) ** 2).sum(axis=1)
     ratios = seen_spread().log_ratio(squared, 2.0 - at_own[:, -1] - at_theirs[:, -1])
     counted = np.maximum(ratios, POSES.least).tolist()
     return tuple(
-        ComparedView(at_m=view, query=mine, map=other, log_ratio=ratio if free else None)
-        for view, mine, other, ratio, free in zip(
-            views_m, own, theirs, counted, grid.look_up(grid.free, there_m, outside=False), strict=True
+        ComparedView(query=mine, map=other, log_ratio=ratio if free else None)
+        for mine, other, ratio, free in zip(
+            own, theirs, counted, grid.look_up(grid.free, there_m, outside=False), strict=True
         )
     )
 
 
-def _described(
+def described(
     grid: OccupancyGrid, points_m: F64, sight_m: float, turned: int
-) -> tuple[list[DrawnSignatures], F32]:
-    """Return what is seen from points (N, 2), and the signatures (N, K); the axes of symmetry are counted on
-    by `turned`."""
+) -> tuple[list[dict[str, F64]], F32]:
+    """Return what is seen from points (N, 2), as shares that a person can read, and the signatures (N, K).
+
+    boundary : (Nb + 2,) of pairs of wall points by their distance, in equal bins up to twice the limit of
+        sight; then of pairs of which one ray, and of which both, meet no wall within sight.
+    freespace : (Nf,) of pairs of free places by the length of the shortest path, in equal bins up to twice
+        the limit of sight.
+    symmetry : (B,) agreement of the walls with their mirror image, 0..1, at axes pi k / B from the map's x,
+        counted on by `turned`.
+    """
     ranges_m, ends = look_around(grid, points_m, sight_m, bearings=PROFILE_BEARINGS)
     boundary = boundary_seen(ranges_m, ends, sight_m)[:, RANGE_BINS + 1 :][:, : PAIR_BINS + 2] ** 2
     freespace = freespace_seen(ranges_m, ends, sight_m)[:, :PATH_BINS] ** 2
     symmetry = np.roll(mirror_agreement(ranges_m, ends), turned, axis=1)
     drawn = [
-        DrawnSignatures(boundary=one, freespace=two, symmetry=three)
+        {"boundary": one, "freespace": two, "symmetry": three}
         for one, two, three in zip(boundary, freespace, symmetry, strict=True)
     ]
     return drawn, seen_signatures(ranges_m, ends, sight_m)

@@ -96,7 +96,9 @@ def draw_session(path: Path, database: SubmapDatabase, session: str) -> None:
     grid = database.grid(session)
     figure, (axes,) = _panels(_known(grid))
     _draw_map(axes, grid)
-    _draw_submaps(axes, database, session)
+    centers_m = database.signatures(session).center_m
+    label = counted(len(centers_m), "submap centre")
+    axes.plot(centers_m[:, 0], centers_m[:, 1], ".", color=GREEN, ms=4, label=label)
     poses = database.trajectory(session).planar()
     if len(poses):
         axes.plot(poses[:, 0], poses[:, 1], color=BLUE, lw=1.2, label="path of the map's robot")
@@ -299,12 +301,6 @@ def _draw_map(axes: Any, grid: OccupancyGrid) -> None:
     )
     if grid.things.any():
         axes.plot([], [], "s", color=_colour(FURNITURE), label=_FURNITURE_LABEL)
-
-
-def _draw_submaps(axes: Any, database: SubmapDatabase, session: str) -> None:
-    centers = database.signatures(session).center_m
-    label = counted(len(centers), "submap centre")
-    axes.plot(centers[:, 0], centers[:, 1], ".", color=GREEN, ms=4, label=label)
 
 
 def _draw_way(axes: Any, way: Trajectory | None) -> None:

@@ -164,11 +164,11 @@ def quarter_turned(grid: OccupancyGrid) -> tuple[OccupancyGrid, SE2]:
 def test_where_the_query_is_the_map_all_signatures_coincide_and_speak_for_one_place() -> None:
     for view in compare_views(office(), VIEWS_M, office(), SE2(), SIGHT_M):
         for name in ("boundary", "freespace", "symmetry"):
-            np.testing.assert_array_equal(getattr(view.query, name), getattr(view.map, name))
+            np.testing.assert_array_equal(view.query[name], view.map[name])
         assert view.log_ratio is not None and view.log_ratio > 0.0
         # Histograms are shares of all pairs.
-        assert math.isclose(view.map.boundary.sum(), 1.0, abs_tol=1e-6)
-        assert math.isclose(view.map.freespace.sum(), 1.0, abs_tol=1e-6)
+        assert math.isclose(view.map["boundary"].sum(), 1.0, abs_tol=1e-6)
+        assert math.isclose(view.map["freespace"].sum(), 1.0, abs_tol=1e-6)
 
 
 def test_a_turned_query_is_shown_in_the_frame_of_the_map() -> None:
@@ -176,8 +176,8 @@ def test_a_turned_query_is_shown_in_the_frame_of_the_map() -> None:
     views_m = [tuple(xy) for xy in T_map_query.inverse().apply(np.array(VIEWS_M)).tolist()]
     for view in compare_views(grid, views_m, office(), T_map_query, SIGHT_M):
         # Rays start at cells, so that a turned one may end 5 cm earlier, of the 0.5 m of a mirrored pair.
-        assert np.abs(view.query.symmetry - view.map.symmetry).mean() < 0.05
-        assert np.abs(view.query.boundary - view.map.boundary).sum() < 0.3
+        assert np.abs(view.query["symmetry"] - view.map["symmetry"]).mean() < 0.05
+        assert np.abs(view.query["boundary"] - view.map["boundary"]).sum() < 0.3
         assert view.log_ratio is not None and view.log_ratio > 0.0
 
 
