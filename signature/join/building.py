@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import compress, product
 from typing import TYPE_CHECKING, cast
@@ -437,7 +437,6 @@ def _bend(nodes: F64, solved: F64, T: SE2) -> Deformation:
     return bend if largest_m(bend) >= _LEAST_M else ()
 
 
-Cells = NDArray[np.int8]
 _SQUARE_M = 1.0
 """Side of the squares for which a bend is computed."""
 
@@ -460,8 +459,13 @@ def building_map(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> Occupan
     """
     whole = _around(maps)
     cells = whole.cells.copy()
-    for window, told in _drawn(maps, whole):
-        here = cells[window]
+    for grid, frame in maps:
+        at = whole.to_cell(_corners(grid, frame))
+        low, high = at.min(axis=0).clip(min=0), at.max(axis=0).clip(max=np.array(cells.shape) - 1)
+        rows, columns = np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
+        there_m = _as_drawn(frame, whole, rows, columns).reshape(-1, 2)
+        told = grid.look_up(grid.cells, there_m, UNKNOWN).reshape(len(rows), len(columns))
+        here = cells[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
         sure = (told >= OCCUPIED_FROM) | (told == THING) | ((told >= FREE) & (told < FREE_BELOW))
         chosen = sure | ((told != UNKNOWN) & (here == UNKNOWN))
         here[chosen] = told[chosen]
@@ -484,18 +488,6 @@ def _around(maps: Sequence[tuple[OccupancyGrid, BuildingFrame]]) -> OccupancyGri
         origin_m=(float(x), float(y)),
         height_m=None if None in heights_m else float(np.mean([grid.height_m for grid, _ in maps])),
     )
-
-
-def _drawn(
-    maps: Sequence[tuple[OccupancyGrid, BuildingFrame]], whole: OccupancyGrid
-) -> Iterator[tuple[tuple[slice, slice], Cells]]:
-    """Yield for each map the window of the grid that it lies in, and its values for the cells there."""
-    for grid, frame in maps:
-        rows, columns = _covered(whole, _corners(grid, frame))
-        there_m = _as_drawn(frame, whole, rows, columns).reshape(-1, 2)
-        told = grid.look_up(grid.cells, there_m, UNKNOWN)
-        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        yield window, told.reshape(len(rows), len(columns))
 
 
 def _corners(grid: OccupancyGrid, frame: BuildingFrame) -> F64:
@@ -527,15 +519,6 @@ def _as_drawn(
     bent_m = (frame.to_session(points_m) - T_session_building.apply(points_m)).reshape(squares.shape)
     height, width = squares.shape[:2]
     return straight_m + cv2.resize(bent_m, (n * width, n * height))[: len(rows), : len(columns)]
-
-
-def _covered(
-    whole: OccupancyGrid, corners_m: NDArray[np.float64]
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the rows and columns of a grid that a box with these corners may lie in."""
-    at = whole.to_cell(corners_m)
-    low, high = at.min(axis=0).clip(min=0), at.max(axis=0).clip(max=np.array(whole.cells.shape) - 1)
-    return np.arange(low[0], high[0] + 1), np.arange(low[1], high[1] + 1)
 
 
 def floors_of(database: SubmapDatabase, frames: Mapping[str, BuildingFrame]) -> tuple[tuple[str, ...], ...]:
