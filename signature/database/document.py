@@ -387,7 +387,11 @@ def check_submaps(submaps: SubmapArrays, info: SessionInfo, grid: OccupancyGrid 
     """Check that submap ids increase, submaps lie on their map, and histograms have the sum 1, or 0."""
     _as_many(len(submaps), info.submaps, "submaps")
     _each(np.diff(submaps.submap_id, prepend=-1) > 0, "the number of submap {} does not increase")
-    _on_map(submaps.center_m, grid, "submap")
+    if grid is not None:  # on the map, or within a cell of it
+        low_m = np.array(grid.origin_m) - grid.resolution_m
+        high_m = low_m + grid.resolution_m * np.array([grid.cells.shape[1] + 2, grid.cells.shape[0] + 2])
+        inside = (submaps.center_m >= low_m) & (submaps.center_m <= high_m)
+        _each(inside.all(axis=1), "submap {} lies outside its map")
     check_bins(submaps, info.provenance.config)
     for name in ("boundary", "freespace"):
         check_histograms(getattr(submaps, name), name)
@@ -446,17 +450,6 @@ def _edge(edge_m: float) -> None:
 def _near(points_m: F64 | F32, what: str) -> None:
     """Check that points (N, 2 or 3) are at plausible coordinates."""
     _each((np.abs(points_m) <= FARTHEST_M).all(axis=1), f"{what} {{}} is more than {FARTHEST_M:g} m away")
-
-
-def _on_map(points_m: F64, grid: OccupancyGrid | None, what: str) -> None:
-    """Check that points (N, 2) lie on a map, or within a cell of it."""
-    if grid is None:
-        return
-    cell_m = grid.resolution_m
-    low_m = np.array(grid.origin_m) - cell_m
-    high_m = low_m + cell_m * np.array([grid.cells.shape[1] + 2, grid.cells.shape[0] + 2])
-    inside = (points_m >= low_m) & (points_m <= high_m)
-    _each(inside.all(axis=1), f"{what} {{}} lies outside its map")
 
 
 def _as_many(found: int, stored: int, what: str) -> None:
