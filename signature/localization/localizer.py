@@ -106,8 +106,12 @@ class Localizer:
         begin = time.perf_counter()
         if not self.take(registered, planar_scan, may_search=may_search):
             return None
+        # A prior without a time is about none of these scans.
+        timeless = self.index.prior is not None and self.index.prior.stamp_ns is None
+        index = self.index.whole or self.index if timeless else self.index
+        index = index.at_look(int(self.query.path_m / index.config.step_m))
         try:
-            self.query, answer = self.search(self.query, index=self._on_the_way)
+            self.query, answer = self.search(self.query, index=index)
         except NoScans:  # the scans since the start, or since registration was lost, show nothing
             return None
         query, T_odometry_base = self.query.map(), registered.scan.T_odom_base
@@ -119,7 +123,7 @@ class Localizer:
             T_odometry_base=None if T_odometry_base is None else SE2.from_matrix(T_odometry_base),
             elapsed_s=time.perf_counter() - begin,
         )
-        self._answer = answer if self._on_the_way is self.index else None
+        self._answer = answer if index is self.index else None
         return answer
 
     def take(self, registered: RegisteredScan, planar_scan: PlanarScan, *, may_search: bool = True) -> bool:
@@ -157,14 +161,6 @@ class Localizer:
         self.query.restart()
         self._answer = None
         self._history.clear()
-
-    @property
-    def _on_the_way(self) -> MapIndex:
-        """Return the index that is searched before the answer is asked: a prior without a time is about none
-        of these scans."""
-        timeless = self.index.prior is not None and self.index.prior.stamp_ns is None
-        index = self.index.whole or self.index if timeless else self.index
-        return index.at_look(int(self.query.path_m / self.index.config.step_m))
 
     def search(
         self,

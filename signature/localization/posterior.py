@@ -110,12 +110,7 @@ class PosteriorParameters:
 POSTERIOR = PosteriorParameters()
 
 PriorOf = Callable[[Sequence[Fit]], float]
-"""Prior of a place by its fits, relative to that of "not in this map"."""
-
-
-def anywhere(fits: Sequence[Fit]) -> float:
-    """Return the prior of a place without any knowledge."""
-    return 1.0
+"""Prior of a place by its fits, relative to that of "not in this map"; None: nothing is known, 1."""
 
 
 # --- Evidence ---
@@ -125,7 +120,7 @@ def decide(
     index: MapIndex,
     query: QueryMap,
     known: tuple[Fit, ...] = (),
-    prior_of: PriorOf = anywhere,
+    prior_of: PriorOf | None = None,
 ) -> tuple[Answer, tuple[Fit, ...]]:
     """Return the answer by the hypotheses that are known and those that the search finds, and all of these.
     The search ends when one place is certain and the right one likely searched, or when what is left has too
@@ -139,7 +134,7 @@ def decide(
 
 
 def judge(
-    index: MapIndex, query: QueryMap, hypotheses: Iterable[Fit], prior_of: PriorOf = anywhere
+    index: MapIndex, query: QueryMap, hypotheses: Iterable[Fit], prior_of: PriorOf | None = None
 ) -> Answer:
     """Return the answer by the places of the hypotheses and what their walls tell.
 
@@ -152,7 +147,7 @@ def judge(
     rivals = [fits[0] for fits, left in zip(every, inside, strict=True) if not left]
     inside = [fits for fits in inside if fits]
     evidence = evidence_of([fits[0] for fits in inside], query.likeness, rivals)
-    mass = masses(evidence, [prior_of(fits) for fits in inside])
+    mass = masses(evidence, 1.0 if prior_of is None else [prior_of(fits) for fits in inside])
     places = tuple(
         Place(fits=inside[k], mass=float(mass[k])) for k in np.argsort(-mass, kind="stable").tolist()
     )
