@@ -165,12 +165,49 @@ class LoopCloser:
         self._keyframes.append(keyframe)
 
     def finish(self) -> OptimisedKeyframes:
-        """Return the optimised poses; without a loop and without walls they are the tracked ones."""
+        """Solve the pose graph, measure its overlaps again, and solve it again. Return its poses, loops and
+        parts; without a loop and without walls the poses are the tracked ones.
+
+        The overlaps were measured on local maps that are bent by the drift of tracking. So these are drawn
+        again with the optimised poses, and compared again.
+        """
         if not len(self._keyframes):
-            return OptimisedKeyframes.empty()
+            none = np.empty(0, np.int64)
+            return OptimisedKeyframes(
+                none, np.empty((0, 3)), (), segments=none, parts=none, anchors=none, sigma_m=np.empty(0)
+            )
         self._complete_local_map()
         self._close_recognized(self._place_maps.finish())
-        return self._optimised_keyframes()
+        self._solve()
+        self._local_maps.redraw(self._optimised())
+        self._edges = [self._again(edge) if edge.loop else edge for edge in self._edges]
+        solution = self._solve()
+        scans, anchors, runs = self._keyframes.scans, self._local_maps.anchors, self._local_maps.runs
+        loops = tuple(
+            Loop(
+                older=scans[anchors[edge.first]],
+                newer=scans[anchors[edge.second]],
+                T_older_newer=edge.T_first_second,
+                information=edge.information,
+                accepted=bool(accepted),
+            )
+            for edge, accepted in zip(self._edges, solution.accepted, strict=True)
+            if edge.loop
+        )
+        begins = [number > 0 and run.start in self._keyframes.restarts for number, run in enumerate(runs)]
+        segment = np.cumsum(begins, dtype=np.int64)
+        edges = list(compress(self._edges, solution.accepted))
+        part = connected(segment, [edge for edge in edges if edge.loop])
+        lengths = [len(run) for run in runs]
+        return OptimisedKeyframes(
+            scans=np.array(scans, dtype=np.int64),
+            poses=self._optimised(),
+            loops=loops,
+            segments=np.repeat(segment, lengths),
+            parts=np.repeat(part, lengths),
+            anchors=np.array(anchors, dtype=np.int64),
+            sigma_m=self._sigmas(edges, part),
+        )
 
     # --- during the session -------------------------------------------------------------------------------
 
@@ -287,44 +324,6 @@ class LoopCloser:
         return max(math.exp(-0.5 * off**2), sys.float_info.min)
 
     # --- at the end of the session ------------------------------------------------------------------------
-
-    def _optimised_keyframes(self) -> OptimisedKeyframes:
-        """Solve the pose graph, measure its overlaps again, and solve it again; returns its poses, loops and
-        parts.
-
-        The overlaps were measured on local maps that are bent by the drift of tracking. So these are drawn
-        again with the optimised poses, and compared again.
-        """
-        self._solve()
-        self._local_maps.redraw(self._optimised())
-        self._edges = [self._again(edge) if edge.loop else edge for edge in self._edges]
-        solution = self._solve()
-        scans, anchors, runs = self._keyframes.scans, self._local_maps.anchors, self._local_maps.runs
-        loops = tuple(
-            Loop(
-                older=scans[anchors[edge.first]],
-                newer=scans[anchors[edge.second]],
-                T_older_newer=edge.T_first_second,
-                information=edge.information,
-                accepted=bool(accepted),
-            )
-            for edge, accepted in zip(self._edges, solution.accepted, strict=True)
-            if edge.loop
-        )
-        begins = [number > 0 and run.start in self._keyframes.restarts for number, run in enumerate(runs)]
-        segment = np.cumsum(begins, dtype=np.int64)
-        edges = list(compress(self._edges, solution.accepted))
-        part = connected(segment, [edge for edge in edges if edge.loop])
-        lengths = [len(run) for run in runs]
-        return OptimisedKeyframes(
-            scans=np.array(scans, dtype=np.int64),
-            poses=self._optimised(),
-            loops=loops,
-            segments=np.repeat(segment, lengths),
-            parts=np.repeat(part, lengths),
-            anchors=np.array(anchors, dtype=np.int64),
-            sigma_m=self._sigmas(edges, part),
-        )
 
     def _again(self, edge: Edge) -> Edge:
         """Measure an overlap again on the present local maps; return the old one if they no longer

@@ -12,10 +12,9 @@ still, or measures no turns. A map of such a recording may be mirrored (`odometr
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,12 +60,6 @@ class OptimisedKeyframes:
     anchors: I64
     sigma_m: F64
 
-    @classmethod
-    def empty(cls) -> OptimisedKeyframes:
-        """Return those of a session without keyframes."""
-        none = np.empty(0, np.int64)
-        return cls(none, np.empty((0, 3)), (), segments=none, parts=none, anchors=none, sigma_m=np.empty(0))
-
 
 def interpolate_corrections(tracked: F64, known: Sequence[int] | I64, corrected: F64) -> F64:
     """Return poses (N, 3) of all scans, from the corrected poses (K, 3) of those of them that are `known`.
@@ -108,7 +101,7 @@ def draw_parts(
     """
     part, T_part_base = _optimised(track.trajectory, closed)
     floors_m = _level(T_part_base, part, closed, np.array(keyframes.above_floor_m))
-    everywhere = dataclasses.replace(track.trajectory, T_session_base=T_part_base)
+    everywhere = replace(track.trajectory, T_session_base=T_part_base)
     drawn = []
     for number in range(int(part.max(initial=0)) + 1):
         scans = np.flatnonzero(part == number)
@@ -278,7 +271,7 @@ def _loops_within(loops: Iterable[Loop], scans: I64) -> tuple[Loop, ...]:
     """Return the loops between two of the scans, numbered within these."""
     number = {scan: k for k, scan in enumerate(scans.tolist())}
     return tuple(
-        dataclasses.replace(loop, older=number[loop.older], newer=number[loop.newer])
+        replace(loop, older=number[loop.older], newer=number[loop.newer])
         for loop in loops
         if loop.older in number and loop.newer in number
     )
@@ -332,7 +325,7 @@ def part_reports(
     left_out = sum(len(part.trajectory) for part in parts) - elsewhere - first.scans_read
     skipped = {"in a part too short to be of use": left_out} if left_out else {}
     division = [division_warning(session, parts, kept, walls_changed_ns)] if len(parts) > 1 else []
-    first = dataclasses.replace(
+    first = replace(
         report,
         scans_read=report.scans_read - elsewhere,
         scans_skipped={**report.scans_skipped, **skipped, **first.scans_skipped},
@@ -415,7 +408,7 @@ def with_track_warnings(report: ReadReport, track: Track) -> ReadReport:
     poses = track.readings if track.with_odometry else track.trajectory.T_session_base
     warnings += height_warnings(poses[:, 2, 3], track.trajectory)
     warnings += odometry_warnings(track.trajectory, track.readings)
-    return dataclasses.replace(report, scans_skipped=skipped, warnings=tuple(warnings))
+    return replace(report, scans_skipped=skipped, warnings=tuple(warnings))
 
 
 def height_warnings(heights_m: F64, trajectory: Trajectory) -> list[str]:
