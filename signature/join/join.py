@@ -14,11 +14,10 @@
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import combinations, islice
 from typing import Literal, TypeVar
 
@@ -102,7 +101,7 @@ def compare_pairs(
         (a, b) for a, b in combinations(infos, 2) if {a, b} & {*only} and not labels[a].contradicts(labels[b])
     ]
 
-    @functools.cache
+    @cache
     def prepared(name: str) -> JoinableMap:
         return JoinableMap(MapIndex.of_session(database, name))
 

@@ -15,12 +15,11 @@ direction. The positions of a query's views relative to each other do contain on
 
 from __future__ import annotations
 
-import functools
-import itertools
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -289,7 +288,7 @@ class Places:
         self._chance = np.random.default_rng(0)
         self._areas_m2 = np.asarray(areas_m2, np.float64)
         self._session_of_block = np.unique(table.session_index)
-        self.ground = functools.lru_cache(_KEPT_SESSIONS)(self._ground)
+        self.ground = lru_cache(_KEPT_SESSIONS)(self._ground)
         self._indexes: dict[ShortlistBy, PlaceIndex] = {}
         self._ordered: tuple[Sequence[View], RelocalizeConfig, Order] | None = None
 
@@ -355,7 +354,7 @@ class Places:
         """Yield the isovists of the places of each session: as stored, or else computed from the map."""
         starts = np.flatnonzero(np.diff(self.table.session_index, prepend=-1)).tolist()
         # Those of a session are side by side.
-        for begin, end in itertools.pairwise((*starts, len(self.table))):
+        for begin, end in pairwise((*starts, len(self.table))):
             session = int(self.table.session_index[begin])
             seen = self._stored(session)
             if seen is None or (len(seen) and seen.place[-1] >= end - begin):
