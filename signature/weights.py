@@ -1,4 +1,4 @@
-"""How likely two descriptions of what was seen show one place; weights of the bins, learned and explained.
+"""How likely two descriptions of what was seen show one place; weights of the bins, explained.
 
 Two sensors at one place do not fill the bins equally, and some bins differ more than others. A bin tells
 places apart if it varies more between places than between sensors. Both were measured: `within`, the
@@ -21,14 +21,13 @@ import functools
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
 from pc2grid.geometry import F32, F64, I64, frozen_arrays
-from pc2grid.io.atomic import replace_file
 from signature.visible import PARTS, WITHOUT_SHARE
 
 DIMENSIONS = 24
@@ -40,29 +39,12 @@ and 0.02 less recall among the first 20 of real windows that were left out, whic
 _RIDGE = 1e-3
 """Added to the diagonal of `within`, as a share of its mean, so that bins that are always empty stay finite;
 0.01 and 0.0001 gave the same."""
-_LEAST_SEEN = 0.7
-"""The weights are learned from pairs of which both sides have seen at least this share of the rays. With 0.5
-and 0.3, 0.01 and 0.03 fewer of real views that were left out found their place among the first 20."""
-_FOLDS = 8
-"""How much a distance says is learned from each of so many parts of the pairs, by weights of the others:
-the pairs that weights are learned from are nearer to each other than those of another building."""
-_TOO_LITTLE = 0.15
-"""Share of the rays; a view that has seen less is not used to learn how much a distance says."""
 COMBINATIONS = tuple(c for n in (1, 2, 3) for c in itertools.combinations(PARTS, n))
 """The names of all combinations of the signatures; the last one is all three."""
 _FILE = Path(__file__).with_name("statistics.npz")
 
 
 FloatArray = TypeVar("FloatArray", F32, F64)
-
-
-class Pairs(NamedTuple):
-    """Signatures of what was seen, (N, K) each: views of `queries`, places of maps at the `same` points, and
-    places of `other` buildings."""
-
-    queries: F32
-    same: F32
-    other: F32
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,28 +68,6 @@ class SeenStatistics:
     between: F64
     spreads: F64
 
-    @staticmethod
-    def of(pairs: Pairs, *, seed: int = 0) -> SeenStatistics:
-        """Measure the weights from pairs of which enough was seen, and the evidence of a distance from all;
-        pairs of one recording are side by side."""
-        return replace(SeenStatistics.without_spreads(pairs), spreads=fitted_spreads(pairs, seed=seed))
-
-    @staticmethod
-    def without_spreads(pairs: Pairs) -> SeenStatistics:
-        """Return the moments that the weights are made of, alone."""
-        enough = (pairs.queries[:, -1] >= _LEAST_SEEN) & (pairs.same[:, -1] >= _LEAST_SEEN)
-        queries, same = (rows[enough][:, WITHOUT_SHARE].astype(np.float64) for rows in pairs[:2])
-        apart = (queries - queries.mean(axis=0)) - (same - same.mean(axis=0))
-        places = np.concatenate((pairs.other[:, WITHOUT_SHARE], same)).astype(np.float64)
-        every = places - places.mean(axis=0)
-        return SeenStatistics(
-            query_mean=queries.mean(axis=0),
-            place_mean=places.mean(axis=0),
-            within=apart.T @ apart / len(apart),
-            between=every.T @ every / len(every),
-            spreads=np.zeros((len(COMBINATIONS), 7)),
-        )
-
     def columns(self, names: Sequence[str] = ()) -> I64:
         """Return the columns of the signatures `names`, by default of all."""
         return np.concatenate([np.r_[part] for name, part in PARTS.items() if not names or name in names])
@@ -118,15 +78,9 @@ class SeenStatistics:
         a, b, c, d, e, one, two = self.spreads[COMBINATIONS.index(chosen)].tolist()
         return Spread(one_place=(a, b, c), two_places=(d, e), one_shape=one, two_shape=two)
 
-    def save(self, path: Path) -> None:
-        """Write them to an .npz file."""
-        content = {field.name: getattr(self, field.name).astype(np.float32) for field in fields(self)}
-        with replace_file(path) as draft, draft.open("wb") as file:
-            np.savez_compressed(file, **content)
-
     @staticmethod
     def load(path: Path = _FILE) -> SeenStatistics:
-        """Read what `save` has written; by default the statistics that come with the program, which
+        """Read what the laboratory has learned; by default the statistics that come with the program, which
         `pc2grid_lab.fit.queries` has learned from real logs."""
         with np.load(path, allow_pickle=False) as file:
             return SeenStatistics(
@@ -185,46 +139,6 @@ def seen_weights(*names: str) -> SeenWeights:
     return SeenWeights.of(learned(), names)
 
 
-def fitted_spreads(pairs: Pairs, *, seed: int = 0) -> F64:
-    """Return the numbers of a `Spread` for each of `COMBINATIONS`, (7, 7), by pairs in `_FOLDS` parts, see
-    there."""
-    rng, every = np.random.default_rng(seed), np.arange(len(pairs.queries))
-    folds = []
-    for held in np.array_split(every, _FOLDS):
-        queries, same = (np.delete(rows, held, axis=0) for rows in pairs[:2])
-        learned_from = SeenStatistics.without_spreads(Pairs(queries, same, pairs.other))
-        folds.append((Pairs(pairs.queries[held], pairs.same[held], pairs.other), learned_from))
-
-    def spread(names: Sequence[str]) -> Spread:
-        found = [squared_distances(held, SeenWeights.of(by, names), rng) for held, by in folds]
-        return Spread.of(*(np.concatenate(each) for each in zip(*found, strict=True)))
-
-    return np.array([spread(names).numbers() for names in COMBINATIONS])
-
-
-def squared_distances(
-    pairs: Pairs, weights: SeenWeights, rng: np.random.Generator
-) -> tuple[F64, F64, F64, F64]:
-    """Return the arguments of `Spread.of`: of pairs at one place, and of as many at two, with a place of
-    another building, and of another pair.
-
-    Pairs of which one side has seen less than `_TOO_LITTLE` are left out.
-    """
-    kept = (pairs.queries[:, -1] > _TOO_LITTLE) & (pairs.same[:, -1] > _TOO_LITTLE)
-    queries, same = pairs.queries[kept], pairs.same[kept]
-    other = pairs.other[rng.integers(0, len(pairs.other), len(queries))]
-    shuffled = same[rng.permutation(len(same))]
-    at = weights.of_queries(queries)
-    squared, hidden = zip(
-        *(
-            (((at - weights.of_places(rows)) ** 2).sum(axis=1), 2.0 - queries[:, -1] - rows[:, -1])
-            for rows in (same, other, shuffled)
-        ),
-        strict=True,
-    )
-    return squared[0], hidden[0], np.concatenate(squared[1:]), np.concatenate(hidden[1:])
-
-
 @functools.cache
 def seen_spread(*names: str) -> Spread:
     """Return the evidence of the distance by the signatures of `seen_weights`."""
@@ -242,31 +156,6 @@ class Spread:
     two_places: tuple[float, float]
     one_shape: float
     two_shape: float
-
-    @staticmethod
-    def of(one_place: F64, one_hidden: F64, two_places: F64, two_hidden: F64) -> Spread:
-        """Return the spread of squared distances (N,) and (M,) with the hidden shares u of each.
-
-        The variance of the logarithm of a gamma variable of shape k is about 1 / (k - 1/2).
-        """
-        one = np.polynomial.polynomial.polyfit(one_hidden, np.log(one_place), 2)
-        two = np.polynomial.polynomial.polyfit(two_hidden, np.log(two_places), 1)
-        rest = [
-            np.log(squares) - np.polynomial.polynomial.polyval(hidden, fit)
-            for squares, hidden, fit in ((one_place, one_hidden, one), (two_places, two_hidden, two))
-        ]
-        a, b, c = one.tolist()
-        first, second = two.tolist()
-        return Spread(
-            one_place=(a, b, c),
-            two_places=(first, second),
-            one_shape=float(1.0 / rest[0].var() + 0.5),
-            two_shape=float(1.0 / rest[1].var() + 0.5),
-        )
-
-    def numbers(self) -> tuple[float, ...]:
-        """Return all seven, in the order of the fields."""
-        return (*self.one_place, *self.two_places, self.one_shape, self.two_shape)
 
     def log_ratio(self, squared: FloatArray, hidden: FloatArray) -> FloatArray:
         """Return natural logarithm of the ratio of the likelihoods of one place and of two, elementwise, as

@@ -45,6 +45,7 @@ from pc2grid.observer import TimeSpan
 from pc2grid.simulate import office_floorplan
 from pc2grid.simulate.scene import covered, place_clutter
 from pc2grid.submaps.submaps import look_around, submap_centers
+from pc2grid_lab.fit.weights import Pairs, learned_from, save
 from pc2grid_lab.peers.programs import recorded_site
 from pc2grid_lab.recordings.catalogue import UNTIL_S, Catalogue, Pair
 from pc2grid_lab.recordings.judging import Judge, config_of
@@ -59,7 +60,6 @@ from signature.localization.posterior import fit_in_space, terms_in_space
 from signature.places.map_index import MapIndex
 from signature.places.query import Query, QueryInSpace, QueryMap, best_observed
 from signature.visible import PROFILE_BEARINGS, seen_signatures, viewpoints_of
-from signature.weights import Pairs, SeenStatistics
 
 ASKED_AFTER_M = (1.0, 3.0, 8.0)
 """Metres of travel after which a query is asked."""
@@ -375,7 +375,7 @@ def weights(
     ]
     known = windows(replace(catalogue, pairs=tuple(asked)), folder)
     pairs = pairs_of(chain(in_logs(drawn, config), in_maps(known, folder)), floors, config)
-    SeenStatistics.of(pairs).save(out)
+    save(learned_from(pairs), out)
     print(f"{out}: learned from {len(pairs.queries):,} pairs and {len(pairs.other):,} other places")
 
 
