@@ -196,8 +196,8 @@ class Localizer:
         answer = self._belief.in_its_map(answer)
         clock.lap("decide")
         # The points.
-        if query.in_space is not None:
-            answer = settle_in_space(answer, query.in_space, index.surface, index.config.accept)
+        if query.in_space is not None and index.surface_of is not None:
+            answer = settle_in_space(answer, query.in_space, index.surface_of, index.config.accept)
             clock.lap("in_space")
         return query, _told(index, answer, self._history, clock)
 

@@ -182,7 +182,8 @@ class MapIndex:
 
     prior : what is known of the pose beforehand, see `within`. whole : the index without it.
     look : number of the look of a robot that is searched for, see `at_look`.
-    surface_of : the points of the maps, which answers are refined and checked with; None if they have none.
+    surface_of : the points of the map of a session, by its index, which answers are refined and checked with;
+        None if no map has any.
     grid_of, map_of : the map of a session, by its index, and the same prepared to be searched; `True` : for a
         query in a lower plane, to which its free space is unknown.
     """
@@ -190,7 +191,7 @@ class MapIndex:
     prior: Prior | None = None
     whole: MapIndex | None = None
     look: int | None = None
-    surface_of: Callable[[str], MapSurface | None] | None = None
+    surface_of: Callable[[int], MapSurface | None] | None = None
 
     def __init__(
         self,
@@ -281,12 +282,12 @@ class MapIndex:
                 index.grid_of(number)
         if any(info.points for info in infos.values()):
 
-            def surface_of(name: str) -> MapSurface | None:
-                points = database.points(name)
+            @lru_cache(index.config.hypotheses)  # as many as an answer may compare
+            def surface_of(number: int) -> MapSurface | None:
+                points = database.points(index.sessions[number])
                 return None if points is None else MapSurface(points)
 
-            # As many as an answer may compare.
-            index.surface_of = lru_cache(index.config.hypotheses)(surface_of)
+            index.surface_of = surface_of
         with observer.step("prepare places"):
             index.places.index(on_progress=observer.on_progress)
         if lacking:
@@ -302,10 +303,6 @@ class MapIndex:
         table, config = database.signatures(session).places, database.config()
         table = replace(table, session_index=np.zeros(len(table), np.int32))
         return MapIndex([session], database.grid, table, config, config, stored=database.seen_places)
-
-    def surface(self, session_index: int) -> MapSurface | None:
-        """Return the points of a session in space; None if it has none."""
-        return None if self.surface_of is None else self.surface_of(self.sessions[session_index])
 
     def within(self, prior: Prior) -> MapIndex:
         """Return an index of which only places that the prior allows are answers; all that is prepared is

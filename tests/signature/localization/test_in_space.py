@@ -265,7 +265,7 @@ ALONE = building({"high": office()})
 
 def with_points(index: MapIndex, maps: Mapping[str, MapSurface]) -> MapIndex:
     index = copy.copy(index)
-    index.surface_of = maps.get
+    index.surface_of = lambda number: maps.get(index.sessions[number])
     return index
 
 

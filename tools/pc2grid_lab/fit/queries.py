@@ -240,8 +240,8 @@ def _in_space(
     index: MapIndex, query: QueryInSpace, place: Fit, truth: Mapping[str, SE2]
 ) -> dict[str, Any] | None:
     """Return the evidence of the points for a place, and how far it is then from the truth; None: nothing."""
-    assert query.T_odom_base is not None
-    fit = fit_in_space(query, index.surface(place.session_index), place)
+    assert query.T_odom_base is not None and index.surface_of is not None
+    fit = fit_in_space(query, index.surface_of(place.session_index), place)
     if fit == "unknown":
         return None
     T_map_query = place.T_map_query if fit == "left" else SE2.from_matrix(fit.T_map_query)
