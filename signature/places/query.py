@@ -123,13 +123,8 @@ class QueryInSpace:
         self.T_odom_base: F64 | None = None
 
     def add(self, registered: RegisteredScan) -> None:
-        """Take in the next scan. One that registration was lost on begins anew."""
+        """Take in the next scan, which registration was not lost on."""
         scan, T = registered.scan, registered.T_session_base
-        if registered.health is Health.LOST:
-            self._views.clear()
-            self.T_odom_base = None
-            self._spacing = ViewSpacing()
-            return
         self.T_odom_base = T
         # A scan may come without its points, which `Follower` leaves out.
         if not len(scan.points_m) or not self._spacing.takes(registered):
@@ -197,8 +192,6 @@ class Query:
 
     def add(self, registered: RegisteredScan, planar_scan: PlanarScan) -> None:
         """Take in the next scan; forget what lies more than `relocalize.window_m` of travel back."""
-        if self.in_space is not None:
-            self.in_space.add(registered)
         pose = SE2.from_matrix(registered.T_session_base)
         self._drawn = None
         self.first_ns = registered.scan.stamp_ns if self.first_ns is None else self.first_ns
@@ -209,6 +202,8 @@ class Query:
             self._newest = Keyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
             return
         self.lost_scans = 0
+        if self.in_space is not None:
+            self.in_space.add(registered)
         path_m, weak = 0.0, registered.health is not Health.FINE
         if self._keyframes and self._newest is not None:
             weak |= self._newest.weak and self._newest is not self._keyframes[-1]

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pc2grid.clouds.planar_scan import BEARINGS
 from pc2grid.geometry import SE2, invert_pose
 from pc2grid.matching.icp_in_space import MapSurface, SpatialFit, register_in_space
 from pc2grid.matching.score import Fit
@@ -19,9 +20,9 @@ from signature.localization.localizer import Follower, Localizer
 from signature.localization.posterior import SPACE, log_odds_in_space, masses_of, settle_in_space, weighed
 from signature.places.hypotheses import HYPOTHESES
 from signature.places.map_index import MapIndex
-from signature.places.query import QueryInSpace
+from signature.places.query import Query, QueryInSpace
 from tests.helpers.building_clouds import box_surface
-from tests.helpers.simulated_drives import building, office
+from tests.helpers.simulated_drives import building, flat_scan, office
 from tests.helpers.tall_offices import lidar_drive, points as points_of
 from tests.helpers.twin_rooms import APART_M, HEIGHTS_M, drive, furnished_map, twin_map
 
@@ -243,14 +244,15 @@ def test_without_points_on_a_side_nothing_changes(points: MapSurface) -> None:
 
 
 def test_what_was_seen_before_tracking_was_lost_is_forgotten() -> None:
-    query, scans = QueryInSpace(Config()), drive(HEIGHTS_M[0])
+    query, scans = Query(Config(), Config().relocalize, in_space=True), drive(HEIGHTS_M[0])
+    planar_scan = flat_scan(np.ones((1, 2)), np.ones(BEARINGS))
     for registered, _ in scans[:3]:
-        query.add(registered)
-    assert len(query.views) == 3
-    query.add(replace(scans[3][0], health=Health.LOST))
-    assert query.views == () and query.T_odom_base is None
-    query.add(replace(scans[4][0], scan=replace(scans[4][0].scan, sensor="laser")))
-    assert query.views == ()
+        query.add(registered, planar_scan)
+    assert query.in_space is not None and len(query.in_space.views) == 3
+    query.add(replace(scans[3][0], health=Health.LOST), planar_scan)
+    assert query.in_space.views == () and query.in_space.T_odom_base is None
+    query.add(replace(scans[4][0], scan=replace(scans[4][0].scan, sensor="laser")), planar_scan)
+    assert query.in_space.views == ()
 
 
 # --- A running robot's points, where the database has points, too ---
