@@ -8,9 +8,9 @@ pose graph over the local maps gives the corrected poses (the scan-to-submap con
 correction is interpolated, because the error of tracking grows gradually.
 
 After a long way a loop may be farther off than this search reaches. For these the session is its own
-database: the map of some metres of travel (`PlaceMap`) has a few described places, and a `SessionRecognizer`
-looks it up among those before it as a query in a database (`signature.places.hypotheses.look_up`), without
-using their poses. Signatures propose, the alignment of walls in both directions verifies.
+database: a place map, of some metres of travel, has a few described places, and a `SessionRecognizer` looks
+it up among those before it as a query in a database (`signature.places.hypotheses.look_up`), without using
+their poses. Signatures propose, the alignment of walls in both directions verifies.
 
 A recognition alone may be wrong with high confidence: buildings repeat themselves, and some look alike when
 they are turned by 180 degrees. What the recognizer does not know is that the drift of tracking is bounded. So
@@ -40,7 +40,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from pc2grid.estimation.line_map import evenly
-from pc2grid.geometry import F64, I64, SE2, frozen_arrays
+from pc2grid.geometry import F64, I64, SE2
 from pc2grid.matching.evidence import LEFT, Evidence, evidence_of, masses
 from pc2grid.matching.search import SearchMap
 from pc2grid.model import Loop, OccupancyGrid
@@ -476,12 +476,8 @@ class PlaceMaps:
         keyframes, poses = self._local_maps.keyframes(
             range(runs[place[0]].start, runs[place[-1]].stop), self._local_maps.anchors[_middle(place)]
         )
-        place_map = PlaceMap(
-            grid=grid_of(zip(keyframes, poses, strict=True), self._projection),
-            poses=np.array([(pose.x, pose.y, pose.yaw) for pose in poses]),
-            scans=np.array([keyframe.index for keyframe in keyframes]),
-        )
-        return self._recognizer.recognize(place_map)
+        grid = grid_of(zip(keyframes, poses, strict=True), self._projection)
+        return self._recognizer.recognize(grid, np.array([(pose.x, pose.y) for pose in poses]))
 
 
 def _middle(numbers: range) -> int:
@@ -504,23 +500,6 @@ class RecognitionParameters:
 
 
 RECOGNITION = RecognitionParameters()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-@frozen_arrays(poses=(np.float64, "K", 3), scans=(np.int64, "K"))
-class PlaceMap:
-    """The map of a few metres of travel, long enough to be recognised.
-
-    The last one of a session may be shorter, and overlap the one before.
-
-    grid : its occupancy grid, in its own frame: the base at one of its keyframes, in the middle.
-    poses : (K, 3) x, y, yaw of its keyframes in the same frame, metres and radians.
-    scans : (K,) number of each keyframe's scan within the session.
-    """
-
-    grid: OccupancyGrid
-    poses: F64
-    scans: I64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -562,11 +541,16 @@ class SessionRecognizer:
         self._map_of = lru_cache(parameters.maps)(lambda number: SearchMap.of(self._grid_of(number)))
         self._places: Places | None = None
 
-    def recognize(self, newest: PlaceMap) -> Sequence[Recognition]:
-        """Return the earlier place maps that look like the newest one, each place with its own evidence."""
-        query = query_of(newest.grid, newest.poses[:, :2], self._made_with, self._config)
+    def recognize(self, grid: OccupancyGrid, path_m: F64) -> Sequence[Recognition]:
+        """Return the earlier place maps that look like the newest one, each place with its own evidence.
+
+        grid : its map, of a few metres of travel, long enough to be recognised; in its own frame, the base at
+        one of its keyframes, in the middle. path_m : (K, 2) its keyframes. The last one of a session may be
+        shorter, and overlap the one before.
+        """
+        query = query_of(grid, path_m, self._made_with, self._config)
         found = [] if self._places is None else self._look_up(query, self._places)
-        self._remember(newest.grid, query)
+        self._remember(grid, query)
         return found
 
     def _look_up(self, query: QueryMap, places: Places) -> list[Recognition]:

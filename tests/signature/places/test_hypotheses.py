@@ -23,7 +23,7 @@ from signature.places.hypotheses import (
 )
 from signature.places.map_index import Prior
 from signature.places.query import query_of
-from signature.session.loops import PlaceMap, RecognitionParameters, SessionRecognizer
+from signature.session.loops import RecognitionParameters, SessionRecognizer
 from tests.helpers.simulated_drives import building, office, office_part, with_tables
 
 CENTER_M = (3.0, -2.0)
@@ -228,19 +228,18 @@ def seen_from(grid: OccupancyGrid, pose: SE2) -> OccupancyGrid:
     return replace(empty, cells=cells)
 
 
-def place_map(grid: OccupancyGrid) -> PlaceMap:
-    poses = np.column_stack((np.linspace(-1.0, 1.0, 9), np.zeros(9), np.zeros(9)))
-    return PlaceMap(grid=grid, poses=poses, scans=np.arange(9))
+PATH_M = np.column_stack((np.linspace(-1.0, 1.0, 9), np.zeros(9)))
+"""Of the keyframes of a place map."""
 
 
 def test_an_earlier_place_is_recognised_and_a_new_one_is_not() -> None:
     recognizer = SessionRecognizer(Config(), RecognitionParameters(maps=2))
-    assert list(recognizer.recognize(place_map(rooms(0)))) == []
+    assert list(recognizer.recognize(rooms(0), PATH_M)) == []
     for index in (1, 2, 3):
-        found = recognizer.recognize(place_map(rooms(index)))
+        found = recognizer.recognize(rooms(index), PATH_M)
         assert all(recognition.evidence.log_odds() < 2.2 for recognition in found)
     again = SE2(0.7, -0.4, 2.0)
-    found = recognizer.recognize(place_map(seen_from(rooms(1), again)))
+    found = recognizer.recognize(seen_from(rooms(1), again), PATH_M)
     best = max(found, key=lambda recognition: recognition.evidence.log_odds())
     assert best.older == 1 and best.evidence.log_odds() > 3.0
     assert math.hypot(best.T_older_newer.x - again.x, best.T_older_newer.y - again.y) < 0.1
@@ -253,7 +252,7 @@ def test_tables_that_were_seen_over_and_under_do_not_hide_an_earlier_place() -> 
     tables, odds = with_tables(rooms(1)), []
     for earlier in (tables, replace(tables, heights=None)):
         recognizer = SessionRecognizer(Config())
-        recognizer.recognize(place_map(earlier))
-        found, *_ = recognizer.recognize(place_map(rooms(1)))
+        recognizer.recognize(earlier, PATH_M)
+        found, *_ = recognizer.recognize(rooms(1), PATH_M)
         odds.append(found.evidence.log_odds())
     assert odds[0] > 4.6 and odds[0] > odds[1] + 2.0

@@ -10,10 +10,11 @@ import pytest
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan
 from pc2grid.geometry import F64, SE2
 from pc2grid.matching.evidence import Evidence
+from pc2grid.model import OccupancyGrid
 from signature.session.graph import Edge, optimise
 from signature.session.keyframes import Keyframe, Keyframes
 from signature.session.local_maps import LocalMap, Overlap
-from signature.session.loops import LoopCloser, LoopParameters, PlaceMap, Recognition
+from signature.session.loops import LoopCloser, LoopParameters, Recognition
 from signature.session.part_maps import OptimisedKeyframes, interpolate_corrections
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.simulated_drives import flat_scan
@@ -108,6 +109,8 @@ def closed(
 ) -> tuple[F64, OptimisedKeyframes]:
     """Settled poses of all keyframes, and the result of loop closure."""
     closer = LoopCloser(Keyframes(), **options)
+    if "recognizer" in options:
+        options["recognizer"].closer = closer
     for k, (pose, planar_scan) in enumerate(zip(poses, planar_scans, strict=True)):
         closer.add(Keyframe(k, planar_scan, pose, restart=k == restart))
     found = closer.finish()
@@ -183,18 +186,21 @@ SURE = Evidence(known_agreement=1.0, compared=100.0, backward=1.0, looked_at=100
 class KnowsTheTruth:
     """A recognizer that knows the true poses of the keyframes, and so of the place maps.
 
-    off : each place is told so often, so far off, and with this evidence.
+    off : each place is told so often, so far off, and with this evidence. closer : asks it.
     """
+
+    closer: LoopCloser
 
     def __init__(self, truth: list[SE2], *off: tuple[SE2, Evidence]) -> None:
         self._truth, self._off = truth, off or ((HERE, SURE),)
-        self.place_maps: list[PlaceMap] = []
+        self.paths_m: list[F64] = []  # of each place map
         self.frames: list[SE2] = []  # true pose of each
 
-    def recognize(self, newest: PlaceMap) -> list[Recognition]:
-        anchor = int(np.flatnonzero(np.abs(newest.poses).sum(axis=1) < 1e-9)[0])
-        self.place_maps.append(newest)
-        self.frames.append(self._truth[newest.scans[anchor]])
+    def recognize(self, grid: OccupancyGrid, path_m: F64) -> list[Recognition]:
+        place = self.closer._place_maps.asked[-1]
+        anchor = self.closer._local_maps.anchors[place[len(place) // 2]]
+        self.paths_m.append(path_m)
+        self.frames.append(self._truth[self.closer._keyframes.scans[anchor]])
         found = []
         for older, frame in enumerate(self.frames[:-1]):
             true = frame.inverse() @ self.frames[-1]
@@ -230,9 +236,9 @@ def test_no_place_map_reaches_across_a_lost_part() -> None:
     recognizer = KnowsTheTruth(truth)
     poses = truth[:35] + [SE2(5.0, 5.0, 1.0) @ pose for pose in truth[35:]]
     closed(poses, [scan_of(pose, BLOCK) for pose in truth], restart=35, recognizer=recognizer)
-    assert recognizer.place_maps
-    for place_map in recognizer.place_maps:
-        assert np.linalg.norm(np.diff(place_map.poses[:, :2], axis=0), axis=1).max() < 1.0
+    assert recognizer.paths_m
+    for path_m in recognizer.paths_m:
+        assert np.linalg.norm(np.diff(path_m, axis=0), axis=1).max() < 1.0
 
 
 # --- Which recognised places become loops ---
