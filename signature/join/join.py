@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 
 from pc2grid.geometry import F32, F64, SE2, frozen_arrays, lever_arm, wrap_angle
-from pc2grid.matching.evidence import EVIDENCE, NO_EVIDENCE, Evidence, evidence_of, masses, with_leads
+from pc2grid.matching.evidence import EVIDENCE, Evidence, evidence_of, masses, with_leads
 from pc2grid.matching.score import Fit, refine, score_fit, self_similarity
 from pc2grid.matching.search import SearchMap
 from pc2grid.matching.walls import LIKELIHOOD, Walls
@@ -151,7 +151,6 @@ class Join:
     covariance : (3, 3) of its x, y, yaw. probability : 0..1, of the transform being right.
     agreement : 0..1, of the walls where both know the ground, the lower one of both directions.
     common_m2 : free ground that both know.
-    rivals : other transforms that were compared, with decoys. evidence : what the probability rests on.
     links : where the pieces of the source lie that agree with the target.
     """
 
@@ -161,8 +160,6 @@ class Join:
     probability: float
     agreement: float
     common_m2: float
-    rivals: int
-    evidence: Evidence
     links: tuple[Link, ...] = ()
 
 
@@ -173,8 +170,6 @@ UNJOINED = Join(
     probability=0.0,
     agreement=0.0,
     common_m2=0.0,
-    rivals=0,
-    evidence=NO_EVIDENCE,
 )
 """Two sessions of which no piece proposes a transform."""
 
@@ -312,8 +307,6 @@ def _judged(
         probability=probability,
         agreement=min(forward, backward),
         common_m2=common_m2,
-        rivals=len(scores) - 1,
-        evidence=evidence,
         links=candidate.links,
     )
 
