@@ -86,7 +86,6 @@ def optimise(
     poses: F64,
     edges: Sequence[Edge],
     walls: Sequence[WallDirection] | None = None,
-    parameters: PoseGraphParameters = POSE_GRAPH,
 ) -> Solution:
     """Optimise poses (N, 3) so that they agree best with the edges; the first pose is fixed.
 
@@ -106,14 +105,14 @@ def optimise(
     i, j, measured, information = _arrays(edges)
     loop = np.array([e.loop for e in edges])
     rows = _unknowns(i, j)
-    damping = parameters.damping * identity(3 * len(poses) - 3, format="csc")
-    limit = parameters.robust_sigmas**2
+    damping = POSE_GRAPH.damping * identity(3 * len(poses) - 3, format="csc")
+    limit = POSE_GRAPH.robust_sigmas**2
     error, jacobian = _linearise(poses, i, j, measured)
     chi2 = np.einsum("ea,eab,eb->e", error, information, error)
     scale = np.maximum(chi2 / limit, 1.0)
     fixed: F64 | None = None
     for _ in range(2):
-        for _ in range(parameters.iterations):
+        for _ in range(POSE_GRAPH.iterations):
             weight = 1.0 / (1.0 + chi2 / (scale * limit)) if fixed is None else fixed
             JtO = jacobian.transpose(0, 2, 1) @ (information * np.where(loop, weight, 1.0)[:, None, None])
             H, g = _normal_equations(poses, rows, JtO, jacobian, error, walls)
@@ -125,10 +124,10 @@ def optimise(
             poses[:, 2] = wrap_angle(poses[:, 2])
             error, jacobian = _linearise(poses, i, j, measured)
             chi2 = np.einsum("ea,eab,eb->e", error, information, error)
-            if scale.max() == 1.0 and np.abs(delta).max() < parameters.converged:
+            if scale.max() == 1.0 and np.abs(delta).max() < POSE_GRAPH.converged:
                 break
-            scale = np.maximum(scale / parameters.annealing, 1.0)
-        fixed = np.minimum(1.0 / (1.0 + chi2 / limit) / parameters.kept, 1.0) ** 3
+            scale = np.maximum(scale / POSE_GRAPH.annealing, 1.0)
+        fixed = np.minimum(1.0 / (1.0 + chi2 / limit) / POSE_GRAPH.kept, 1.0) ** 3
     return Solution(poses, ~loop | (chi2 <= limit))
 
 
@@ -269,9 +268,7 @@ def wall_direction(normal_rad: NDArray[np.floating]) -> WallDirection:
     return WallDirection(float(np.angle(mean)) / 4.0, float(np.abs(mean)))
 
 
-def pull_to_axes(
-    yaw_rad: F64, walls: Sequence[WallDirection], parameters: AxesParameters = AXES
-) -> tuple[F64, F64]:
+def pull_to_axes(yaw_rad: F64, walls: Sequence[WallDirection]) -> tuple[F64, F64]:
     """Return the deviation of the walls of local maps with headings (N,) from the axes, and its information.
 
     Deviations (N,) are in radians, within 45 degrees, positive for headings that are too large; their robust
@@ -281,11 +278,11 @@ def pull_to_axes(
     direction = np.array([wall.direction_rad for wall in walls]) + yaw_rad
     weight = np.array([wall.concentration for wall in walls]) ** 2
     axis_rad = float(np.angle((weight * np.exp(4j * direction)).sum())) / 4.0
-    for _ in range(parameters.rounds):
+    for _ in range(AXES.rounds):
         deviation = _from_axis(direction, axis_rad)
-        robust = weight / (1.0 + (deviation / parameters.robust_rad) ** 2) ** 2
+        robust = weight / (1.0 + (deviation / AXES.robust_rad) ** 2) ** 2
         axis_rad += float((robust * deviation).sum() / max(robust.sum(), np.finfo(float).tiny))
-    return _from_axis(direction, axis_rad), robust / parameters.sigma_rad**2
+    return _from_axis(direction, axis_rad), robust / AXES.sigma_rad**2
 
 
 def _from_axis(direction_rad: F64, axis_rad: float) -> F64:

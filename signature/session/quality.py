@@ -74,16 +74,15 @@ def measure_consistency(
     keyframes: Iterable[Keyframe],
     grid: OccupancyGrid,
     trajectory: Trajectory,
-    parameters: ConsistencyParameters = CONSISTENCY,
 ) -> Consistency:
     """Compare keyframes with the grid that was drawn from them.
 
     trajectory : the poses at which they were drawn; `Keyframe.index` is the number of a pose.
     The keyframes are read one after the other; of each, three numbers stay in memory.
     """
-    clear = _clear_ground(grid, parameters.wall_m)
+    clear = _clear_ground(grid, CONSISTENCY.wall_m)
     drawn = (
-        _drawn(keyframe, SE2.from_matrix(trajectory.T_session_base[keyframe.index]), grid, clear, parameters)
+        _drawn(keyframe, SE2.from_matrix(trajectory.T_session_base[keyframe.index]), grid, clear)
         for keyframe in keyframes
     )
     before, here, after = tee(drawn, 3)
@@ -97,15 +96,15 @@ def measure_consistency(
         return Consistency()
     index, hits, contradicting = np.array(counts, dtype=np.int64).T
     poses = trajectory.planar()[index]
-    shares = _window_shares(poses, hits, contradicting, parameters)
-    contradicted = shares >= parameters.contradicted_from
+    shares = _window_shares(poses, hits, contradicting)
+    contradicted = shares >= CONSISTENCY.contradicted_from
     share_of_keyframes = float(contradicted.mean())
     return Consistency(
         hits_on_free=float(contradicting.sum() / max(hits.sum(), 1)),
         contradicted=share_of_keyframes,
-        bent=share_of_keyframes >= parameters.bent_from,
+        bent=share_of_keyframes >= CONSISTENCY.bent_from,
         stretches=_contradictions(contradicted, shares, poses, trajectory.stamps_ns[index])[
-            : parameters.shown
+            : CONSISTENCY.shown
         ],
     )
 
@@ -158,9 +157,7 @@ class _Drawn:
     on_clear: NDArray[np.bool_]
 
 
-def _drawn(
-    keyframe: Keyframe, pose: SE2, grid: OccupancyGrid, clear: BoolGrid, parameters: ConsistencyParameters
-) -> _Drawn:
+def _drawn(keyframe: Keyframe, pose: SE2, grid: OccupancyGrid, clear: BoolGrid) -> _Drawn:
     """Return the hits within reach, and which of them lie on clear ground."""
     scan = keyframe.planar_scan
     hits_m = pose.apply(scan.hits_m[np.hypot(*(scan.hits_m - scan.origin_m).T) < LOCAL_MAPS.range_m])
@@ -181,13 +178,13 @@ def _confirmed(before: _Drawn | None, scan: _Drawn, after: _Drawn | None, cell_m
     return int(np.count_nonzero(seen_again))
 
 
-def _window_shares(poses: F64, hits: I64, contradicting: I64, parameters: ConsistencyParameters) -> F64:
+def _window_shares(poses: F64, hits: I64, contradicting: I64) -> F64:
     """Return the share of contradicting hits in the window of travel around each of the poses (K, 3)."""
     steps = np.diff(poses, axis=0)
     step_m = np.hypot(steps[:, 0], steps[:, 1]) + TURN_M_PER_RAD * np.abs(wrap_angle(steps[:, 2]))
     travel_m = np.concatenate(([0.0], np.cumsum(step_m)))
-    first = np.searchsorted(travel_m, travel_m - 0.5 * parameters.window_m, side="left")
-    last = np.searchsorted(travel_m, travel_m + 0.5 * parameters.window_m, side="right")
+    first = np.searchsorted(travel_m, travel_m - 0.5 * CONSISTENCY.window_m, side="left")
+    last = np.searchsorted(travel_m, travel_m + 0.5 * CONSISTENCY.window_m, side="right")
     in_window = [np.concatenate(([0], np.cumsum(counts))) for counts in (hits, contradicting)]
     all_hits, all_contradicting = (total[last] - total[first] for total in in_window)
     return np.asarray(all_contradicting / np.maximum(all_hits, 1))
