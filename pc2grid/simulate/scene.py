@@ -10,7 +10,7 @@ their rays, and noise and losses of their readings.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -36,56 +36,22 @@ from pc2grid.settings import ReadConfig
 from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
 from pc2grid.simulate.plan import Passages, outline_mask
 
-# --- meshes and rays ----------------------------------------------------------------------------------
+# --- triangles and rays -------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-@frozen_arrays(vertices_m=(np.float32, "V", 3), triangles=(np.uint32, "T", 3))
-class Mesh:
-    """Triangles in the map frame.
-
-    vertices_m : (V, 3) float32. triangles : (T, 3) uint32, rows of `vertices_m`; seen from both sides.
-    """
-
-    vertices_m: F32
-    triangles: NDArray[np.uint32]
-
-    @staticmethod
-    def join(meshes: Iterable[Mesh]) -> Mesh:
-        """Join meshes into one."""
-        parts = list(meshes)
-        starts = np.cumsum([0] + [len(part.vertices_m) for part in parts])
-        return Mesh(
-            np.concatenate([np.empty((0, 3), np.float32), *(part.vertices_m for part in parts)]),
-            np.concatenate(
-                [
-                    np.empty((0, 3), np.uint32),
-                    *(part.triangles + np.uint32(s) for part, s in zip(parts, starts, strict=False)),
-                ]
-            ),
-        )
+def quads(corners_m: F64) -> F32:
+    """Return faces with four corners (N, 4, 3), in order around each face, as triangles (2 N, 3, 3)."""
+    return np.concatenate((corners_m[:, [0, 1, 2]], corners_m[:, [0, 2, 3]])).astype(np.float32)
 
 
-def quads(corners_m: F64) -> Mesh:
-    """Return flat four-cornered faces (N, 4, 3), corners in order around each face, as a mesh."""
-    first = 4 * np.arange(len(corners_m))[:, None]
-    triangles = np.concatenate((first + np.array([0, 1, 2]), first + np.array([0, 2, 3])))
-    return Mesh(corners_m.reshape(-1, 3).astype(np.float32), triangles.astype(np.uint32))
-
-
-def prism(outline_m: F64, bottom_m: float, top_m: float) -> Mesh:
-    """Extrude a convex outline (N, 2) between two heights, with lid and bottom."""
+def prism(outline_m: F64, bottom_m: float, top_m: float) -> F32:
+    """Return triangles (T, 3, 3) of a convex outline (N, 2) between two heights, with lid and bottom."""
     n = len(outline_m)
-    after = np.roll(outline_m, -1, axis=0)
-    sides = np.empty((n, 4, 3))
-    sides[:, 0, :2] = sides[:, 3, :2] = outline_m
-    sides[:, 1, :2] = sides[:, 2, :2] = after
-    sides[:, :2, 2], sides[:, 2:, 2] = bottom_m, top_m
-    fan = np.column_stack((np.zeros(n - 2), np.arange(1, n - 1), np.arange(2, n))).astype(np.uint32)
-    lids = [
-        Mesh(np.column_stack((outline_m, np.full(n, z))).astype(np.float32), fan) for z in (bottom_m, top_m)
-    ]
-    return Mesh.join([quads(sides), *lids])
+    bottom, top = (np.column_stack((outline_m, np.full(n, z))) for z in (bottom_m, top_m))
+    after = np.roll(np.arange(n), -1)
+    sides = np.stack((bottom, bottom[after], top[after], top), axis=1)
+    fan = np.column_stack((np.zeros(n - 2, np.intp), np.arange(1, n - 1), np.arange(2, n)))
+    return np.concatenate((quads(sides), bottom[fan], top[fan])).astype(np.float32)
 
 
 def _runs(mask: BoolGrid) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
@@ -96,8 +62,10 @@ def _runs(mask: BoolGrid) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray
     return rows, starts, ends
 
 
-def extrude(grid: OccupancyGrid, height_m: float) -> Mesh:
+def extrude(grid: OccupancyGrid, height_m: float) -> F32:
     """Make walls where the grid is occupied, and a floor (z = 0) and ceiling over its whole extent.
+
+    Returns triangles (T, 3, 3).
 
     Faces are made only between an occupied and another cell, and faces in one line are joined: a building of
     a million cells has about ten thousand. Walls reach the ceiling, so they have no top. Unknown cells are
@@ -123,16 +91,20 @@ def extrude(grid: OccupancyGrid, height_m: float) -> Mesh:
 
 
 class Scene:
-    """Casts rays into a mesh (Open3D RaycastingScene, Embree). The constructor loads Open3D."""
+    """Casts rays onto triangles (T, 3, 3), which are seen from both sides (Open3D RaycastingScene, Embree).
 
-    def __init__(self, mesh: Mesh) -> None:
+    The constructor loads Open3D.
+    """
+
+    def __init__(self, triangles_m: F32) -> None:
         from pc2grid.open3d_core import o3d
 
         tensor: Any = o3d.core.Tensor
         self._tensor = tensor
         self._scene: Any = o3d.t.geometry.RaycastingScene()
+        corners = np.arange(3 * len(triangles_m), dtype=np.uint32).reshape(-1, 3)
         # Open3D's tensors need writable memory.
-        self._scene.add_triangles(tensor(mesh.vertices_m.copy()), tensor(mesh.triangles.copy()))
+        self._scene.add_triangles(tensor(triangles_m.reshape(-1, 3).copy()), tensor(corners))
 
     def cast(self, rays: F32) -> F32:
         """Cast rays (N, 6), origin in metres and direction.
@@ -155,17 +127,18 @@ _LATTICE = 1.01  # the points of a lattice are equally far from their neighbours
 class Building:
     """A real building.
 
-    plan : where the robot may drive, in the map frame. shell : surfaces for the rays, in the same frame, with
-    the floor at z = 0. T_map_file : (4, 4), the frame of the file in the map frame.
+    plan : where the robot may drive, in the map frame. shell : (T, 3, 3) triangles for the rays, in the same
+    frame, with the floor at z = 0. T_map_file : (4, 4), the frame of the file in the map frame.
     """
 
     plan: OccupancyGrid
-    shell: Mesh
+    shell: F32
     T_map_file: F64
 
     @staticmethod
-    def of(points_m: NDArray[np.floating], mesh: Mesh | None = None) -> Building:
-        """Make a building of points (N, 3) whose z axis points up, and of the mesh that they lie on, if any.
+    def of(points_m: NDArray[np.floating], mesh: F32 | None = None) -> Building:
+        """Make a building of points (N, 3) whose z axis points up, and of the triangles (T, 3, 3) that they
+        lie on, if any.
 
         Raises MapFileError if they show no floor.
         """
@@ -174,7 +147,7 @@ class Building:
         # The voxels follow the axes of the cloud, in which they may have been a lattice before.
         shell = voxel_faces(points, voxel_m(points)) if mesh is None else mesh
         plan = drivable_plan(transform_points(T_map_file, points))
-        return Building(plan, _moved(shell, T_map_file), T_map_file)
+        return Building(plan, transform_points(T_map_file, shell).astype(np.float32), T_map_file)
 
 
 def load_building(path: str | Path) -> OccupancyGrid | Building:
@@ -189,8 +162,9 @@ def load_building(path: str | Path) -> OccupancyGrid | Building:
         if is_building_file(path) and kind_of(path) == "mesh":
             vertices, triangles = load_mesh(path)
             check_plausible(vertices)
-            mesh = Mesh(vertices.astype(np.float32), triangles.astype(np.uint32))
-            return Building.of(voxel_cloud(sampled(mesh.vertices_m.astype(np.float64), triangles)), mesh)
+            rounded = vertices.astype(np.float32)
+            points = voxel_cloud(sampled(rounded.astype(np.float64), triangles))
+            return Building.of(points, rounded[triangles])
         return Building.of(np.concatenate([np.empty((0, 3)), *building_points(path, ReadConfig())]))
 
 
@@ -204,8 +178,11 @@ def voxel_m(points_m: F64) -> float:
     return max(float(median) * (1.0 if lattice else _SPACINGS), _VOXEL_M)
 
 
-def voxel_faces(points_m: F64, edge_m: float) -> Mesh:
-    """Return the faces between occupied voxels and empty ones. The first point's corner is on the lattice."""
+def voxel_faces(points_m: F64, edge_m: float) -> F32:
+    """Return the faces between occupied voxels and empty ones, as triangles (T, 3, 3).
+
+    The first point's corner is on the lattice.
+    """
     first = points_m.min(axis=0)
     voxels = np.rint((points_m - first) / edge_m).astype(np.int64) + 1
     occupied = np.zeros(voxels.max(axis=0) + 2, bool)
@@ -221,10 +198,6 @@ def voxel_faces(points_m: F64, edge_m: float) -> Mesh:
             corner[..., v] += (-0.5, -0.5, 0.5, 0.5)
             corners.append(corner)
     return quads((np.concatenate(corners) - 1) * edge_m + first)
-
-
-def _moved(mesh: Mesh, T: F64) -> Mesh:
-    return Mesh(transform_points(T, mesh.vertices_m).astype(np.float32), mesh.triangles)
 
 
 # --- sensors ------------------------------------------------------------------------------------------
@@ -374,18 +347,17 @@ class Prism:
 class Furniture:
     """One movable object; people who stand still count as such.
 
-    kind : a key of `FURNITURE`. pose : T_map_object. outline_m : (N, 2) convex hull on the floor, in its
-        frame.
+    pose : T_map_object. outline_m : (N, 2) convex hull on the floor, in its frame.
     """
 
-    kind: str
     pose: SE2
     outline_m: F64
     parts: tuple[Prism, ...]
 
-    def mesh(self) -> Mesh:
-        """Return the triangles in the map frame."""
-        return Mesh.join(prism(self.pose.apply(p.outline_m), p.bottom_m, p.top_m) for p in self.parts)
+    def mesh(self) -> F32:
+        """Return the triangles (T, 3, 3) in the map frame."""
+        parts = [prism(self.pose.apply(p.outline_m), p.bottom_m, p.top_m) for p in self.parts]
+        return np.concatenate(parts)
 
 
 def place_clutter(
@@ -415,7 +387,7 @@ def place_clutter(
         x, y = (float(v) for v in grid.to_point(cell)[0])
         square = rng.random() < _SQUARE_SHARE
         yaw = rng.choice(4) * math.pi / 2 if square else rng.uniform(-math.pi, math.pi)
-        candidate = Furniture(name, SE2(x, y, float(yaw)), outline, tuple(parts))
+        candidate = Furniture(SE2(x, y, float(yaw)), outline, tuple(parts))
         reach = float(np.linalg.norm(outline, axis=1).max())
         if any(math.hypot(x - px, y - py) < _KEPT_FREE_M + reach for px, py in keep_free_m):
             continue
@@ -439,11 +411,6 @@ def _rectangle(x0: float, y0: float, x1: float, y1: float) -> F64:
     return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
 
-def _disc(radius_m: float) -> F64:
-    angles = np.arange(16) * (2 * math.pi / 16)
-    return radius_m * np.column_stack((np.cos(angles), np.sin(angles)))
-
-
 def _legs(width: float, depth: float, thickness: float, top: float) -> list[Prism]:
     x, y, t = width / 2, depth / 2, thickness
     corners = ((-x, -y), (x - t, -y), (x - t, y - t), (-x, y - t))
@@ -459,7 +426,8 @@ def _box(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
 def _cylinder(
     radius_m: tuple[float, float], height_m: tuple[float, float], rng: np.random.Generator
 ) -> tuple[F64, list[Prism]]:
-    outline = _disc(rng.uniform(*radius_m))
+    angles = np.arange(16) * (2 * math.pi / 16)
+    outline = rng.uniform(*radius_m) * np.column_stack((np.cos(angles), np.sin(angles)))
     return outline, [Prism(outline, 0.0, rng.uniform(*height_m))]
 
 

@@ -25,7 +25,6 @@ from pc2grid.simulate.plan import office_floorplan
 from pc2grid.simulate.scene import (
     Building,
     Furniture,
-    Mesh,
     Scene,
     SimulatedSensor,
     covered,
@@ -71,7 +70,7 @@ class Session:
     grid : the true floor plan. clutter : movable objects in it.
     drive : true motion in the plan's map frame.
     odometry : None when switched off. scan_count : scans of the sensor during the drive.
-    shell : geometry of a real building; None where the plan is extruded.
+    shell : (T, 3, 3) triangles of a real building; None where the plan is extruded.
     """
 
     sensor: SimulatedSensor
@@ -80,17 +79,17 @@ class Session:
     drive: Drive
     odometry: SimulatedOdometry | None
     config: SimulationConfig
-    shell: Mesh | None = None
+    shell: F32 | None = None
 
     @property
     def scan_count(self) -> int:
         """Return the number of whole scans from start to end of the drive."""
         return max(int(self.drive.duration_s * self.sensor.rate_hz), 1)
 
-    def mesh(self) -> Mesh:
-        """Return building and objects as triangles in the map frame."""
+    def mesh(self) -> F32:
+        """Return building and objects as triangles (T, 3, 3) in the map frame."""
         shell = extrude(self.grid, self.config.wall_height_m) if self.shell is None else self.shell
-        return Mesh.join([shell, *(furniture.mesh() for furniture in self.clutter)])
+        return np.concatenate([shell, *(furniture.mesh() for furniture in self.clutter)])
 
     def readings(self) -> Iterator[Measurements]:
         """Cast all scans, several in a call; each ray starts at the robot's pose at the time of the ray."""

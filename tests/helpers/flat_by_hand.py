@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from pc2grid.geometry import F64, pose_from_rotation_vector
+from pc2grid.geometry import F32, F64, pose_from_rotation_vector
 from pc2grid.model import Scan
-from pc2grid.simulate.scene import OPTICAL, Mesh, Scene, prism
+from pc2grid.simulate.scene import OPTICAL, Scene, prism
 
 STEP_M, TURN_RAD = 0.25, 0.35  # between two images
 Point = tuple[float, float]
@@ -30,7 +30,7 @@ _FURNITURE = (  # lowest corner, highest corner, bottom, top
 )
 
 
-def box(low: Point, high: Point, bottom_m: float, top_m: float) -> Mesh:
+def box(low: Point, high: Point, bottom_m: float, top_m: float) -> F32:
     (a, b), (c, d) = low, high
     return prism(np.array([(a, b), (c, b), (c, d), (a, d)]), bottom_m, top_m)
 
@@ -46,7 +46,7 @@ def scene() -> Scene:
         parts += [box((x - 0.45, y - 0.05), (x + 0.45, y + 0.05), 2.0, 2.5) for x in doors]
     parts += [box((x - 0.05, 1.3), (x + 0.05, high), 0.0, 2.5) for x in (2.5, 5.3, 7.8)]
     parts += [box((x - 0.05, low), (x + 0.05, 0.0), 0.0, 2.5) for x in (3.5, 7.0)]
-    return Scene(Mesh.join([*parts, *(box(*thing) for thing in _FURNITURE)]))
+    return Scene(np.concatenate([*parts, *(box(*thing) for thing in _FURNITURE)]))
 
 
 CORRIDOR: tuple[Point, ...] = ((0.5, 0.65), (10.0, 0.65), (0.5, 0.65))

@@ -21,9 +21,9 @@ VOXEL_M = 0.1
 
 def points(height_m: float) -> PointMap:
     """The surfaces of the office in space."""
-    mesh = extrude(office(), height_m)
+    corners_m = extrude(office(), height_m).reshape(-1, 3).astype(np.float64)
     cloud = VoxelCloud(VOXEL_M)
-    for block_m in sampled(mesh.vertices_m.astype(np.float64), mesh.triangles.astype(np.int64)):
+    for block_m in sampled(corners_m, np.arange(len(corners_m)).reshape(-1, 3)):
         cloud.add(block_m)
     return PointMap.of(cloud.points_m(), VOXEL_M, cloud.corner_m)
 

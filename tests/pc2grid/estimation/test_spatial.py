@@ -30,7 +30,7 @@ from pc2grid.model import Health, OccupancyGrid, Scan
 from pc2grid.observer import Observer
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
 from pc2grid.simulate import SimulationConfig, prepare_session
-from pc2grid.simulate.scene import Mesh, Scene
+from pc2grid.simulate.scene import Scene
 from signature.config import Config
 from signature.session.build import map_scans
 from tests.helpers.field import DATA
@@ -55,7 +55,7 @@ def room() -> Scene:
         box((4.4, 0.0), (5.0, 1.0), 0.0, 2.0),
         box((0.0, 3.2), (0.5, 4.0), 0.0, 2.2),
     ]
-    return Scene(Mesh.join(parts))
+    return Scene(np.concatenate(parts))
 
 
 def hand(count: int) -> list[F64]:

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.geometry import F64
+from pc2grid.geometry import F32, F64
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from pc2grid.simulate import Building, SimulationConfig, load_building, prepare_session
 from pc2grid.simulate.plan import clearance_m, office_floorplan
-from pc2grid.simulate.scene import Mesh, Scene, covered, place_clutter, prism, voxel_faces, voxel_m
+from pc2grid.simulate.scene import Scene, covered, place_clutter, prism, voxel_faces, voxel_m
 from tests.helpers.building_clouds import ROOM_M, room_cloud
 
 
@@ -71,23 +71,24 @@ def write_cloud(path: Path, points: F64) -> Path:
     return path
 
 
-def write_mesh(path: Path, mesh: Mesh) -> Path:
+def write_mesh(path: Path, triangles_m: F32) -> Path:
     import open3d as o3d
 
+    corners_m = triangles_m.reshape(-1, 3).astype(float)
     made = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices_m.astype(float)),
-        o3d.utility.Vector3iVector(mesh.triangles.astype(np.int32)),
+        o3d.utility.Vector3dVector(corners_m),
+        o3d.utility.Vector3iVector(np.arange(len(corners_m), dtype=np.int32).reshape(-1, 3)),
     )
     made.compute_triangle_normals()
     o3d.io.write_triangle_mesh(str(path), made)
     return path
 
 
-def hall() -> Mesh:
+def hall() -> F32:
     x, y, z = ROOM_M
     outline = np.array([(0.0, 0.0), (x, 0.0), (x, y), (0.0, y)])
     pillar = np.array([(5.0, 3.0), (5.5, 3.0), (5.5, 3.5), (5.0, 3.5)])
-    return Mesh.join([prism(outline, 0.4, 0.4 + z), prism(pillar, 0.4, 0.4 + z)])
+    return np.concatenate([prism(outline, 0.4, 0.4 + z), prism(pillar, 0.4, 0.4 + z)])
 
 
 def test_rays_hit_the_faces_of_voxels() -> None:
@@ -126,7 +127,7 @@ def test_cloud_is_driven_through(tmp_path: Path, suffix: str) -> None:
 def test_mesh_is_driven_through(tmp_path: Path, suffix: str) -> None:
     building = load_building(write_mesh(tmp_path / f"hall{suffix}", hall()))
     assert isinstance(building, Building)
-    assert building.shell.vertices_m[:, 2].min() == pytest.approx(0.0, abs=0.01)
+    assert building.shell[..., 2].min() == pytest.approx(0.0, abs=0.01)
     session = prepare_session(sensor="depth", grid=building, config=SimulationConfig(length_m=3.0, clutter=0))
     scan, _ = next(iter(session.scans()))
     assert len(scan.points_m) > 1000

@@ -68,10 +68,10 @@ def data(folder: Path) -> None:
         slow: dict[str, Any] = {"laser": {"rate_hz": 4.0}, "length_m": length_m, "seed": seed, "clutter": 0}
         config = SimulationConfig.model_validate(slow)
         simulate_session(folder / f"{name}.mcap", sensor="laser", grid=rooms(), config=config)
-    walls = extrude(rooms(), 2.2)
+    corners_m = extrude(rooms(), 2.2).reshape(-1, 3).astype(float)
     mesh = open3d.geometry.TriangleMesh(
-        open3d.utility.Vector3dVector(walls.vertices_m.astype(float)),
-        open3d.utility.Vector3iVector(walls.triangles.astype(np.int32)),
+        open3d.utility.Vector3dVector(corners_m),
+        open3d.utility.Vector3iVector(np.arange(len(corners_m), dtype=np.int32).reshape(-1, 3)),
     )
     open3d.io.write_triangle_mesh(str(folder / "floor.obj"), mesh)
     (folder / "broken.mcap").write_bytes(b"no recording")
