@@ -1,14 +1,14 @@
 """A procedural office floor as an occupancy grid: walls, doors and everything that does not move.
 
-The floor is divided into corridors first, then rooms in the remaining space, then doors (`lay_out`). All
-lengths are whole cells of the floor plan; rectangles are half-open, x to the right and y up. `Passages`
-places objects so that the free space stays connected for a robot.
+The floor is divided into corridors first, then rooms in the remaining space, then doors. All lengths are
+whole cells of the floor plan; rectangles are half-open, x to the right and y up. `Passages` places objects so
+that the free space stays connected for a robot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+import itertools
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import cv2
@@ -21,111 +21,95 @@ from pc2grid.geometry import F32, F64, I64, BoolGrid
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 OUTER_WALL_M = 0.3
-INNER_WALL_M = 0.1
+RESOLUTION_M = 0.05
+_PER_M = 1.0 / RESOLUTION_M
+_WALL = 1  # half the thickness of an inner wall, cells
 
 
-def office_floorplan(
-    seed: int, width_m: float = 44.0, height_m: float = 32.0, *, resolution_m: float = 0.05
-) -> OccupancyGrid:
+def office_floorplan(seed: int, width_m: float = 44.0, height_m: float = 32.0) -> OccupancyGrid:
     """Make an office floor, different for each seed: corridors, rooms, doors, pillars, niches, built-in
     shelves.
 
     Cells outside and in shafts are unknown. The origin is the outer corner of the building. Raises
-    ConfigError below 20 x 20 m, where corridors and rooms do not fit, or for cells above 0.1 m.
+    ConfigError below 20 x 20 m, where corridors and rooms do not fit.
     """
     if min(width_m, height_m) < 20:
         raise ConfigError(f"an office of {width_m:g} x {height_m:g} m is too small", hint="20 x 20 m or more")
-    if not 0.02 <= resolution_m <= 0.1:
-        raise ConfigError(f"office walls need cells of 0.02 to 0.1 m, not {resolution_m:g} m")
     rng = np.random.default_rng([seed, 0x0FF1CE])
-    unit = 1.0 / resolution_m
-    outer = Box(0, 0, round(width_m * unit), round(height_m * unit))
-    inside = outer.grown(-round(OUTER_WALL_M * unit))
-    wall = max(round(INNER_WALL_M * unit / 2), 1)
-    layout = lay_out(inside, wall, unit, rng)
+    outer = Box(0, 0, round(width_m * _PER_M), round(height_m * _PER_M))
+    inside = outer.grown(-round(OUTER_WALL_M * _PER_M))
+    corridors = _corridors(inside, rng)
+    rooms = [room for block in _blocks(inside, corridors, rng) for room in _rooms(block, rng)]
+    reached, doors = _doors(corridors, rooms, rng)
     cells = np.full((outer.height, outer.width), OCCUPIED, np.int8)
-    _carve(cells, layout, inside, wall)
-    margin = round(0.5 * unit)
-    cells = np.pad(cells, margin, constant_values=UNKNOWN)
-    passages = Passages(cells == FREE, resolution_m, robot_m=0.4)
-    _keep_doors_clear(passages, layout, margin)
-    _relief(passages, layout, wall, margin, rng)
-    _columns(passages, inside, margin, unit, rng)
-    _shelves(passages, layout, wall, margin, rng)
-    solid = (cells == FREE) & ~passages.free
-    cells[solid] = OCCUPIED
-    return OccupancyGrid(cells=cells, resolution_m=resolution_m, origin_m=(-margin / unit, -margin / unit))
+    for number, room in enumerate(rooms):
+        cells[room.grown(-_WALL).cells] = FREE if number in reached else UNKNOWN
+    for corridor in corridors:
+        cells[corridor.grown(-_WALL).within(inside).cells] = FREE
+    for door in doors:
+        cells[door.cells] = FREE
+    passages = Passages(cells == FREE, RESOLUTION_M, robot_m=0.4)
+    for door in doors:
+        passages.reserved[door.grown(round(0.7 * _PER_M)).cells] = True
+    passages.reserved &= passages.free
+    _relief(passages, corridors, rng)
+    _columns(passages, inside, rng)
+    _shelves(passages, rooms, rng)
+    cells[(cells == FREE) & ~passages.free] = OCCUPIED
+    margin = round(0.5 * _PER_M)
+    return OccupancyGrid(
+        cells=np.pad(cells, margin, constant_values=UNKNOWN),
+        resolution_m=RESOLUTION_M,
+        origin_m=(-margin / _PER_M, -margin / _PER_M),
+    )
 
 
-def _carve(cells: NDArray[np.int8], layout: Layout, inside: Box, wall: int) -> None:
-    """Make rooms, corridors and doors free in the solid block."""
-    reached = {side for door in layout.doors for side in door.sides}
-    for number, room in enumerate(layout.rooms):
-        _fill(cells, room.grown(-wall), FREE if number in reached else UNKNOWN)
-    for corridor in layout.corridors:
-        _fill(cells, _within(corridor.grown(-wall), inside), FREE)
-    for door in layout.doors:
-        _fill(cells, door.box, FREE)
-
-
-def _keep_doors_clear(passages: Passages, layout: Layout, margin: int) -> None:
-    """Reserve the space in front of doors."""
-    reserved: BoolGrid = np.zeros(passages.free.shape, bool)
-    for door in layout.doors:
-        box = door.box.grown(round(0.7 * layout.unit))
-        reserved[box.y0 + margin : box.y1 + margin, box.x0 + margin : box.x1 + margin] = True
-    passages.reserve(reserved & passages.free)
-
-
-def _relief(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.random.Generator) -> None:
+def _relief(passages: Passages, corridors: list[Box], rng: np.random.Generator) -> None:
     """Put pilasters, pipes, radiators and cases on corridor walls, so that no corridor is smooth."""
-    for whole in layout.corridors:
-        others = [other for other in layout.corridors if other != whole]
-        corridor = whole.grown(-wall)
+    for whole in corridors:
+        others = [other for other in corridors if other != whole]
+        corridor = whole.grown(-_WALL)
         upright = corridor.width < corridor.height
         low, y0, high, y1 = corridor.flipped if upright else corridor
         for near in (True, False):
-            for begin, end, deep in _pieces(low, high, layout.unit, rng):
+            for begin, end, deep in _pieces(low, high, rng):
                 foot = y0 if near else y1 - deep
                 box = Box(begin, foot, end, foot + deep)
                 box = box.flipped if upright else box
-                if not any(_touch(box, other) for other in others):
-                    passages.put(_corners(box) + margin)
+                if all(box.within(other).is_empty for other in others):
+                    passages.put(box.corners)
 
 
-def _pieces(low: int, high: int, unit: float, rng: np.random.Generator) -> Iterator[tuple[int, int, int]]:
+def _pieces(low: int, high: int, rng: np.random.Generator) -> Iterator[tuple[int, int, int]]:
     """Yield the begin, the end and the depth, in cells, of pieces along a wall from `low` to `high`."""
-    at = low + float(rng.uniform(0.3, 2.0)) * unit
+    at = low + float(rng.uniform(0.3, 2.0)) * _PER_M
     while at < high:
         slim = rng.random() < 0.5
         long_m = float(rng.uniform(0.15, 0.4) if slim else rng.uniform(0.6, 1.6))
-        deep = max(round(float(rng.uniform(0.05, 0.2 if slim else 0.15)) * unit), 1)
-        yield round(at), round(at + long_m * unit), deep
-        at += (long_m + float(rng.uniform(0.6, 4.0))) * unit
+        deep = max(round(float(rng.uniform(0.05, 0.2 if slim else 0.15)) * _PER_M), 1)
+        yield round(at), round(at + long_m * _PER_M), deep
+        at += (long_m + float(rng.uniform(0.6, 4.0))) * _PER_M
 
 
-def _columns(passages: Passages, inside: Box, margin: int, unit: float, rng: np.random.Generator) -> None:
+def _columns(passages: Passages, inside: Box, rng: np.random.Generator) -> None:
     """Put structural columns on a regular pitch, where they leave passages open."""
-    pitch_x, pitch_y = rng.uniform(5.0, 7.5, size=2) * unit
-    half = round(float(rng.uniform(0.15, 0.25)) * unit)
+    pitch_x, pitch_y = rng.uniform(5.0, 7.5, size=2) * _PER_M
+    half = round(float(rng.uniform(0.15, 0.25)) * _PER_M)
     start_x, start_y = rng.uniform(0.3, 0.7, size=2) * (pitch_x, pitch_y)
     for x in np.arange(inside.x0 + start_x, inside.x1, pitch_x):
         for y in np.arange(inside.y0 + start_y, inside.y1, pitch_y):
             column = Box(round(x) - half, round(y) - half, round(x) + half, round(y) + half)
-            passages.put(_corners(column) + margin, overlap=True)
+            passages.put(column.corners, overlap=True)
 
 
-def _shelves(passages: Passages, layout: Layout, wall: int, margin: int, rng: np.random.Generator) -> None:
+def _shelves(passages: Passages, rooms: list[Box], rng: np.random.Generator) -> None:
     """Put shelves and cabinets along the walls of rooms, and some free-standing ones in halls."""
-    unit = layout.unit
-    for room in layout.rooms:
-        free = room.grown(-wall)
-        area_m2 = free.width * free.height / unit**2
+    for room in rooms:
+        free = room.grown(-_WALL)
+        area_m2 = free.width * free.height / _PER_M**2
         for _ in range(rng.poisson(1.0 + area_m2 / 12)):
-            long, deep = (
-                round(float(rng.uniform(0.6, 2.2)) * unit),
-                round(float(rng.uniform(0.3, 0.5)) * unit),
-            )
+            long = round(float(rng.uniform(0.6, 2.2)) * _PER_M)
+            deep = round(float(rng.uniform(0.3, 0.5)) * _PER_M)
             side = int(rng.integers(4))
             width, height = (long, deep) if side < 2 else (deep, long)
             if width >= free.width or height >= free.height:
@@ -138,7 +122,7 @@ def _shelves(passages: Passages, layout: Layout, wall: int, margin: int, rng: np
                     y = (free.y0, free.y1 - height)[side]
                 else:
                     x = (free.x0, free.x1 - width)[side - 2]
-            passages.put(_corners(Box(x, y, x + width, y + height)) + margin)
+            passages.put(Box(x, y, x + width, y + height).corners)
 
 
 # --- the division of a floor --------------------------------------------------------------------------
@@ -163,6 +147,11 @@ class Box(NamedTuple):
         return self.y1 - self.y0
 
     @property
+    def is_empty(self) -> bool:
+        """Return True if it holds no cell."""
+        return self.width <= 0 or self.height <= 0
+
+    @property
     def flipped(self) -> Box:
         """Return the box with x and y exchanged."""
         return Box(self.y0, self.x0, self.y1, self.x1)
@@ -171,76 +160,37 @@ class Box(NamedTuple):
         """Return a box that is larger by `by` on every side; smaller if negative."""
         return Box(self.x0 - by, self.y0 - by, self.x1 + by, self.y1 + by)
 
+    def within(self, other: Box) -> Box:
+        """Return what lies in the other box, too."""
+        low, high = np.maximum(self[:2], other[:2]), np.minimum(self[2:], other[2:])
+        return Box(*low.tolist(), *high.tolist())
 
-def _fill(cells: NDArray[np.int8], box: Box, value: int) -> None:
-    cells[max(box.y0, 0) : max(box.y1, 0), max(box.x0, 0) : max(box.x1, 0)] = value
+    @property
+    def cells(self) -> tuple[slice, slice]:
+        """Return its rows and columns, without negative ones."""
+        return np.s_[max(self.y0, 0) : max(self.y1, 0), max(self.x0, 0) : max(self.x1, 0)]
 
-
-def _within(box: Box, other: Box) -> Box:
-    return Box(max(box.x0, other.x0), max(box.y0, other.y0), min(box.x1, other.x1), min(box.y1, other.y1))
-
-
-def _touch(box: Box, other: Box) -> bool:
-    common = _within(box, other)
-    return common.width > 0 and common.height > 0
-
-
-def _corners(box: Box) -> F64:
-    # Through the centres of the outermost cells, so that exactly the cells of the box are covered.
-    x0, y0, x1, y1 = box.x0 + 0.5, box.y0 + 0.5, box.x1 - 0.5, box.y1 - 0.5
-    return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
+    @property
+    def corners(self) -> F64:
+        """Return the centres (4, 2) of its outermost cells: their outline covers exactly its cells."""
+        x0, y0, x1, y1 = self.x0 + 0.5, self.y0 + 0.5, self.x1 - 0.5, self.y1 - 0.5
+        return np.array([(x0, y0), (x1, y0), (x1, y1), (x0, y1)])
 
 
-class Door(NamedTuple):
-    """An opening: the cells of the wall that it removes, and the two places that it connects."""
-
-    box: Box
-    sides: tuple[int, int]
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """The division of a floor.
-
-    corridors : touching or crossing each other, one space. rooms : disjoint. doors : sides are numbers of
-    rooms, or -1 for the corridor. unit : cells per metre.
-    """
-
-    corridors: tuple[Box, ...]
-    rooms: tuple[Box, ...]
-    doors: tuple[Door, ...]
-    unit: float
-
-
-def lay_out(inside: Box, wall: int, unit: float, rng: np.random.Generator) -> Layout:
-    """Divide the inside of the outer walls.
-
-    wall : half the thickness of an inner wall, cells. Rooms without a door are shafts.
-    """
-    corridors = _corridors(inside, unit, rng)
-    rooms = [room for block in _blocks(inside, corridors, rng) for room in _rooms(block, unit, rng)]
-    doors = _doors(corridors, rooms, wall, unit, rng)
-    return Layout(tuple(corridors), tuple(rooms), tuple(doors), unit)
-
-
-def _cells(metres: float, unit: float) -> int:
-    return round(metres * unit)
-
-
-def _corridors(inside: Box, unit: float, rng: np.random.Generator) -> list[Box]:
+def _corridors(inside: Box, rng: np.random.Generator) -> list[Box]:
     """Make corridors as a ring, a ladder or a comb, with random widths and positions."""
 
     def wide() -> int:
-        return _cells(float(rng.uniform(1.7, 2.5)), unit)
+        return round(float(rng.uniform(1.7, 2.5)) * _PER_M)
 
     def deep() -> int:
-        return _cells(float(rng.uniform(4.5, 7.0)), unit)
+        return round(float(rng.uniform(4.5, 7.0)) * _PER_M)
 
     x0, y0 = inside.x0 + deep(), inside.y0 + deep()
     core = Box(x0, y0, inside.x1 - deep(), inside.y1 - deep())
     kind = rng.choice(["ring", "ladder", "comb"], p=[0.5, 0.3, 0.2])
     if kind == "ring":
-        return _ring(inside, core, wide, _cells(1.0, unit), rng)
+        return _ring(inside, core, wide, round(_PER_M), rng)
     if kind == "ladder":
         return _ladder(inside, core, wide, rng)
     return _comb(inside, core, wide, rng)
@@ -334,9 +284,9 @@ def _largest(left: BoolGrid, *, along_x_first: bool) -> tuple[int, int]:
     return wide, high
 
 
-def _rooms(block: Box, unit: float, rng: np.random.Generator) -> list[Box]:
+def _rooms(block: Box, rng: np.random.Generator) -> list[Box]:
     """Divide a block until its parts are rooms: mostly offices, sometimes a hall."""
-    long, short = max(block.width, block.height) / unit, min(block.width, block.height) / unit
+    long, short = max(block.width, block.height) / _PER_M, min(block.width, block.height) / _PER_M
     area = long * short
     if (
         long < 5.0
@@ -348,72 +298,57 @@ def _rooms(block: Box, unit: float, rng: np.random.Generator) -> list[Box]:
     x0, y0, x1, y1 = block.flipped if upright else block
     at = x0 + int((x1 - x0) * rng.uniform(0.32, 0.68))
     parts = [Box(x0, y0, at, y1), Box(at, y0, x1, y1)]
-    return [room for part in parts for room in _rooms(part.flipped if upright else part, unit, rng)]
+    return [room for part in parts for room in _rooms(part.flipped if upright else part, rng)]
 
 
-def _doors(
-    corridors: list[Box], rooms: list[Box], wall: int, unit: float, rng: np.random.Generator
-) -> list[Door]:
-    """Open a door from every room to the corridor, or to a room that has one; some rooms get two."""
-    opened: list[Door] = []
+def _doors(corridors: list[Box], rooms: list[Box], rng: np.random.Generator) -> tuple[list[int], list[Box]]:
+    """Open a door from every room to the corridor, or to a room that has one; some rooms get two.
 
-    def opens(room: int, other: Box, number: int) -> bool:
-        box = _door(rooms[room], other, wall, unit, rng)
-        if box is not None:
-            opened.append(Door(box, (room, number)))
-        return box is not None
+    Returns the numbers of the rooms that have a door, and the doors.
+    """
+    doors: list[Box] = []
 
-    def to_corridor(room: int) -> bool:
-        """Open one door to a corridor, sometimes two."""
-        tried = [corridors[int(i)] for i in rng.permutation(len(corridors))]
-        count = sum(opens(room, corridor, -1) for corridor in tried[:1])
-        for corridor in tried[1:]:
+    def opens(room: Box, other: Box) -> bool:
+        door = _door(room, other, rng)
+        if door is not None:
+            doors.append(door)
+        return door is not None
+
+    order: list[int] = rng.permutation(len(rooms)).tolist()
+    reached: list[int] = []
+    for k in order:
+        count = 0
+        for i in rng.permutation(len(corridors)):
             if count == 0 or (count == 1 and rng.random() < 0.15):
-                count += opens(room, corridor, -1)
-        return count > 0
-
-    def to_room(room: int, others: Iterable[int]) -> bool:
-        """Open a door to the first possible one of other rooms."""
-        return any(opens(room, rooms[other], other) for other in others)
-
-    order = [int(k) for k in rng.permutation(len(rooms))]
-    reached = [k for k in order if to_corridor(k)]
-    _through_rooms(to_room, reached, [k for k in order if k not in reached])
-    for k in reached:
-        for other in reached:
-            if k < other and rng.random() < 0.1:
-                to_room(k, [other])
-    return opened
-
-
-def _through_rooms(
-    to_room: Callable[[int, Iterable[int]], bool], reached: list[int], waiting: list[int]
-) -> None:
-    """Open doors from waiting rooms to reached ones, and add them to these, until none is left."""
-    while waiting:
-        for k in waiting:
-            if to_room(k, reached):
+                count += opens(rooms[k], corridors[i])
+        if count:
+            reached.append(k)
+    before = 0
+    while before < len(reached):  # until no further room can be reached
+        before = len(reached)
+        for k in order:
+            if k not in reached and any(opens(rooms[k], rooms[other]) for other in reached):
                 reached.append(k)
-        left = [k for k in waiting if k not in reached]
-        if left == waiting:
-            return
-        waiting = left
+    for k, other in itertools.product(reached, reached):
+        if k < other and rng.random() < 0.1:
+            opens(rooms[k], rooms[other])
+    return reached, doors
 
 
-def _door(a: Box, b: Box, wall: int, unit: float, rng: np.random.Generator) -> Box | None:
+def _door(a: Box, b: Box, rng: np.random.Generator) -> Box | None:
     """Return an opening with the width of a door, sometimes of a double one, away from the corners."""
     along_x = _shared_wall(a, b)
     shared = along_x or _shared_wall(a.flipped, b.flipped)
     if shared is None:
         return None
     line, low, high = shared
-    double = rng.random() < 0.08 and high - low > _cells(4.0, unit)
+    double = rng.random() < 0.08 and high - low > round(4.0 * _PER_M)
     wide = rng.uniform(1.6, 2.2) if double else rng.uniform(0.9, 1.0)
-    size, corner = _cells(float(wide), unit), _cells(0.3, unit)
+    size, corner = round(float(wide) * _PER_M), round(0.3 * _PER_M)
     if high - low < size + 2 * corner:
         return None
     at = int(rng.integers(low + corner, high - corner - size + 1))
-    across = wall + 1
+    across = _WALL + 1
     box = Box(at, line - across, at + size, line + across)
     return box if along_x else box.flipped
 
@@ -435,7 +370,7 @@ class Passages:
     """Free space in which objects are placed so that it stays connected for a robot.
 
     free : (H, W) cells that are empty; changes with each object.
-    reserved : (H, W) cells on which no object may be placed.
+    reserved : (H, W) cells on which no object may be placed; they stay passable.
     """
 
     def __init__(self, free: BoolGrid, resolution_m: float, robot_m: float) -> None:
@@ -444,10 +379,6 @@ class Passages:
         self.resolution_m = resolution_m
         self.robot_m = robot_m
         self._passable = clearance_m(free, resolution_m) >= robot_m
-
-    def reserve(self, cells: BoolGrid) -> None:
-        """Reserve cells (H, W): no object is placed on them from now on; they stay passable."""
-        self.reserved |= cells
 
     def put(self, outline_cells: F64, *, overlap: bool = False) -> bool:
         """Place an object if it stands on free cells only and leaves every passage beside it open.
