@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
@@ -70,29 +71,26 @@ class Drive:
         return SE2(x, y, wrap_angle(yaw))
 
 
-def drive_along(route: Route, config: DriveConfig, rng: np.random.Generator) -> Drive:
-    """Drive a route from rest to rest, with random short stops and a stop at each turn in place."""
-    points = route.points_m
+def drive_along(points: F64, turns: I64, config: DriveConfig, rng: np.random.Generator) -> Drive:
+    """Drive a route of `plan_route` from rest to rest, with random short stops and a stop at each turn."""
     last = len(points) - 1
     gap = config.pause_every_m
-    pauses = np.cumsum(rng.exponential(gap, size=int(3 * route.length_m / gap) + 10))
-    driven = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
+    steps_m = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    pauses = np.cumsum(rng.exponential(gap, size=int(3 * float(steps_m.sum()) / gap) + 10))
+    driven = np.concatenate(([0.0], np.cumsum(steps_m)))
     stops = {int(np.searchsorted(driven, s)): float(rng.uniform(*_PAUSE_S)) for s in pauses if s < driven[-1]}
-    turns = [int(v) for v in route.turns if 0 < v < last]
-    times, poses = [np.array([0.0, 0.5])], [np.tile([*points[0], 0.0], (2, 1))]
-    yaw: float | None = None
-    for a, b in zip([0, *turns], [*turns, last], strict=True):
+    ends = [0, *(int(v) for v in turns if 0 < v < last), last]
+    yaw = float(_headings(points[: ends[1] + 1])[0])
+    times, poses = [np.array([0.0, 0.5])], [np.tile([*points[0], yaw], (2, 1))]
+    for a, b in pairwise(ends):
         line = points[a : b + 1]
         yaws = _headings(line)
-        if yaw is None:
-            poses[0][:, 2] = yaws[0]
-        else:
-            spin = wrap_angle(float(yaws[0]) - yaw)
-            if abs(spin) > 1e-3:
-                when, angles = _turn(spin, config)
-                times.append(times[-1][-1] + when)
-                poses.append(np.column_stack((np.tile(line[0], (len(when), 1)), yaw + angles)))
-            yaws += yaw + spin - yaws[0]
+        spin = wrap_angle(float(yaws[0]) - yaw)
+        if abs(spin) > 1e-3:
+            when, angles = _turn(spin, config)
+            times.append(times[-1][-1] + when)
+            poses.append(np.column_stack((np.tile(line[0], (len(when), 1)), yaw + angles)))
+        yaws += yaw + spin - yaws[0]
         cuts = sorted({a, b, *(s for s in stops if a + 10 < s < b - 10)})
         for c, d in pairwise(cuts):
             part, headings = points[c : d + 1], yaws[c - a : d - a + 1]
@@ -125,10 +123,9 @@ def _follow(points_m: F64, yaws: F64, config: DriveConfig) -> F64:
     curvature = maximum_filter1d(curvature, 5)
     speed = np.minimum(config.speed_mps, config.yaw_rate_rps / np.maximum(curvature, 1e-3))
     speed[0] = speed[-1] = 0.0
-    for i in range(1, len(speed)):
-        speed[i] = min(speed[i], np.sqrt(speed[i - 1] ** 2 + 2 * config.acceleration_mps2 * steps[i - 1]))
-    for i in range(len(speed) - 2, -1, -1):
-        speed[i] = min(speed[i], np.sqrt(speed[i + 1] ** 2 + 2 * config.acceleration_mps2 * steps[i]))
+    for way, step in ((speed, steps), (speed[::-1], steps[::-1])):  # speeding up, then braking
+        for i in range(1, len(way)):
+            way[i] = min(way[i], np.sqrt(way[i - 1] ** 2 + 2 * config.acceleration_mps2 * step[i - 1]))
     seconds = 2 * steps / np.maximum(speed[1:] + speed[:-1], _LEAST_MPS)
     seconds = np.maximum(seconds, np.abs(np.diff(yaws)) / config.yaw_rate_rps)
     return np.concatenate(([0.0], np.cumsum(seconds)))
@@ -171,24 +168,6 @@ _AHEAD_M = 1.5  # detour accepted for a goal that lies ahead and not beside
 _LONGER, _LONGER_M = 1.3, 2.0
 
 
-@dataclass(frozen=True, slots=True)
-@frozen_arrays(points_m=(np.float64, "N", 2), turns=(np.int64, "K"))
-class Route:
-    """A line to drive along.
-
-    points_m : (N, 2) in the map frame, about STEP_M apart.
-    turns : (K,) increasing indices into points_m where the robot stops and turns in place.
-    """
-
-    points_m: F64
-    turns: I64
-
-    @property
-    def length_m(self) -> float:
-        """Return the length of the line."""
-        return float(np.linalg.norm(np.diff(self.points_m, axis=0), axis=1).sum())
-
-
 def plan_route(
     grid: OccupancyGrid,
     blocked: NDArray[np.bool_],
@@ -197,8 +176,11 @@ def plan_route(
     start_m: tuple[float, float] | None,
     least_m: float,
     rng: np.random.Generator,
-) -> Route:
+) -> tuple[F64, I64]:
     """Plan a route of `length_m` that stays `least_m` away from everything that is not free.
+
+    Returns its points (N, 2) in the map frame, about STEP_M apart, and the increasing indices (K,) of those
+    where the robot stops and turns in place.
 
     blocked : (H, W) cells below clutter. Places that were not visited come first; at dead ends the robot
     turns; later it comes back to places, which closes loops. Raises ConfigError if there is no room, or none
@@ -211,40 +193,34 @@ def plan_route(
         at = int(centres[rng.integers(len(centres))])
     else:
         at = int(np.argmin(np.linalg.norm(lattice.points_m - start_m, axis=1)))
-    explorer = _Explorer(lattice, at, rng)
+    legs = _legs(lattice, at, rng)
     # The line is smooth between two turns in place.
     segments: list[list[F64]] = [[lattice.points_m[[at]]]]
-    heading: F64 | None = None
     driven_m = 0.0
     # Smoothing shortens the line, so more than the length is planned.
     while driven_m < _LONGER * length_m + _LONGER_M:
-        leg = lattice.points_m[explorer.next_path(heading)]
+        leg, turns_before = next(legs)
         driven_m += float(np.linalg.norm(np.diff(leg, axis=0), axis=1).sum())
-        leaving = leg[min(5, len(leg) - 1)] - leg[0]
-        if heading is not None and heading @ leaving < 0:
+        if turns_before:
             segments.append([leg[:1]])
         segments[-1].append(leg[1:])
-        arriving = leg[-1] - leg[max(-6, -len(leg))]
-        heading = arriving / np.linalg.norm(arriving)
     lines = [_smooth(_resample(np.concatenate(part)), grid, clearance, least_m) for part in segments]
     points = np.concatenate([lines[0], *(line[1:] for line in lines[1:])])
     turns = np.cumsum([len(line) - 1 for line in lines])
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     last = min(int(np.searchsorted(lengths, length_m)), len(points) - 1)
-    return Route(points[: last + 1], turns[turns < last])
+    return points[: last + 1], turns[turns < last]
 
 
 @dataclass(frozen=True, slots=True)
 class _Lattice:
     """Passable points some cells apart, connected with their neighbours.
 
-    points_m : (N, 2). cells : (N, 2) row, column. graph : (N, N) sparse; the weight of an edge is its length,
-    and up to three times that near walls. centres : (N,) True where the clearance is about the largest
-    around.
+    points_m : (N, 2). graph : (N, N) sparse; the weight of an edge is its length, and up to three times that
+    near walls. centres : (N,) True where the clearance is about the largest around.
     """
 
     points_m: F64
-    cells: I64
     graph: Any
     centres: NDArray[np.bool_]
 
@@ -289,6 +265,7 @@ def _lattice(
     discomfort = 1 + _DISCOMFORT * np.clip((comfort_m - here) / comfort_m, 0, 1)
     padded = np.pad(number, 1, constant_values=-1)
     height, width = part.shape
+    cost = discomfort[part]
     rows, columns, weights = [], [], []
     for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
         other = padded[1 + dr : 1 + dr + height, 1 + dc : 1 + dc + width]
@@ -296,67 +273,57 @@ def _lattice(
         a, b = number[edge], other[edge]
         rows.append(a)
         columns.append(b)
-        cost = discomfort[part]
         weights.append(math.hypot(dr, dc) * stride * grid.resolution_m * (cost[a] + cost[b]) / 2)
     shape = (len(cells), len(cells))
     graph = coo_matrix(
         (np.concatenate(weights), (np.concatenate(rows), np.concatenate(columns))), shape=shape
     )
-    return _Lattice(grid.to_point(cells * stride), cells * stride, graph.tocsr(), centres[part])
+    return _Lattice(grid.to_point(cells * stride), graph.tocsr(), centres[part])
 
 
-class _Explorer:
-    """Chooses one goal after another; keeps the places that were visited."""
+def _legs(lattice: _Lattice, at: int, rng: np.random.Generator) -> Iterator[tuple[F64, bool]]:
+    """Yield the points (N, 2) to one goal after another, and whether the robot turns before it goes there.
 
-    def __init__(self, lattice: _Lattice, at: int, rng: np.random.Generator) -> None:
-        self.lattice = lattice
-        self.at = at
-        self.rng = rng
-        self.new = np.ones(len(lattice.points_m), bool)
-        self._tree = cKDTree(lattice.points_m)
-        # A random preference for each block of the map makes the routes of two seeds differ.
-        blocks = np.floor((lattice.points_m - lattice.points_m.min(axis=0)) / _BLOCK_M).astype(int)
-        self._taste_m = rng.uniform(0, _TASTE_M, size=blocks.max(axis=0) + 1)[blocks[:, 0], blocks[:, 1]]
-        self._visit(np.array([at]))
-
-    def _visit(self, path: I64) -> None:
-        for near in self._tree.query_ball_point(self.lattice.points_m[path[::5]], SEEN_M):
-            self.new[near] = False
-
-    def next_path(self, heading: F64 | None) -> I64:
-        """Return the points (indices) to the next goal: near, not visited, and preferably ahead.
-
-        When everything is visited, a random place far away becomes the goal and all places count as new.
-        """
-        points = self.lattice.points_m
+    A goal is near, not visited, and preferably ahead. When everything is visited, a random place far away
+    becomes the goal and all places count as new.
+    """
+    points, tree = lattice.points_m, cKDTree(lattice.points_m)
+    new = np.ones(len(points), bool)
+    # A random preference for each block of the map makes the routes of two seeds differ.
+    blocks = np.floor((points - points.min(axis=0)) / _BLOCK_M).astype(int)
+    taste_m = rng.uniform(0, _TASTE_M, size=blocks.max(axis=0) + 1)[blocks[:, 0], blocks[:, 1]]
+    path = [at]
+    heading: F64 | None = None
+    while True:
+        for near in tree.query_ball_point(points[path[::5]], SEEN_M):
+            new[near] = False
         for limit in _SEARCH_M:
             away, before = dijkstra(
-                self.lattice.graph, directed=False, indices=self.at, return_predecessors=True, limit=limit
+                lattice.graph, directed=False, indices=at, return_predecessors=True, limit=limit
             )
-            goals = np.flatnonzero(
-                self.lattice.centres & self.new & np.isfinite(away) & (away > _NEAREST_GOAL_M)
-            )
+            goals = np.flatnonzero(lattice.centres & new & np.isfinite(away) & (away > _NEAREST_GOAL_M))
             if len(goals):
                 break
         else:
-            self.new[:] = True
+            new[:] = True
             reachable = np.isfinite(away)
             goals = np.flatnonzero(reachable & (away > 0.5 * away[reachable].max()))
             if len(goals) == 0:
                 raise ConfigError("the free space is too small to drive in", hint="choose another --start")
-            goals = goals[[self.rng.integers(len(goals))]]
-        score = away[goals] + self._taste_m[goals]
+            goals = goals[[rng.integers(len(goals))]]
+        score = away[goals] + taste_m[goals]
         if heading is not None:
-            direction = points[goals] - points[self.at]
+            direction = points[goals] - points[at]
             score += _AHEAD_M * (1 - direction @ heading / np.linalg.norm(direction, axis=1))
-        goal = int(goals[np.argmin(score)])
-        path = [goal]
-        while path[-1] != self.at:
+        path = [int(goals[np.argmin(score)])]
+        while path[-1] != at:
             path.append(int(before[path[-1]]))
-        indices = np.array(path[::-1], dtype=np.int64)
-        self._visit(indices)
-        self.at = goal
-        return indices
+        path.reverse()
+        at, leg = path[-1], points[path]
+        leaving = leg[min(5, len(leg) - 1)] - leg[0]
+        yield leg, heading is not None and bool(heading @ leaving < 0)
+        arriving = leg[-1] - leg[max(-6, -len(leg))]
+        heading = arriving / np.linalg.norm(arriving)
 
 
 def _resample(points_m: F64) -> F64:

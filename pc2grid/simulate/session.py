@@ -183,10 +183,10 @@ def prepare_session(
         keep_free_m=() if config.start_m is None else (config.start_m,),
     )
     blocked, clearance_m = covered(plan, clutter), config.drive.clearance_m
-    route = plan_route(
+    points, turns = plan_route(
         plan, blocked, config.length_m, start_m=config.start_m, least_m=clearance_m, rng=stream(_ROUTE)
     )
-    drive = drive_along(route, config.drive, stream(_DRIVE))
+    drive = drive_along(points, turns, config.drive, stream(_DRIVE))
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
     return Session(make_sensor(sensor, config), plan, clutter, drive, odometry, config, shell)
 
