@@ -19,9 +19,8 @@ import hashlib
 import math
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -78,7 +77,7 @@ class DrawnMap:
     T_map_file: F64
     level_points_m: F64
     digest: str
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
 
 
 def is_drawn_map(path: Path) -> bool:
@@ -192,11 +191,11 @@ def _doubts(level: F64, T_map_file: F64, read: ReadConfig, *, dense: bool) -> It
     others = other_floors(level)
     if others:
         middle_m = np.median(level[:, :2], axis=0)
-        there = np.array([(*middle_m, other.height_m) for other in others], np.float64)
+        there = np.array([(*middle_m, height_m) for height_m, _ in others], np.float64)
         z_m = transform_points(invert_pose(T_map_file), there)[:, 2]
         floors = " and ".join(
-            f"another floor lies at z = {z:.1f} with {other.area_m2:.0f} m2"
-            for z, other in zip(z_m, others, strict=True)
+            f"another floor lies at z = {z:.1f} with {area_m2:.0f} m2"
+            for z, (_, area_m2) in zip(z_m, others, strict=True)
         )
         yield f"the lowest floor is mapped; {floors}: --set read.floor_z={z_m[0]:.1f} maps that one"
 
@@ -263,7 +262,6 @@ _SCANS_OF_A_VIEW = 2
 def voxel_cloud(
     blocks: Iterable[NDArray[np.floating]],
     projection: ProjectionConfig = PROJECTION,
-    parameters: CloudMapParameters = CLOUD_MAP,
 ) -> F64:
     """Return the points of blocks (N, 3), one for each voxel of the size of a cell, (V, 3).
 
@@ -272,7 +270,7 @@ def voxel_cloud(
     cloud = VoxelCloud(projection.resolution_m)
     for block in blocks:
         if len(block) and not len(cloud):
-            check_plausible(block, parameters)
+            check_plausible(block)
         cloud.add(block)
     return cloud.points_m()
 
@@ -282,7 +280,6 @@ def map_cloud(
     projection: ProjectionConfig = PROJECTION,
     *,
     origin_m: F64 | None = None,
-    parameters: CloudMapParameters = CLOUD_MAP,
 ) -> OccupancyGrid:
     """Draw the occupancy grid of a levelled cloud (N, 3), whose floor is at z = 0.
 
@@ -300,29 +297,36 @@ def map_cloud(
     >>> bool(grid.free.any()), bool(grid.occupied.any())
     (True, True)
     """
-    p = parameters
+    p = CLOUD_MAP
     points = np.asarray(level_points_m, np.float64)
     builder = GridBuilder(projection)
-    drawn = 0
-    for corner_m, near in _tiles(_without_noise(points, projection, p), p.tile_m, p.sight_m):
-        for view_m in _viewpoints(near, corner_m, projection, p):
-            _draw(builder, near, view_m, projection, p)
-            drawn += 1
+    drawn = False
+    for corner_m, near in _tiles(_without_noise(points, projection)):
+        for view_m in _viewpoints(near, corner_m, projection):
+            _draw(builder, near, view_m, projection)
+            drawn = True
     if drawn:
-        return _near_seen_floor(builder.grid(), points, p)
+        # A view through a wall that was not scanned ends on some obstacle of another room: free cells that
+        # are far from all visible floor are removed.
+        grid = builder.grid()
+        unseen = ~_mask(grid.to_cell(points[np.abs(points[:, 2]) < p.floor_m, :2]), grid.cells.shape)
+        away_m = cv2.distanceTransform(unseen.astype(np.uint8), cv2.DIST_L2, 5) * grid.resolution_m
+        cells = np.where(grid.free & (away_m > p.hidden_m), np.int8(UNKNOWN), grid.cells)
+        return dataclasses.replace(grid, cells=cells)
     if origin_m is None or not p.floor_m < origin_m[2] < p.ceiling_m:
         raise MapFileError(
             "the floor of the cloud is seen nowhere without something on it",
             hint=f"obstacles are what is {projection.band_min_m:g} to {projection.band_max_m:g} m above the"
             " floor (settings projection.band_min_m and band_max_m)",
         )
-    _draw(builder, points, origin_m, projection, p)
+    _draw(builder, points, origin_m, projection)
     return builder.grid()
 
 
-def _tiles(points: F64, edge_m: float, margin_m: float) -> Iterator[tuple[F64, F64]]:
-    """Yield the lower left corner (2,) of each square of `edge_m` with points (N, 3), and the points (M, 3)
-    in it and up to `margin_m` around it."""
+def _tiles(points: F64) -> Iterator[tuple[F64, F64]]:
+    """Yield the lower left corner (2,) of each tile with points (N, 3), and the points (M, 3) that are in
+    sight of it."""
+    edge_m, margin_m = CLOUD_MAP.tile_m, CLOUD_MAP.sight_m
     points = points[np.argsort(points[:, 0], kind="stable")]
     for corner_m in np.unique(np.floor(points[:, :2] / edge_m), axis=0) * edge_m:
         low_m, high_m = corner_m - margin_m, corner_m + edge_m + margin_m
@@ -331,8 +335,9 @@ def _tiles(points: F64, edge_m: float, margin_m: float) -> Iterator[tuple[F64, F
         yield corner_m, strip[(strip[:, 1] >= low_m[1]) & (strip[:, 1] < high_m[1])]
 
 
-def _without_noise(points: F64, projection: ProjectionConfig, p: CloudMapParameters) -> F64:
+def _without_noise(points: F64, projection: ProjectionConfig) -> F64:
     """Return the points up to the ceiling, without obstacles of fewer than `obstacle_voxels` in a cell."""
+    p = CLOUD_MAP
     points = points[(points[:, 2] > -p.floor_m) & (points[:, 2] < p.ceiling_m)]
     cell = np.floor(points[:, :2] / projection.resolution_m).astype(np.int64)
     _, column = np.unique((cell[:, 0] << 32) + cell[:, 1], return_inverse=True)
@@ -341,26 +346,19 @@ def _without_noise(points: F64, projection: ProjectionConfig, p: CloudMapParamet
     return np.asarray(points[~band | (obstacles[column] >= p.obstacle_voxels)])
 
 
-def _viewpoints(near: F64, corner_m: F64, projection: ProjectionConfig, p: CloudMapParameters) -> F64:
+def _viewpoints(near: F64, corner_m: F64, projection: ProjectionConfig) -> F64:
     """Return viewpoints (K, 3) in a tile, one in each square of `spacing_m` that has room for it on visible
     floor.
 
     near : the points of the tile and around it. corner_m : (2,) of the tile.
     """
-    cell_m = projection.resolution_m
+    p, cell_m = CLOUD_MAP, projection.resolution_m
     side = round((p.tile_m + 2.0 * p.spacing_m) / cell_m)
     low_m = corner_m - p.spacing_m
-    cell = np.floor((near[:, :2] - low_m) / cell_m).astype(np.int64)
-    inside = ((cell >= 0) & (cell < side)).all(axis=1)
-
-    def seen(chosen: NDArray[np.bool_]) -> BoolGrid:
-        mask = np.zeros((side, side), np.bool_)
-        mask[tuple(cell[chosen & inside, ::-1].T)] = True
-        return mask
-
-    floor = _without_gaps(seen(np.abs(near[:, 2]) < p.floor_m), p.gap_m / cell_m)
-    obstacle = (near[:, 2] > projection.band_min_m) & (near[:, 2] < projection.band_max_m)
-    room_m = cv2.distanceTransform(floor * ~seen(obstacle), cv2.DIST_L2, 5) * cell_m
+    cell = np.floor((near[:, 1::-1] - low_m[::-1]) / cell_m).astype(np.int64)
+    seen = _mask(cell[np.abs(near[:, 2]) < p.floor_m], (side, side))
+    obstacle = _mask(cell[_between(near[:, 2], projection.band_min_m, projection.band_max_m)], (side, side))
+    room_m = cv2.distanceTransform(_without_gaps(seen, cell_m) * ~obstacle, cv2.DIST_L2, 5) * cell_m
     step = round(p.spacing_m / cell_m)
     squares = room_m[step:-step, step:-step]
     count = len(squares) // step
@@ -373,19 +371,17 @@ def _viewpoints(near: F64, corner_m: F64, projection: ProjectionConfig, p: Cloud
     return np.column_stack((xy_m, np.full(len(xy_m), p.height_m)))
 
 
-def _without_gaps(floor: BoolGrid, gap_cells: float) -> U8:
+def _without_gaps(floor: BoolGrid, cell_m: float) -> U8:
     """Close the narrow gaps of the visible floor (H, W); returns 0 or 1."""
-    side = 2 * round(gap_cells / 2) + 1
+    side = 2 * round(CLOUD_MAP.gap_m / cell_m / 2) + 1
     kernel = np.ones((side, side), np.uint8)
     return cv2.morphologyEx(floor.astype(np.uint8), cv2.MORPH_CLOSE, kernel).astype(np.uint8)
 
 
-def _draw(
-    builder: GridBuilder, near: F64, view_m: F64, projection: ProjectionConfig, p: CloudMapParameters
-) -> None:
+def _draw(builder: GridBuilder, near: F64, view_m: F64, projection: ProjectionConfig) -> None:
     """Draw the surroundings of a viewpoint (3,), as if a scan from there had returned them."""
     away = near - (view_m[0], view_m[1], 0.0)
-    away = away[np.einsum("ij,ij->i", away[:, :2], away[:, :2]) < p.sight_m**2]
+    away = away[np.einsum("ij,ij->i", away[:, :2], away[:, :2]) < CLOUD_MAP.sight_m**2]
     planar_scan = project_to_plane(
         away.astype(np.float32),
         stamp_ns=0,
@@ -393,32 +389,17 @@ def _draw(
         ground=Ground(np.array([0.0, 0.0, 1.0]), 0.0),
         config=projection,
     )
-    closed = dataclasses.replace(planar_scan, free_m=_without_slits(planar_scan.free_m, p.gap_m))
+    closed = dataclasses.replace(planar_scan, free_m=_without_slits(planar_scan.free_m))
     for _ in range(_SCANS_OF_A_VIEW):
         builder.add(closed, SE2(float(view_m[0]), float(view_m[1]), 0.0))
 
 
-def _near_seen_floor(grid: OccupancyGrid, points: F64, p: CloudMapParameters) -> OccupancyGrid:
-    """Remove the free cells of a grid that are far from all visible floor.
-
-    A view through a wall that was not scanned ends on some obstacle of another room.
-    """
-    floor = points[np.abs(points[:, 2]) < p.floor_m, :2]
-    row, column = grid.to_cell(floor).T
-    inside = (row >= 0) & (row < grid.cells.shape[0]) & (column >= 0) & (column < grid.cells.shape[1])
-    unseen = np.ones(grid.cells.shape, np.uint8)
-    unseen[row[inside], column[inside]] = 0
-    away_m = cv2.distanceTransform(unseen, cv2.DIST_L2, 5) * grid.resolution_m
-    cells = np.where(grid.free & (away_m > p.hidden_m), np.int8(UNKNOWN), grid.cells)
-    return dataclasses.replace(grid, cells=cells)
-
-
-def _without_slits(free_m: F32, gap_m: float) -> F32:
+def _without_slits(free_m: F32) -> F32:
     """Return free ranges (B,) that do not pass between obstacles which are less than `gap_m` apart.
 
     Scanned walls have holes, through which a view would show the next room in stripes.
     """
-    bearing_rad = 2.0 * np.pi / len(free_m)
+    gap_m, bearing_rad = CLOUD_MAP.gap_m, 2.0 * np.pi / len(free_m)
     known_m = np.where(free_m > 0.0, free_m, np.inf)
     shortest_m = known_m.copy()
     widest = int(0.5 * gap_m / bearing_rad / max(known_m.min(), gap_m))
@@ -429,9 +410,7 @@ def _without_slits(free_m: F32, gap_m: float) -> F32:
     return np.where(free_m > 0.0, shortest_m, 0.0).astype(np.float32)
 
 
-def drivable_plan(
-    level_points_m: NDArray[np.floating], parameters: CloudMapParameters = CLOUD_MAP
-) -> OccupancyGrid:
+def drivable_plan(level_points_m: NDArray[np.floating]) -> OccupancyGrid:
     """Draw where a robot can drive in a levelled cloud (N, 3), whose floor is at z = 0.
 
     A cell is free if the floor is visible and nothing stands on it at the heights of a robot, and occupied if
@@ -446,8 +425,9 @@ def drivable_plan(
     >>> bool(grid.free.any()), bool(grid.occupied.any())
     (True, True)
     """
-    p = parameters
-    voxels = _voxels(np.asarray(level_points_m, np.float64), p)
+    p, points = CLOUD_MAP, np.asarray(level_points_m, np.float64)
+    near = points[_between(points[:, 2], -p.floor_m, p.passage_m[1])]
+    voxels = np.unique(np.floor(near / p.resolution_m).astype(np.int64), axis=0)
     if not len(voxels):
         raise MapFileError("the cloud has no points near its floor")
     low = voxels[:, :2].min(axis=0)
@@ -464,8 +444,8 @@ def drivable_plan(
     def counts(chosen: NDArray[np.bool_]) -> I64:
         return np.bincount(cell[chosen], minlength=rows * columns).reshape(shape)
 
-    floor = _without_gaps(counts(np.abs(height_m) < p.floor_m) > 0, p.gap_m / p.resolution_m)
-    obstacles = counts((height_m > p.passage_m[0]) & (height_m < p.passage_m[1]))
+    floor = _without_gaps(counts(np.abs(height_m) < p.floor_m) > 0, p.resolution_m)
+    obstacles = counts(_between(height_m, *p.passage_m))
     cells = np.full(shape, UNKNOWN, np.int8)
     cells[floor > 0] = FREE
     cells[obstacles >= p.obstacle_voxels] = OCCUPIED
@@ -475,26 +455,19 @@ def drivable_plan(
     )
 
 
-def _voxels(points: F64, p: CloudMapParameters) -> I64:
-    """Return the indices (V, 3) of the voxels with points at the heights of a robot, each once."""
-    chosen = points[(points[:, 2] > -p.floor_m) & (points[:, 2] < p.passage_m[1])]
-    return np.asarray(np.unique(np.floor(chosen / p.resolution_m).astype(np.int64), axis=0))
-
-
-def check_plausible(points_m: NDArray[np.floating], parameters: CloudMapParameters = CLOUD_MAP) -> None:
+def check_plausible(points_m: NDArray[np.floating]) -> None:
     """Raise MapFileError for points (N, 3) that cannot be a building in metres, z up."""
-    p = parameters
     if not len(points_m):
         raise MapFileError("it holds neither points nor triangles")
     low, high = np.quantile(points_m, (0.01, 0.99), axis=0)
     extent = high - low
     size = " x ".join(f"{v:.0f}" if v >= 10.0 else f"{v:.2g}" for v in extent)
-    if extent[2] > p.tall_m:
+    if extent[2] > CLOUD_MAP.tall_m:
         raise MapFileError(
             f"the cloud is {size} large, too high for a building in metres",
             hint="--set read.unit_m=0.001 says millimetres, 0.01 centimetres; read.up=y another axis",
         )
-    if max(extent) < p.small_m:
+    if max(extent) < CLOUD_MAP.small_m:
         raise MapFileError(
             f"the cloud is {size} large, too small for a building in metres",
             hint="--set read.unit_m=1000 says that one unit is a kilometre",
@@ -510,13 +483,7 @@ _NEARLY_DEG = math.degrees(math.acos(LEVEL.level))
 """A plane that is tilted by less is level, and one that is nearer to upright may be a wall."""
 
 
-def level_cloud(
-    points_m: NDArray[np.floating],
-    parameters: CloudMapParameters = CLOUD_MAP,
-    *,
-    floor_z: float | None = None,
-    up: str = "z",
-) -> F64:
+def level_cloud(points_m: NDArray[np.floating], *, floor_z: float | None = None, up: str = "z") -> F64:
     """Return T_level_cloud (4, 4), which makes the floor of a cloud (N, 3) level, at z = 0.
 
     x and y stay as they are but for the tilt. The z axis of the cloud must point up within 55 degrees. Of
@@ -529,18 +496,29 @@ def level_cloud(
     Raises MapFileError if the cloud shows no floor, or one that is tilted by more.
     """
     points = np.asarray(points_m, np.float64)
-    check_plausible(points, parameters)
+    check_plausible(points)
     if floor_z is not None:
         lowered = np.eye(4)
         lowered[2, 3] = -floor_z
         return lowered
+    from pc2grid.open3d_core import o3d
+
     # A cloud may lie far from its origin, in coordinates of a country: it is turned about its middle.
     middle = np.median(points, axis=0)
     points = points - middle
-    ground = _refined(points, _lowest_floor(points, up), parameters)
-    T_level_cloud = leveling(ground.normal)
+    ground = _lowest_floor(points, up)
+    # `find_ground` uses a small sample: the plane is fitted again, to all points near it.
+    near = points[np.abs(ground.heights(points)) < CLOUD_MAP.floor_m]
+    near = near[random_subset(len(near), CLOUD_PARAMETERS.sample)]
+    o3d.utility.random.seed(0)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
+    model, _ = cloud.segment_plane(CLOUD_MAP.refine_m, 3, 1000, probability=1.0)
+    plane: F64 = np.asarray(model) / np.linalg.norm(model[:3])
+    if plane[:3] @ ground.normal < 0.0:
+        plane = -plane
+    T_level_cloud = leveling(plane[:3])
     T_level_cloud[:3, 3] = middle - T_level_cloud[:3, :3] @ middle
-    T_level_cloud[2, 3] += ground.offset_m - middle[2]
+    T_level_cloud[2, 3] += float(plane[3]) - middle[2]
     return T_level_cloud
 
 
@@ -617,21 +595,6 @@ def _no_floor(normal: F64 | None, up: str) -> MapFileError:
     )
 
 
-def _refined(points: F64, ground: Ground, p: CloudMapParameters) -> Ground:
-    """Fit the ground to all points near it; `find_ground` uses a small sample."""
-    from pc2grid.open3d_core import o3d
-
-    near = points[np.abs(ground.heights(points)) < p.floor_m]
-    near = near[random_subset(len(near), CLOUD_PARAMETERS.sample)]
-    o3d.utility.random.seed(0)
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(near))
-    model, _ = cloud.segment_plane(p.refine_m, 3, 1000, probability=1.0)
-    plane: F64 = np.asarray(model) / np.linalg.norm(model[:3])
-    if plane[:3] @ ground.normal < 0.0:
-        plane = -plane
-    return Ground(plane[:3], float(plane[3]))
-
-
 # --- is the right side up, and the right floor mapped? ------------------------------------------------
 
 _CELL_M = CLOUD_MAP.gap_m
@@ -651,13 +614,6 @@ _LIES = 2.0
 lies on its side. 3.4 in rooms of 5 m."""
 
 
-class OtherFloor(NamedTuple):
-    """A floor above the mapped one: its height above that, and its visible area."""
-
-    height_m: float
-    area_m2: float
-
-
 def is_upside_down(level_points_m: NDArray[np.floating]) -> bool:
     """Return True if the floor of a levelled cloud (V, 3), at z = 0, is more likely a ceiling.
 
@@ -665,17 +621,17 @@ def is_upside_down(level_points_m: NDArray[np.floating]) -> bool:
     on a floor than hangs from a ceiling. Without a ceiling the answer is False.
     """
     points = np.asarray(level_points_m, np.float64)
-    ceiling_m = _ceiling_m(points)
+    ceiling_m = next((height_m for height_m in _surfaces(points) if height_m < CLOUD_MAP.ceiling_m), None)
     if ceiling_m is None:
         return False
     points = points[(points[:, 2] > -_NEAR_M) & (points[:, 2] < ceiling_m + _NEAR_M)]
     below, above = points[:, 2], ceiling_m - points[:, 2]
-    cells = _cells(points)
-    floor, ceiling = (_free(cells, heights) for heights in (below, above))
+    cells, shape = _cells(points)
+    floor, ceiling = (_free(cells, shape, heights) for heights in (below, above))
     if not floor.any() or not ceiling.any():
         return False
     doors = math.log2(_largest_share(ceiling) / _largest_share(floor))
-    standing, hanging = _things(cells, below, above)
+    standing, hanging = _things(cells, shape, below, above)
     furniture = (hanging - standing) / (hanging + standing + 0.5 * float(floor.sum()))
     return doors + furniture > _CERTAIN
 
@@ -695,20 +651,23 @@ def side_that_is_up(level_points_m: NDArray[np.floating]) -> F64 | None:
     return best.normal if upright and size > _LIES * max(upright) else None
 
 
-def other_floors(level_points_m: NDArray[np.floating]) -> list[OtherFloor]:
-    """Return the floors above that of a levelled cloud (V, 3), from below: free to pass, with walls
-    around."""
+def other_floors(level_points_m: NDArray[np.floating]) -> list[tuple[float, float]]:
+    """Return the floors above that of a levelled cloud (V, 3), from below: free to pass, with walls around.
+
+    Each is its height above the mapped one, m, and its visible area, m2.
+    """
     points = np.asarray(level_points_m, np.float64)
+    cells, shape = _cells(points)
     found = []
     for height_m in _surfaces(points):
-        heights, cells = points[:, 2] - height_m, _cells(points)
+        heights = points[:, 2] - height_m
         on_it = np.abs(heights) < 0.5 * _NEAR_M
-        seen = _mask(cells, on_it)
-        in_the_way = _mask(cells, _between(heights, _NEAR_M, _PASSAGE_M))
-        overhead = _mask(cells, _between(heights, _PASSAGE_M, CLOUD_MAP.ceiling_m))
+        seen = _mask(cells[on_it], shape)
+        in_the_way = _mask(cells[_between(heights, _NEAR_M, _PASSAGE_M)], shape)
+        overhead = _mask(cells[_between(heights, _PASSAGE_M, CLOUD_MAP.ceiling_m)], shape)
         area = int(seen.sum())
         if (seen & ~in_the_way).sum() > 0.5 * area and (seen & overhead).sum() > _OVERHEAD_SHARE * area:
-            found.append(OtherFloor(float(np.median(points[on_it, 2])), area * _CELL_M**2))
+            found.append((float(np.median(points[on_it, 2])), area * _CELL_M**2))
     return found
 
 
@@ -725,41 +684,34 @@ def _surfaces(points: F64) -> list[float]:
     return [float(height_m) for height_m in middle_m[chosen]]
 
 
-def _ceiling_m(points: F64) -> float | None:
-    """Return the height of the ceiling of the storey at z = 0; None if there is none."""
-    ceilings = [height_m for height_m in _surfaces(points) if height_m < CLOUD_MAP.ceiling_m]
-    return ceilings[0] if ceilings else None
-
-
-def _cells(points: F64) -> I64:
-    """Return the cell (V, 2) of each point, from (0, 0)."""
+def _cells(points: F64) -> tuple[I64, tuple[int, int]]:
+    """Return the cell (V, 2) of each point, from (0, 0), and the size of a grid that contains them."""
     cells = np.floor(points[:, :2] / _CELL_M).astype(np.int64)
-    return np.asarray(cells - cells.min(axis=0))
+    cells -= cells.min(axis=0)
+    rows, columns = (cells.max(axis=0) + 1).tolist()
+    return cells, (rows, columns)
 
 
-def _mask(cells: I64, chosen: NDArray[np.bool_]) -> BoolGrid:
-    """Return the cells (R, C) that contain some of the chosen points."""
-    mask = np.zeros(cells.max(axis=0) + 1, np.bool_)
-    mask[tuple(cells[chosen].T)] = True
+def _mask(cells: I64, shape: tuple[int, ...]) -> BoolGrid:
+    """Return a mask (H, W) of cells (N, 2), given as (row, column); those outside are left out."""
+    mask = np.zeros(shape, np.bool_)
+    inside = ((cells >= 0) & (cells < shape)).all(axis=1)
+    mask[tuple(cells[inside].T)] = True
     return mask
 
 
-def _between(heights: F64, low_m: float, high_m: float) -> NDArray[np.bool_]:
+def _between(heights: NDArray[np.floating], low_m: float, high_m: float) -> NDArray[np.bool_]:
     return (heights > low_m) & (heights < high_m)
 
 
-def _free(cells: I64, distances: F64) -> BoolGrid:
+def _free(cells: I64, shape: tuple[int, int], distances: F64) -> BoolGrid:
     """Return the free cells (R, C) of a floor or ceiling whose neighbours are free, too.
 
     distances : (V,) of the points from it.
     """
-    free = _mask(cells, np.abs(distances) < _NEAR_M) & ~_mask(cells, _between(distances, _NEAR_M, _BAND_M))
+    seen = _mask(cells[np.abs(distances) < _NEAR_M], shape)
+    free = seen & ~_mask(cells[_between(distances, _NEAR_M, _BAND_M)], shape)
     return cv2.erode(free.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
-
-
-def _grown(mask: BoolGrid) -> BoolGrid:
-    """Return the cells (R, C) and their neighbours."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
 
 
 def _largest_share(free: BoolGrid) -> float:
@@ -768,7 +720,7 @@ def _largest_share(free: BoolGrid) -> float:
     return float(stats[1:, cv2.CC_STAT_AREA].max() / free.sum())
 
 
-def _things(cells: I64, below: F64, above: F64) -> tuple[int, int]:
+def _things(cells: I64, shape: tuple[int, int], below: F64, above: F64) -> tuple[int, int]:
     """Count the voxels of objects that stand on the floor, and of those that hang from the ceiling.
 
     Walls, which do both, are left out. below, above : (V,) distances of the points from the floor and from
@@ -777,12 +729,13 @@ def _things(cells: I64, below: F64, above: F64) -> tuple[int, int]:
     from scipy import ndimage
 
     ends = [_between(distances, _NEAR_M, _BAND_M) for distances in (below, above)]
-    low, high = (_mask(cells, end) for end in ends)
+    low, high = (_mask(cells[end], shape) for end in ends)
     # A wall that leans by a hair may have its ends in neighbouring cells.
-    wall = (low & _grown(high)) | (high & _grown(low))
+    near_low, near_high = (ndimage.binary_dilation(end, np.ones((3, 3), np.bool_)) for end in (low, high))
+    wall = (low & near_high) | (high & near_low)
     kept = (below > _NEAR_M) & (above > _NEAR_M) & ~wall[tuple(cells.T)]
     at = (*cells[kept].T, (below[kept] / _CELL_M).astype(np.int64))
-    voxels = np.zeros((*wall.shape, int(below.max() / _CELL_M) + 1), np.bool_)
+    voxels = np.zeros((*shape, int(below.max() / _CELL_M) + 1), np.bool_)
     voxels[at] = True
     labels, count = ndimage.label(voxels, np.ones((3, 3, 3)))
     sizes = np.bincount(labels.ravel(), minlength=count + 1)

@@ -7,6 +7,7 @@ import pytest
 
 from pc2grid.errors import MapFileError
 from pc2grid.geometry import F64, transform_points
+from pc2grid.grids import drawn
 from pc2grid.grids.drawn import (
     CLOUD_MAP,
     CloudMapParameters,
@@ -52,7 +53,7 @@ def test_floor_is_levelled(height_m: float, tilt_deg: float) -> None:
     assert level[:, 2].max() == pytest.approx(2.5, abs=RESOLUTION_M)
 
 
-def test_plan_is_free_where_floor_is_seen_and_nothing_stands() -> None:
+def test_plan_is_free_where_floor_is_seen_and_nothing_stands(monkeypatch: pytest.MonkeyPatch) -> None:
     grid = drivable_plan(room_cloud())
     assert cell_at(grid, 3.0, 2.0) == 0
     assert cell_at(grid, 5.25, 3.0) == 100  # the pillar
@@ -60,11 +61,13 @@ def test_plan_is_free_where_floor_is_seen_and_nothing_stands() -> None:
     assert cell_at(grid, -0.3, 3.0) == -1
     # Nothing above the floor blocks a lower robot; here the table is one voxel thick.
     assert cell_at(grid, 1.5, 4.4) == 0
-    one_is_enough = CloudMapParameters(obstacle_voxels=1)
-    assert cell_at(drivable_plan(room_cloud(), one_is_enough), 1.5, 4.4) == 100
+    monkeypatch.setattr(drawn, "CLOUD_MAP", CloudMapParameters(obstacle_voxels=1))
+    assert cell_at(drivable_plan(room_cloud()), 1.5, 4.4) == 100
 
 
-def test_floor_hidden_by_furniture_is_free_up_to_the_wall_and_a_hole_in_it_is_closed() -> None:
+def test_floor_hidden_by_furniture_is_free_up_to_the_wall_and_a_hole_in_it_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     cloud = room_cloud()
     hidden = (cloud[:, 2] < 0.1) & (cloud[:, 0] > 0.1) & (cloud[:, 0] < 0.4) & (cloud[:, 1] > 1.0)
     hole = (cloud[:, 0] > 7.9) & (np.abs(cloud[:, 1] - 2.0) < 0.06)
@@ -76,7 +79,8 @@ def test_floor_hidden_by_furniture_is_free_up_to_the_wall_and_a_hole_in_it_is_cl
     assert cell_at(drivable_plan(cloud), 0.25, 3.0) == -1
     assert cell_at(grid, 8.5, 2.0) < 20  # seen from its own floor
     one_room = CloudMapParameters(floor_m=0.02, spacing_m=20.0, tile_m=40.0)
-    assert cell_at(map_cloud(cloud, parameters=one_room), 8.5, 2.0) == -1
+    monkeypatch.setattr(drawn, "CLOUD_MAP", one_room)
+    assert cell_at(map_cloud(cloud), 8.5, 2.0) == -1
 
 
 def test_ground_far_from_seen_floor_stays_unknown() -> None:
@@ -241,8 +245,8 @@ def test_nothing_is_said_where_nothing_shows_it() -> None:
 def test_other_floors_are_found(rise_m: float, storeys: int, ceiling: bool) -> None:
     above = [raised(rooms_cloud(ceiling=ceiling), i * rise_m) for i in range(storeys)]
     found = other_floors(level(np.concatenate(above)))
-    assert [floor.height_m for floor in found] == pytest.approx(np.arange(1, storeys) * rise_m, abs=0.03)
-    assert all(45.0 < floor.area_m2 < 60.0 for floor in found)
+    assert [height_m for height_m, _ in found] == pytest.approx(np.arange(1, storeys) * rise_m, abs=0.03)
+    assert all(45.0 < area_m2 < 60.0 for _, area_m2 in found)
 
 
 def test_a_ceiling_is_no_other_floor() -> None:
