@@ -30,15 +30,15 @@ class OccupancyParameters:
         threshold, two misses make it free. A hit weighs two misses, so a thin wall that passing rays graze
         stays; three misses clear a person who has left.
     body_m : radius of the robot's body around the origin of the base, which is free of obstacles.
-    lone_window, lone_cells : a cell that was hit once is noise if at least `lone_cells` cells in the square
-        of `lone_window` around it were hit more often.
+    lone_window, lone_cells : a cell that was hit once is noise if at least `lone_cells` cells in the window
+        of `lone_window` cells around it were hit more often.
     """
 
     hit: int = 150
     miss: int = -75
     limit: int = 500
     body_m: float = 0.15
-    lone_window: int = 3
+    lone_window: tuple[int, int] = (3, 3)
     lone_cells: int = 3
 
 
@@ -55,12 +55,11 @@ class GridBuilder:
     passed over it becomes a low obstacle.
     """
 
-    def __init__(self, config: ProjectionConfig, parameters: OccupancyParameters = OCCUPANCY) -> None:
+    def __init__(self, config: ProjectionConfig) -> None:
         self._config = config
-        self._parameters = parameters
         self._tiles: defaultdict[tuple[int, int], _Tile] = defaultdict(_Tile)
         self._things_seen = self._heights_seen = False
-        self._planes_m: tuple[float, float] | None = None  # lowest and highest plane; NaN: not of planes
+        self._planes_m = math.inf, -math.inf  # lowest and highest plane; NaN: not of planes
 
     def add(self, planar_scan: PlanarScan, T_grid_base: SE2) -> None:
         """Draw one planar scan taken at `T_grid_base`.
@@ -68,15 +67,15 @@ class GridBuilder:
         Raises LimitExceeded if the map needs more than `max_cells`.
         """
         height_m = math.nan if planar_scan.height_m is None else planar_scan.height_m
-        low_m, high_m = self._planes_m or (height_m, height_m)
+        low_m, high_m = self._planes_m
         self._planes_m = float(np.minimum(low_m, height_m)), float(np.maximum(high_m, height_m))
         walls, hits, things, low = self._drawn(planar_scan, T_grid_base)
         standing, heights = np.zeros_like(walls), np.zeros(walls.shape, np.uint8)
         self._things_seen |= len(things) > 0
         if self._things_seen:
-            standing[walls != 0] = self._parameters.miss
-            standing[things[:, 1], things[:, 0]] = self._parameters.hit
-            standing[walls > 0] = self._parameters.miss
+            standing[walls != 0] = OCCUPANCY.miss
+            standing[things[:, 1], things[:, 0]] = OCCUPANCY.hit
+            standing[walls > 0] = OCCUPANCY.miss
         if len(planar_scan.heights):
             self._heights_seen = True
             columns, rows = np.concatenate((hits, things)).T
@@ -86,9 +85,9 @@ class GridBuilder:
             if touched.any():
                 tile = self._tiles[number]
                 tile.observed[of_tile] |= touched
-                self._sum(tile.walls[of_tile], walls[of_window])
+                _sum(tile.walls[of_tile], walls[of_window])
                 if self._things_seen:
-                    self._sum(tile.things[of_tile], standing[of_window])
+                    _sum(tile.things[of_tile], standing[of_window])
                 if self._heights_seen:
                     tile.heights[of_tile] |= heights[of_window]
         self._check_size(len(self._tiles) * _TILE * _TILE)
@@ -100,7 +99,7 @@ class GridBuilder:
         The latter (M, 2) and (L, 2) are columns and rows of the window, whose first cell is at the last array
         (2,), column and row in the grid's frame.
         """
-        p, resolution = self._parameters, self._config.resolution_m
+        p, resolution = OCCUPANCY, self._config.resolution_m
         outline = T_grid_base.apply(planar_scan.free_polygon()) / resolution
         hits, things = (
             np.floor(T_grid_base.apply(points_m) / resolution).astype(np.int64)
@@ -124,14 +123,9 @@ class GridBuilder:
         cv2.circle(update, (here - low).tolist(), round(p.body_m / resolution), 2 * p.miss, -1)
         return update, hits, things, low
 
-    def _sum(self, evidence: NDArray[np.int16], more: NDArray[np.int16]) -> None:
-        """Add log-odds in place, within the limit."""
-        limit = self._parameters.limit
-        np.clip(evidence + more, -limit, limit, out=evidence)
-
     def grid(self) -> OccupancyGrid:
         """Return the map so far: 0..100 where observed, unknown elsewhere, cropped to the observed part."""
-        resolution = self._config.resolution_m
+        p, resolution = OCCUPANCY, self._config.resolution_m
         if not self._tiles:
             return OccupancyGrid(
                 cells=np.zeros((0, 0), np.int8), resolution_m=resolution, origin_m=(0.0, 0.0)
@@ -146,38 +140,32 @@ class GridBuilder:
         for number, tile in self._tiles.items():
             r, c = ((np.array(number) - first) * _TILE).tolist()
             here = np.s_[r : r + _TILE, c : c + _TILE]
-            percent = np.rint(_percent(tile.walls.astype(np.float32))).astype(np.int8)
-            known = np.where(tile.observed, percent, UNKNOWN)
+            odds = np.exp(tile.walls.astype(np.float32) / np.float32(-100.0))
+            known = np.where(tile.observed, np.rint(OCCUPIED / (1.0 + odds)).astype(np.int8), UNKNOWN)
             known[(tile.things > 0) & (tile.things >= tile.walls)] = THING
             cells[here], walls[here], heights[here] = known, tile.walls, tile.heights
-        self._erase_lone_hits(cells, walls)
+        # What was hit once and never observed free, beside cells hit more often, is a return one cell in
+        # front of its wall. No later ray clears it, because the wall stops all of them.
+        often = cv2.boxFilter(
+            (walls > p.hit).astype(np.uint8),
+            -1,
+            p.lone_window,
+            normalize=False,
+            borderType=cv2.BORDER_CONSTANT,
+        )
+        cells[(walls == p.hit) & (often >= p.lone_cells)] = UNKNOWN
         known_rows, known_columns = (np.flatnonzero((cells >= FREE).any(axis=axis)) for axis in (1, 0))
         r0, c0 = int(known_rows[0]), int(known_columns[0])
         kept = np.s_[r0 : int(known_rows[-1]) + 1, c0 : int(known_columns[-1]) + 1]
         y, x = (first * _TILE + (r0, c0)).tolist()
+        low_m, high_m = self._planes_m
         return OccupancyGrid(
             cells=cells[kept].copy(),
             heights=heights[kept].copy() if self._heights_seen else None,
             resolution_m=resolution,
             origin_m=(x * resolution, y * resolution),
-            height_m=self._height_m,
+            height_m=low_m if high_m - low_m < resolution else None,  # of one plane, or not
         )
-
-    @property
-    def _height_m(self) -> float | None:
-        """Return the height of the scan plane; None if the scans are not all of one plane."""
-        low_m, high_m = self._planes_m or (math.nan, math.nan)
-        return low_m if high_m - low_m < self._config.resolution_m else None
-
-    def _erase_lone_hits(self, cells: NDArray[np.int8], log_odds: NDArray[np.int16]) -> None:
-        """Make cells (H, W) unknown that were hit once, never observed free, beside cells hit more often.
-
-        Such a hit is a return one cell in front of its wall. No later ray clears it, because the wall stops
-        all of them.
-        """
-        hit = self._parameters.hit
-        often = _count_around(log_odds > hit, self._parameters.lone_window)
-        cells[(log_odds == hit) & (often >= self._parameters.lone_cells)] = UNKNOWN
 
     def _check_size(self, cells: int) -> None:
         if cells > self._config.max_cells:
@@ -219,19 +207,9 @@ def _under(low: I64, shape: tuple[int, ...]) -> Iterator[tuple[tuple[int, int], 
             yield (row, column), of_tile, of_window
 
 
-def _percent(log_odds: NDArray[np.floating] | np.floating) -> NDArray[np.floating]:
-    """Return log-odds in hundredths as a probability in percent."""
-    return np.asarray(OCCUPIED / (1.0 + np.exp(-log_odds / np.float32(100.0))))
-
-
-def _count_around(mask: NDArray[np.bool_], width: int) -> NDArray[np.uint8]:
-    """Count the cells of the mask (H, W) in the square of `width` cells around each cell."""
-    return np.asarray(
-        cv2.boxFilter(
-            mask.astype(np.uint8), -1, (width, width), normalize=False, borderType=cv2.BORDER_CONSTANT
-        ),
-        np.uint8,
-    )
+def _sum(evidence: NDArray[np.int16], more: NDArray[np.int16]) -> None:
+    """Add log-odds in place, within the limit."""
+    np.clip(evidence + more, -OCCUPANCY.limit, OCCUPANCY.limit, out=evidence)
 
 
 def _rims(corners: NDArray[np.int32], free_m: NDArray[np.float32]) -> list[NDArray[np.int32]]:
