@@ -64,34 +64,20 @@ class LikelihoodField:
     origin_m: tuple[float, float]
 
     @staticmethod
-    def of(
-        grid: OccupancyGrid, parameters: LikelihoodParameters = LIKELIHOOD, *, margin_m: float = 0.0
-    ) -> LikelihoodField:
-        """Return the field of a grid, with `margin_m` of unknown cells added on each side."""
-        padded = padded_grid(grid, margin_m)
-        occupied = padded.occupied
-        return LikelihoodField.around(
-            occupied, occupied | padded.free, padded.resolution_m, padded.origin_m, parameters
-        )
-
-    @staticmethod
-    def around(
-        occupied: BoolGrid,
-        known: BoolGrid,
-        resolution_m: float,
-        origin_m: tuple[float, float],
-        parameters: LikelihoodParameters = LIKELIHOOD,
-    ) -> LikelihoodField:
-        """Return the field of a mask (H, W) of occupied cells; `known` (H, W) are all observed cells."""
-        values = np.zeros(occupied.shape, np.uint8)
-        if occupied.any():
-            distance = cv2.distanceTransform((~occupied).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    def of(grid: OccupancyGrid, stands: BoolGrid) -> LikelihoodField:
+        """Return the field of those cells (H, W) of a grid in which something stands."""
+        known = stands | grid.occupied | grid.free
+        values = np.zeros(stands.shape, np.uint8)
+        if stands.any():
+            distance = cv2.distanceTransform((~stands).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
             # Farther away than this the likelihood is below 1/255.
-            sigma_cells = parameters.sigma_m / resolution_m
+            sigma_cells = LIKELIHOOD.sigma_m / grid.resolution_m
             near = distance < sigma_cells * math.sqrt(2.0 * math.log(255.0))
             values[near] = np.exp(-0.5 * (distance[near] / sigma_cells) ** 2) * 255.0
-        values[~known] = np.maximum(values[~known], parameters.neutral_value)
-        return LikelihoodField(values=values, known=known, resolution_m=resolution_m, origin_m=origin_m)
+        values[~known] = np.maximum(values[~known], LIKELIHOOD.neutral_value)
+        return LikelihoodField(
+            values=values, known=known, resolution_m=grid.resolution_m, origin_m=grid.origin_m
+        )
 
     def at(self, points_m: NDArray[np.floating], *, above: bool = False) -> tuple[F32, NDArray[np.bool_]]:
         """Return the likelihood (N,) 0..1 in the cells of points (N, 2), and a mask (N,) of the known cells.
@@ -99,29 +85,14 @@ class LikelihoodField:
         Both are 0 outside the field. above : the field is of a higher plane than the points. Its walls stand
         on the floor, but its free space passes over low obstacles, so only ground near walls counts as known.
         """
-        height, width = self.values.shape
-        cells = np.floor((points_m - np.asarray(self.origin_m)) / self.resolution_m).astype(np.int64)
-        column, row = cells[:, 0], cells[:, 1]
-        inside = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        flat = np.where(inside, row * width + column, 0)
-        known = inside & self.known.reshape(-1)[flat]
-        values = np.where(inside, self.values.reshape(-1)[flat], 0)
+        xy = np.floor((points_m - np.asarray(self.origin_m)) / self.resolution_m).astype(np.int64)
+        inside = ((xy >= 0) & (xy < self.values.shape[::-1])).all(axis=1)
+        column, row = np.where(inside[:, None], xy, 0).T
+        known = inside & self.known[row, column]
+        values = np.where(inside, self.values[row, column], 0)
         if above:
             known &= values > LIKELIHOOD.neutral_value
         return values * np.float32(1.0 / 255.0), known
-
-
-def padded_grid(grid: OccupancyGrid, margin_m: float) -> OccupancyGrid:
-    """Return the grid with `margin_m`, rounded to whole cells, of unknown cells on each side."""
-    n = round(margin_m / grid.resolution_m)
-    if not n:
-        return grid
-    return replace(
-        grid,
-        cells=np.pad(grid.cells, n, constant_values=UNKNOWN),
-        heights=None if grid.heights is None else np.pad(grid.heights, n),
-        origin_m=(grid.origin_m[0] - n * grid.resolution_m, grid.origin_m[1] - n * grid.resolution_m),
-    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -176,41 +147,47 @@ class Walls:
     @staticmethod
     def of(
         grid: OccupancyGrid,
-        parameters: WallParameters = WALLS,
         *,
         margin_m: float = 0.0,
         drawn: bool = False,
     ) -> Walls:
-        """Prepare a grid; the field gets `margin_m` of unknown cells on each side.
+        """Prepare a grid; it gets `margin_m`, rounded to whole cells, of unknown cells on each side.
 
         drawn : True for a map that was not built here: cells that no ray can have ended in are left out, see
         `_seen`.
         """
-        grid = padded_grid(grid, margin_m)
+        n = round(margin_m / grid.resolution_m)
+        if n:
+            grid = replace(
+                grid,
+                cells=np.pad(grid.cells, n, constant_values=UNKNOWN),
+                heights=None if grid.heights is None else np.pad(grid.heights, n),
+                origin_m=(grid.origin_m[0] - n * grid.resolution_m, grid.origin_m[1] - n * grid.resolution_m),
+            )
         if grid.heights is None:
             stands = _seen(grid) if drawn else grid.occupied
-            return Walls._of(grid, stands, stands, parameters)
-        stands = grid.occupied | _things(grid, parameters)
+            return Walls._of(grid, stands, stands)
+        # Low obstacles without grains of noise: the median around each cell.
+        things = cv2.medianBlur(grid.things.astype(np.uint8), WALLS.grain_cells) > 0
+        stands = grid.occupied | things
         never_passed = stands & (grid.heights < 1 << SLICES)
         return replace(
-            Walls._of(grid, stands, _edges(stands), parameters),
-            at_all_heights=Walls._of(grid, stands, _edges(never_passed), parameters),
+            Walls._of(grid, stands, _edges(stands)),
+            at_all_heights=Walls._of(grid, stands, _edges(never_passed)),
         )
 
     @staticmethod
-    def _of(grid: OccupancyGrid, stands: BoolGrid, shown: BoolGrid, parameters: WallParameters) -> Walls:
+    def _of(grid: OccupancyGrid, stands: BoolGrid, shown: BoolGrid) -> Walls:
         """Prepare a grid with `stands` (H, W) as the cells of the field, and `shown` (H, W) as those of the
         points.
         """
         cells = cells_of(shown)
-        cells = cells[thin_evenly(grid.to_point(cells), parameters.spacing_m)]
+        cells = cells[thin_evenly(grid.to_point(cells), WALLS.spacing_m)]
         points_m = grid.to_point(cells).astype(np.float32)
-        weights = permanence(shown, cells, grid.resolution_m, parameters)
-        weights[grid.things[cells[:, 0], cells[:, 1]]] *= parameters.movable
+        weights = permanence(shown, cells, grid.resolution_m)
+        weights[grid.things[cells[:, 0], cells[:, 1]]] *= WALLS.movable
         return Walls(
-            field=LikelihoodField.around(
-                stands, stands | grid.occupied | grid.free, grid.resolution_m, grid.origin_m
-            ),
+            field=LikelihoodField.of(grid, stands),
             points_m=points_m,
             before_m=points_m,
             weights=weights,
@@ -254,12 +231,6 @@ class Walls:
         return float(self.weights.sum(dtype=np.float64))
 
 
-def _things(grid: OccupancyGrid, parameters: WallParameters) -> BoolGrid:
-    """Return the low obstacles (H, W) of a grid, without grains of noise: the median around each cell."""
-    things: BoolGrid = cv2.medianBlur(grid.things.astype(np.uint8), parameters.grain_cells) > 0
-    return things
-
-
 def _seen(grid: OccupancyGrid) -> BoolGrid:
     """Return the occupied cells (H, W) in which a ray can have ended.
 
@@ -282,9 +253,7 @@ def _edges(stands: BoolGrid) -> BoolGrid:
     return stands & ~inside
 
 
-def permanence(
-    occupied: BoolGrid, cells: I64, resolution_m: float, parameters: WallParameters = WALLS
-) -> F32:
+def permanence(occupied: BoolGrid, cells: I64, resolution_m: float) -> F32:
     """Return the permanence (K,) 0..1 of the objects in `cells` (K, 2; row, column): how likely they stay in
     place.
 
@@ -295,7 +264,7 @@ def permanence(
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(closed, connectivity=8)
     longer = boxes[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]].max(axis=1)
     extent_m = longer[labels[cells[:, 0], cells[:, 1]]] * resolution_m
-    return np.asarray(np.minimum(extent_m / parameters.fixed_m, 1.0), np.float32)
+    return np.asarray(np.minimum(extent_m / WALLS.fixed_m, 1.0), np.float32)
 
 
 def thin_evenly(points_m: NDArray[np.floating], spacing_m: float) -> NDArray[np.intp]:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.ndimage import distance_transform_edt
 
+from pc2grid.matching import walls as matching_walls
 from pc2grid.matching.walls import (
     LIKELIHOOD,
     WALLS,
@@ -105,11 +106,12 @@ def test_a_laser_must_have_seen_what_stands_at_all_heights() -> None:
     assert seen.weights[table] == pytest.approx(WALLS.movable * 1.6 / WALLS.fixed_m)
 
 
-def test_of_a_thing_its_edges_must_have_been_seen_and_not_its_inside() -> None:
+def test_of_a_thing_its_edges_must_have_been_seen_and_not_its_inside(monkeypatch: pytest.MonkeyPatch) -> None:
     cells = np.zeros((40, 40), np.int8)
     cells[10:30, 10:30] = OCCUPIED
     grid = OccupancyGrid(cells=cells, heights=np.zeros_like(cells), resolution_m=0.05, origin_m=(0.0, 0.0))
-    walls = Walls.of(grid, WallParameters(spacing_m=0.05))
+    monkeypatch.setattr(matching_walls, "WALLS", WallParameters(spacing_m=0.05))
+    walls = Walls.of(grid)
     # What stands at heights that are not known stands at all of them.
     assert len(walls.facing(OF_A_LASER).points_m) == len(walls.facing(walls).points_m) == 4 * 19
 
@@ -136,13 +138,16 @@ def a_grid(resolution_m: float = 0.05) -> OccupancyGrid:
 
 
 @pytest.mark.parametrize(("resolution_m", "sigma_m"), [(0.05, 0.1), (0.1, 0.1), (0.03, 0.07)])
-def test_the_field_is_a_gaussian_of_the_exact_distance(resolution_m: float, sigma_m: float) -> None:
+def test_the_field_is_a_gaussian_of_the_exact_distance(
+    resolution_m: float, sigma_m: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     grid = a_grid(resolution_m)
     distance = distance_transform_edt(~grid.occupied)
     expected = np.exp(-0.5 * (distance * (resolution_m / sigma_m)) ** 2) * 255.0
     unknown = ~(grid.occupied | grid.free)  # never observed, or neither free nor occupied
     expected[unknown] = np.maximum(expected[unknown], LIKELIHOOD.neutral * 255.0)
-    field = LikelihoodField.of(grid, LikelihoodParameters(sigma_m=sigma_m))
+    monkeypatch.setattr(matching_walls, "LIKELIHOOD", LikelihoodParameters(sigma_m=sigma_m))
+    field = LikelihoodField.of(grid, grid.occupied)
     assert np.abs(field.values - np.floor(expected)).max() <= 1  # float32 against float64
     assert np.mean(field.values == np.floor(expected)) > 0.999
     assert np.array_equal(field.known, ~unknown)
@@ -150,7 +155,7 @@ def test_the_field_is_a_gaussian_of_the_exact_distance(resolution_m: float, sigm
 
 def test_points_are_looked_up_in_their_cells_and_outside_nothing_is_known() -> None:
     grid = a_grid()
-    field = LikelihoodField.of(grid)
+    field = LikelihoodField.of(grid, grid.occupied)
     cells = np.argwhere(grid.occupied)
     likelihood, known = field.at(grid.to_point(cells))
     assert (likelihood == 1.0).all() and known.all()
