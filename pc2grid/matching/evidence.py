@@ -91,12 +91,12 @@ class Evidence:
         sharpness = math.sqrt(self.compared * (1.0 - self.likeness**2))
         return 1.0, self.log_likelihood, self.lead * sharpness
 
-    def log_odds(self, p: EvidenceParameters = EVIDENCE) -> float:
+    def log_odds(self) -> float:
         """Return z, the logarithm of the mass of the place over that of "nowhere"; minus infinity without
         walls."""
         if not self.compared:
             return -math.inf
-        return float(np.dot((p.bias, p.fit, p.lead), self.terms))
+        return float(np.dot((EVIDENCE.bias, EVIDENCE.fit, EVIDENCE.lead), self.terms))
 
 
 NO_EVIDENCE = Evidence(known_agreement=0.0, compared=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
@@ -141,25 +141,20 @@ def with_leads(each: Sequence[Evidence], scores: Sequence[float]) -> tuple[Evide
     return tuple(max(compress(led, equal), key=Evidence.log_odds) for equal in alike)
 
 
-def masses(
-    evidence: Sequence[Evidence], prior: float | Sequence[float] = 1.0, p: EvidenceParameters = EVIDENCE
-) -> F64:
+def masses(evidence: Sequence[Evidence], prior: float | Sequence[float] = 1.0) -> F64:
     """(H,) probability of each place; what is missing to 1 is "nowhere".
 
     prior : of each place, relative to that of "nowhere".
     """
-    log_odds = np.array([e.log_odds(p) for e in evidence]) + np.log(prior)
+    log_odds = np.array([e.log_odds() for e in evidence]) + np.log(prior)
     highest = max(0.0, *log_odds, 0.0)
     odds = np.exp(log_odds - highest)
     return np.asarray(odds / (math.exp(-highest) + odds.sum()))
 
 
 def tempered(agreement: float, points: float) -> float:
-    """Return the log-likelihood of wall points that agree so well, tempered by their number."""
-    return log_likelihood_ratio(agreement) * points / (points + EVIDENCE.few)
-
-
-def log_likelihood_ratio(agreement: float) -> float:
-    """Return l of an agreement, 0..1: 0 at what wrong places reach."""
+    """Return l of the agreement of wall points, 0..1, tempered by their number: 0 at what wrong places
+    reach."""
     a = min(max(agreement, EVIDENCE.least_agreement), 1.0)
-    return math.log(a) - math.log(1.0 + EVIDENCE.slack - a)
+    likelihood_ratio = math.log(a) - math.log(1.0 + EVIDENCE.slack - a)
+    return likelihood_ratio * points / (points + EVIDENCE.few)

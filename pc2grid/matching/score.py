@@ -160,7 +160,6 @@ def refine(
     points_m: F32,
     T_map_query: SE2,
     center_m: tuple[float, float],
-    parameters: RefinementParameters = REFINEMENT,
 ) -> tuple[SE2, F64]:
     """Refine the pose of points (M, 2) of the query's frame; returns it and its covariance (3, 3).
 
@@ -171,19 +170,19 @@ def refine(
     points, with a prior as wide as the reach of the field: a direction that the walls do not constrain gets
     that width, not infinity.
     """
-    res = field.resolution_m
+    p, res = REFINEMENT, field.resolution_m
     center = np.asarray(center_m, np.float64)
     x, y = ((points_m - center) / res).T.copy()
     start = (T_map_query.apply(center[None])[0] - field.origin_m) / res
     pose = np.array([start[0], start[1], T_map_query.yaw])
-    if len(x) >= 4 * parameters.few_points:
-        every = len(x) // parameters.few_points
-        pose, _, _ = gauss_newton(field.values, x[::every].copy(), y[::every].copy(), pose, parameters)
-    pose, hessian, misfit = gauss_newton(field.values, x, y, pose, parameters)
+    if len(x) >= 4 * p.few_points:
+        every = len(x) // p.few_points
+        pose, _, _ = gauss_newton(field.values, x[::every].copy(), y[::every].copy(), pose)
+    pose, hessian, misfit = gauss_newton(field.values, x, y, pose)
     per_cell = np.array([res, res, 1.0])
     information = hessian / np.outer(per_cell, per_cell)
-    information /= parameters.correlated * max(misfit, parameters.least_misfit)
-    information += np.diag([parameters.prior_m**-2, parameters.prior_m**-2, parameters.prior_rad**-2])
+    information /= p.correlated * max(misfit, p.least_misfit)
+    information += np.diag([p.prior_m**-2, p.prior_m**-2, p.prior_rad**-2])
     yaw = wrap_angle(float(pose[2]))
     at_x, at_y = pose[:2] * res + field.origin_m
     turned = SE2(0.0, 0.0, yaw).apply(center[None])[0]
@@ -302,20 +301,20 @@ class SelfSimilarityParameters:
 SELF_SIMILARITY = SelfSimilarityParameters()
 
 
-def self_similarity(walls: Walls, parameters: SelfSimilarityParameters = SELF_SIMILARITY) -> float:
+def self_similarity(walls: Walls) -> float:
     """Return the best agreement of a map with itself, 0..1, over all shifts; 0 if none overlaps enough.
 
     As between two maps (`score_fit`), it is the geometric mean, forward and backward, of the mean likelihood
     of the wall points on known ground. All shifts are computed at once, as correlations by the fast Fourier
     transform.
     """
-    total = walls.weight
+    p, total = SELF_SIMILARITY, walls.weight
     if total <= 0.0:
         return 0.0
-    n = max(round(parameters.cell_m / walls.field.resolution_m), 1)
+    n = max(round(p.cell_m / walls.field.resolution_m), 1)
     cell_m = n * walls.field.resolution_m
     drawn = _drawn(walls, n)
-    reach = round(parameters.farthest_m / cell_m)
+    reach = round(p.farthest_m / cell_m)
     shape = [cv2.getOptimalDFTSize(n + reach) for n in drawn[0].shape]
     points, *grounds = (fft.rfft2(image, shape) for image in drawn)
     slides = np.arange(-reach, reach + 1)
@@ -324,8 +323,8 @@ def self_similarity(walls: Walls, parameters: SelfSimilarityParameters = SELF_SI
     )
     there = np.where(overlap > 1e-6, fits / np.maximum(overlap, 1e-6), 0.0)
     length_m = cell_m * np.hypot(slides[:, None], slides)
-    enough = overlap >= parameters.overlap * total
-    compared = (length_m >= parameters.nearest_m) & (length_m <= parameters.farthest_m)
+    enough = overlap >= p.overlap * total
+    compared = (length_m >= p.nearest_m) & (length_m <= p.farthest_m)
     compared &= enough & enough[::-1, ::-1]
     both_ways = np.clip(there * there[::-1, ::-1], 0.0, 1.0)[compared]
     return math.sqrt(float(both_ways.max())) if len(both_ways) else 0.0
