@@ -36,7 +36,7 @@ scores the same if the margin is wider than the last of `REACHES_M`."""
 MOST_POINTS = 256
 """So many likelihoods of 8 bits add up in 16 bits."""
 BOUND_SLACK = 0.98
-"""A pose may exceed the bound of its square, because `levels_for` neglects half a cell. A square is left out
+"""A pose may exceed the bound of its square, because `levels_of` neglects half a cell. A square is left out
 only if its bound is below this share of the best score found. Chosen by hand."""
 SQUARE = 4
 """Side of a square of the lattice, in cells."""
@@ -151,9 +151,19 @@ def search_windows(
     boxes = (np.asarray(boxes, np.float64) - origin) / (res, res, 1.0)
     turns = headings(half_a_rad, 2.0 * parameters.step_rad)
     points = np.asarray(points_m, np.float64) / res
-    half_a_rad /= len(turns)
+    half_a_rad /= len(turns)  # half width of each of them
     keep = min(parameters.keep if parameters.most > 1 else 1.0, BOUND_SLACK)
-    found = _best(target, points, Tiles.of(boxes, half_t_m / res), turns, half_a_rad, parameters.floor, keep)
+    tiles, levels = Tiles.of(boxes, half_t_m / res), levels_of(points, half_a_rad, target)
+    images, shape = target.images.reshape(-1), target.images.shape[-2:]
+    bounds = tile_bounds(images, shape, levels[0], points, tiles.corner, tiles.yaw_rad, tiles.inside, turns)
+    tile, turn = np.unravel_index(np.argsort(-bounds, axis=None, kind="stable"), bounds.shape)
+    corners, yaws = tiles.corner[tile], tiles.yaw_rad[tile] + turns[turn]
+    found = best_in_tiles(
+        images, shape, levels, points, corners, yaws, tiles.inside, tile, bounds[tile, turn], half_a_rad,
+        parameters.floor, keep,
+    )  # fmt: skip
+    # Of each block only the best pose, if it has a share `keep` of the best score.
+    found = found[found[:, 3] >= keep * float(found[:, 3].max(initial=0.0))]
     found = found[np.argsort(-found[:, 3], kind="stable")]
     found[:, :2] = found[:, :2] * res + origin[:2]
     return _distinct(found, parameters)
@@ -221,65 +231,20 @@ def _tile_numbers(squares: I64) -> I64:
     return number
 
 
-def _best(
-    target: SearchMap,
-    points: F64,
-    tiles: Tiles,
-    turns: F64,
-    half_a_rad: float,
-    floor: float,
-    keep: float,
-) -> F64:
-    """Return (N, 4) the best pose of each block with at least `floor` and the share `keep` of the best score;
-    in cells.
-
-    turns : (K,) headings relative to those of the tiles. half_a_rad : half width of each of them.
-    """
-
-    images, shape = target.images.reshape(-1), target.images.shape[-2:]
-    levels = levels_of(points, half_a_rad, target)
-    bounds = tile_bounds(images, shape, levels[0], points, tiles.corner, tiles.yaw_rad, tiles.inside, turns)
-    tile, turn = np.unravel_index(np.argsort(-bounds, axis=None, kind="stable"), bounds.shape)
-    found = best_in_tiles(
-        images,
-        shape,
-        levels,
-        points,
-        tiles.corner[tile],
-        tiles.yaw_rad[tile] + turns[turn],
-        tiles.inside,
-        tile,
-        bounds[tile, turn],
-        half_a_rad,
-        floor,
-        keep,
-    )
-    return found[found[:, 3] >= keep * float(found[:, 3].max(initial=0.0))]
-
-
 def levels_of(points: F64, half_a_rad: float, target: SearchMap) -> I64:
     """Return (4, N) the image for each point: for a square, for its half in heading, for a quarter of that,
     for a cell.
 
-    It is -1 where a point can move farther than any image covers; it then counts as on a wall.
+    It is the first of the sliding maxima that covers what the point can move. Half a cell is neglected: it is
+    less than the width of the field, and covering it would blur the smallest squares. It is -1 where a point
+    can move farther than any image covers; it then counts as on a wall.
     """
     res = target.field.resolution_m
     away = np.hypot(points[:, 0], points[:, 1])
     halves = ((0.5 * SQUARE, 1.0), (0.5 * SQUARE, 0.5), (0.25 * SQUARE, 0.5), (0.5, 0.5))
     reach = np.array([half_t + away * share * half_a_rad for half_t, share in halves])
-    covered = reach - 0.5 <= REACHES_M[-1] / res
-    return np.where(covered, levels_for(reach, res), -1)
-
-
-def levels_for(reach_cells: F64, resolution_m: float) -> I64:
-    """Return the first of the sliding maxima that covers each of the reaches, or the last one; in their
-    shape.
-
-    Half a cell is neglected: it is less than the width of the field, and covering it would blur the smallest
-    squares.
-    """
-    reaches = np.asarray(REACHES_M) / resolution_m
-    return np.asarray(np.searchsorted(reaches, reach_cells - 0.5).clip(max=len(reaches) - 1), np.int64)
+    level = np.searchsorted(np.asarray(REACHES_M) / res, reach - 0.5)
+    return np.where(level < len(REACHES_M), level, -1)
 
 
 def headings(half_a_rad: float, step_rad: float) -> F64:
@@ -395,9 +360,7 @@ def best_in_tiles(
                 continue
             if number == len(found):
                 more = np.empty((2 * number, 4))
-                for row in range(number):
-                    for column in range(4):
-                        more[row, column] = found[row, column]
+                more[:number] = found
                 found = more
             quarter, cell = (part - 1) // _QUARTER, (part - 1) % _QUARTER - 1
             i, j = quarter // 2 * _HALF + cell // _HALF, quarter % 2 * _HALF + cell % _HALF
