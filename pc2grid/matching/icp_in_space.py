@@ -126,12 +126,6 @@ class Rays:
     through: NDArray[np.bool_]
     before: NDArray[np.bool_]
 
-    @property
-    def counts(self) -> tuple[int, int, int]:
-        """Return the numbers of rays that are on, through and before."""
-        on, through, before = (int(np.count_nonzero(k)) for k in (self.on, self.through, self.before))
-        return on, through, before
-
     def patches_over(self, other: Rays) -> int:
         """Return the number of patches that only this place explains, minus those that only the other place
         explains.
@@ -245,7 +239,7 @@ def register_in_space(
         return found
     T, information, center_m, rmse_m = found
     compared = compare_rays(views, target, T)
-    on, through, before = compared.counts
+    on, through, before = (int(k.sum()) for k in (compared.on, compared.through, compared.before))
     count = on + through + before
     return SpatialFit(
         T_map_query=T,
@@ -323,7 +317,10 @@ def _icp(query: F64, target_m: F64, normals: F64, start: F64) -> tuple[F64, F64,
         if len(result.correspondence_set) < p.least_points:
             return "unknown"
     # Only the last round counts: the first one may turn too far, and the next ones back.
-    if _has_left(query.mean(axis=0), start, T):
+    turn_rad, middle = rotation_vector(invert_pose(start) @ T), query.mean(axis=0)[None]
+    moved_m = (transform_points(T, middle) - transform_points(start, middle))[0]
+    tilt_rad = math.hypot(turn_rad[0], turn_rad[1])
+    if math.hypot(*moved_m[:2]) > p.rounds_m[0] or abs(turn_rad[2]) > p.farthest_rad or tilt_rad > p.tilt_rad:
         return "left"
     pairs = np.asarray(result.correspondence_set)
     placed = transform_points(T, np.asarray(source.points))[pairs[:, 0]]
@@ -338,19 +335,6 @@ def _icp(query: F64, target_m: F64, normals: F64, start: F64) -> tuple[F64, F64,
     independent = min(1.0, (p.voxel_m / p.patch_m) ** 2) / share
     information = J.T @ J * (independent / max(rmse_m, p.noise_m) ** 2)
     return T, information, center_m, rmse_m
-
-
-def _has_left(center_m: F64, start: F64, T: F64) -> bool:
-    """Return True if a pose (4, 4) moves or turns a query about its centre (3,) farther than a planar pose
-    can be off.
-    """
-    p, turn_rad = REGISTRATION, rotation_vector(invert_pose(start) @ T)
-    before_m, after_m = (transform_points(pose, center_m[None])[0] for pose in (start, T))
-    return (
-        math.hypot(*(after_m - before_m)[:2]) > p.rounds_m[0]
-        or abs(turn_rad[2]) > p.farthest_rad
-        or math.hypot(turn_rad[0], turn_rad[1]) > p.tilt_rad
-    )
 
 
 def compare_rays(views: Sequence[SpatialView], target: F64, T_map_query: F64) -> Rays:
