@@ -54,29 +54,30 @@ def divide(grid: OccupancyGrid, config: PartitionConfig) -> tuple[nx.Graph, tupl
 def view_at(
     grid: OccupancyGrid, center_m: tuple[float, float], config: PartitionConfig, *, submap_id: int = 0
 ) -> Submap:
-    """Return the submap around `center_m` as `config.view` defines it: the whole disc, or its isovist.
+    """Return the submap around `center_m` (map frame) as `config.view` defines it: the whole disc, or its
+    isovist. Other cells become unknown.
+
+    In an isovist, of a wall that a ray ends on the first `WALL_MARGIN_M` are kept. Free cells inside stay
+    free; the last cell of a ray that ends on a wall becomes occupied.
 
     The views of a query are made by this function, too, because only views of one kind are comparable.
     """
-    if config.view == "isovist":
-        return visible_submap(grid, isovist(grid, center_m, config.radius_m), submap_id)
-    return submap_at(grid, center_m, config.radius_m, submap_id=submap_id)
-
-
-def submap_at(
-    grid: OccupancyGrid, center_m: tuple[float, float], radius_m: float, *, submap_id: int = 0
-) -> Submap:
-    """Return the disc of `grid` around `center_m` (map frame); cells farther than `radius_m` become
-    unknown."""
-    crop = grid.crop(center_m, radius_m)
-    n = crop.cells.shape[0] // 2
-    steps = np.arange(-n, n + 1) ** 2
-    inside = steps[:, None] + steps <= (radius_m / grid.resolution_m) ** 2 + 1e-9
-    cells = np.where(inside, crop.cells, np.int8(UNKNOWN))
+    crop = grid.crop(center_m, config.radius_m)
+    if config.view == "disc":
+        n = crop.cells.shape[0] // 2
+        steps = np.arange(-n, n + 1) ** 2
+        inside = steps[:, None] + steps <= (config.radius_m / grid.resolution_m) ** 2 + 1e-9
+        cells = np.where(inside, crop.cells, np.int8(UNKNOWN))
+    else:
+        view = isovist(grid, center_m, config.radius_m)
+        cells = np.where(polygon_mask(view, crop, margin_m=WALL_MARGIN_M), crop.cells, np.int8(UNKNOWN))
+        at = crop.to_cell(center_m + ray_ends(view.ranges_m[None])[0, view.ends == WALL])
+        ok = ((at >= 0) & (at < np.array(cells.shape))).all(axis=1)
+        cells[at[ok, 0], at[ok, 1]] = OCCUPIED
     return Submap(
         submap_id=submap_id,
         center_m=center_m,
-        radius_m=radius_m,
+        radius_m=config.radius_m,
         grid=OccupancyGrid(cells=cells, resolution_m=crop.resolution_m, origin_m=crop.origin_m),
     )
 
@@ -176,26 +177,6 @@ def polygon_mask(view: Isovist, grid: OccupancyGrid, *, margin_m: float = 0.0) -
     mask = np.zeros(grid.cells.shape, dtype=np.uint8)
     cv2.fillPoly(mask, [polygon_corners(corners)], 1, shift=SUBPIXEL_BITS)
     return mask.astype(bool)
-
-
-def visible_submap(grid: OccupancyGrid, view: Isovist, submap_id: int) -> Submap:
-    """Return the submap around the isovist's centre; cells that are not visible from there become unknown.
-
-    Of a wall that a ray ends on, the first `WALL_MARGIN_M` are kept. Free cells inside the isovist stay free;
-    the last cell of a ray that ends on a wall becomes occupied.
-    """
-    crop = grid.crop(view.center_m, view.sight_m)
-    inside = polygon_mask(view, crop, margin_m=WALL_MARGIN_M)
-    cells = np.where(inside, crop.cells, np.int8(UNKNOWN)).astype(np.int8)
-    at = crop.to_cell(view.center_m + ray_ends(view.ranges_m[None])[0, view.ends == WALL])
-    ok = ((at >= 0) & (at < np.array(cells.shape))).all(axis=1)
-    cells[at[ok, 0], at[ok, 1]] = OCCUPIED
-    return Submap(
-        submap_id=submap_id,
-        center_m=view.center_m,
-        radius_m=view.sight_m,
-        grid=OccupancyGrid(cells=cells, resolution_m=crop.resolution_m, origin_m=crop.origin_m),
-    )
 
 
 @compiled(nogil=True)

@@ -4,7 +4,8 @@ import cv2
 import numpy as np
 
 from pc2grid.model import FREE, OCCUPIED, UNKNOWN, OccupancyGrid, Submap
-from pc2grid.submaps.submaps import submap_at
+from pc2grid.settings import PartitionConfig
+from pc2grid.submaps.submaps import view_at
 
 RESOLUTION_M = 0.05
 """Edge of a cell, as in the default settings. Bounds on positions are whole cells: a map shows no less, and
@@ -23,7 +24,7 @@ def grid_of(cells: np.ndarray) -> OccupancyGrid:
 
 
 def submap_of(cells: np.ndarray, radius_m: float = 8.0) -> Submap:
-    return submap_at(grid_of(cells), (0.0, 0.0), radius_m)
+    return view_at(grid_of(cells), (0.0, 0.0), PartitionConfig.paper(radius_m))
 
 
 def polygon(points_m: list[tuple[float, float]], cells: np.ndarray | None = None) -> np.ndarray:

@@ -31,8 +31,7 @@ from pc2grid.submaps.submaps import (
     isovist,
     partition,
     polygon_mask,
-    submap_at,
-    visible_submap,
+    view_at,
 )
 from tests.helpers.field import DATA
 from tests.helpers.rooms import RESOLUTION_M, canvas, cross, grid_of
@@ -69,7 +68,7 @@ def test_a_map_without_free_space_has_no_submaps(value: int) -> None:
 
 def test_a_submap_is_a_disc_around_its_centre() -> None:
     grid = grid_of(np.full((400, 500), FREE, np.int8))
-    submap = submap_at(grid, (1.0, -2.0), 3.0, submap_id=7)
+    submap = view_at(grid, (1.0, -2.0), PartitionConfig.paper(3.0), submap_id=7)
     points = submap.grid.to_point(np.argwhere(submap.grid.cells == FREE))
     reach = np.hypot(*(points - submap.center_m).T)
     assert submap.submap_id == 7
@@ -247,7 +246,7 @@ def test_a_few_unobserved_cells_do_not_hide_the_wall_behind_them() -> None:
 
 def test_a_visible_submap_hides_the_next_room_and_keeps_the_wall() -> None:
     rooms = plan(12, 6, [(6, 0, 6, 6)])
-    submap = visible_submap(rooms, isovist(rooms, (3.0, 3.0), 8.0), 7)
+    submap = view_at(rooms, (3.0, 3.0), PartitionConfig(view="isovist", radius_m=8.0), submap_id=7)
     assert submap.submap_id == 7
     next_room = submap.grid.to_cell(np.array([[8.0, 3.0], [9.0, 1.0]]))
     assert (submap.grid.cells[next_room[:, 0], next_room[:, 1]] == UNKNOWN).all()

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from pc2grid.model import FREE, OCCUPIED, OccupancyGrid
-from pc2grid.submaps.submaps import submap_at
+from pc2grid.settings import PartitionConfig
+from pc2grid.submaps.submaps import view_at
 from pc2grid_lab.paper.experiment import (
     NOISE_LEVELS,
     BestMatches,
@@ -21,6 +22,7 @@ from pc2grid_lab.paper.methods import make_methods
 from tests.helpers.rooms import canvas, cross, disc, grid_of, l_shape, rectangle, submap_of
 
 SILENT = NOISE_LEVELS[0]
+PAPER = PartitionConfig.paper()
 
 
 def floor() -> OccupancyGrid:
@@ -98,7 +100,7 @@ def test_obstacles_stand_on_unknown_cells_too() -> None:
 
 def test_the_paper_method_finds_rooms_that_differ() -> None:
     grid = floor()
-    submaps = [submap_at(grid, (float(x), float(y)), 8.0, submap_id=i) for i, (x, y) in enumerate(centers())]
+    submaps = [view_at(grid, (float(x), float(y)), PAPER, submap_id=i) for i, (x, y) in enumerate(centers())]
     outcomes = evaluate(make_methods(["proposed"]), grid, submaps, Experiment(queries=40), SILENT)
     assert outcomes["proposed"].correct.mean() > 0.95
     again = evaluate(make_methods(["proposed"]), grid, submaps, Experiment(queries=40), SILENT)
@@ -107,7 +109,7 @@ def test_the_paper_method_finds_rooms_that_differ() -> None:
 
 def test_a_match_elsewhere_is_false() -> None:
     grid = floor()
-    submaps = [submap_at(grid, (float(x), float(y)), 8.0) for x, y in centers()]
+    submaps = [view_at(grid, (float(x), float(y)), PAPER) for x, y in centers()]
 
     def stubborn(_submaps: object) -> Matcher:
         return lambda query: np.array([1.0, 0.0, 0.0, 0.0])
