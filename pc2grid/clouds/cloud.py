@@ -7,13 +7,11 @@ number of scans. Open3D's voxel_down_sample does the same for a cloud that is in
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.errors import LimitExceeded
-from pc2grid.geometry import F32, F64, I64, rotation_vector
+from pc2grid.geometry import F32, F64, I64, rotation_vector, skew
 
 
 def deskew(points_m: F32, offsets_s: F32, motion: F64, motion_s: float) -> F32:
@@ -33,8 +31,7 @@ def deskew(points_m: F32, offsets_s: F32, motion: F64, motion_s: float) -> F32:
     if angle_rad < 1e-9:
         return moved
     # Rodrigues' formula about one axis: p + sin(a) k x p + (1 - cos(a)) k x (k x p), with k x p = K p.
-    x, y, z = turn_rad / angle_rad
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    K = skew(turn_rad[None] / angle_rad)[0]
     angles = share * np.float32(angle_rad)
     moved += np.sin(angles)[:, None] * (points_m @ K.T.astype(np.float32))
     moved += (1.0 - np.cos(angles))[:, None] * (points_m @ (K @ K).T.astype(np.float32))
@@ -73,12 +70,12 @@ class VoxelCloud:
     [[0.02, 0.0, 0.0], [1.02, 0.0, 0.0]]
     """
 
-    def __init__(self, edge_m: float, max_voxels: int = MAX_VOXELS) -> None:
+    def __init__(self, edge_m: float) -> None:
         self.edge_m = edge_m
-        self._max_voxels = max_voxels
         self._corner_m: F64 | None = None  # of a voxel with the first point in its middle
-        self._merged = _Voxels()
-        self._new: list[_Voxels] = []
+        # The first part has each voxel once; the others are to be merged into it.
+        nothing = np.empty(0, np.int64), np.empty((0, 3), np.float32), np.empty(0, np.int32)
+        self._parts: list[_Voxels] = [nothing]
 
     def add(self, points_m: NDArray[np.floating]) -> None:
         """Add points (N, 3), finite.
@@ -100,14 +97,13 @@ class VoxelCloud:
         index = voxel.astype(np.int64) + HALF_VOXELS
         code = (index[:, 0] << 2 * AXIS_BITS) + (index[:, 1] << AXIS_BITS) + index[:, 2]
         within = (points - voxel * self.edge_m).astype(np.float32)
-        self._new.append(_reduced(code, within, np.ones(len(code), np.int32)))
-        if sum(len(voxels.code) for voxels in self._new) > len(self._merged.code) // 2:
-            self._merge()
+        self._parts.append(_reduced(code, within, np.ones(len(code), np.int32)))
+        if sum(len(part[0]) for part in self._parts[1:]) > len(self._parts[0][0]) // 2:
+            self._merged()
 
     def __len__(self) -> int:
         """Return the number of voxels that hold points."""
-        self._merge()
-        return len(self._merged.code)
+        return len(self._merged()[0])
 
     @property
     def corner_m(self) -> F64:
@@ -118,46 +114,29 @@ class VoxelCloud:
         """Return the mean (V, 3) of each voxel that holds points, by increasing x, then y, then z of the
         voxels.
         """
-        self._merge()
-        if self._corner_m is None:
-            return np.empty((0, 3))
-        kept = self._merged
-        points: F64 = kept.sum_m / kept.count[:, None].astype(np.float64)
+        code, sum_m, count = self._merged()
+        points: F64 = sum_m / count[:, None].astype(np.float64)
         mask = (1 << AXIS_BITS) - 1
         for axis in range(3):
-            index = ((kept.code >> (2 - axis) * AXIS_BITS) & mask) - HALF_VOXELS
-            points[:, axis] += index * self.edge_m + self._corner_m[axis]
+            index = ((code >> (2 - axis) * AXIS_BITS) & mask) - HALF_VOXELS
+            points[:, axis] += index * self.edge_m + self.corner_m[axis]
         return points
 
-    def _merge(self) -> None:
-        """Reduce each voxel to one entry."""
-        if not self._new:
-            return
-        parts = [self._merged, *self._new]
-        self._merged = _reduced(
-            np.concatenate([part.code for part in parts]),
-            np.concatenate([part.sum_m for part in parts]),
-            np.concatenate([part.count for part in parts]),
-        )
-        self._new = []
-        if len(self._merged.code) > self._max_voxels:
+    def _merged(self) -> _Voxels:
+        """Return the voxels, each once."""
+        if len(self._parts) > 1:
+            self._parts = [_reduced(*map(np.concatenate, zip(*self._parts, strict=True)))]
+        if len(self._parts[0][0]) > MAX_VOXELS:
             raise LimitExceeded(
-                f"the cloud has more than {self._max_voxels} voxels of {self.edge_m:g} m",
+                f"the cloud has more than {MAX_VOXELS} voxels of {self.edge_m:g} m",
                 hint="is it in metres? else cut it into parts, or use larger voxels",
             )
+        return self._parts[0]
 
 
-@dataclass(frozen=True, slots=True)
-class _Voxels:
-    """Voxels, each once, by increasing code.
-
-    code : (V,) the three indices in one number. sum_m : (V, 3) sums of the points' offsets from the voxel's
-    lowest corner. count : (V,) how many points.
-    """
-
-    code: I64 = field(default_factory=lambda: np.empty(0, np.int64))
-    sum_m: F32 = field(default_factory=lambda: np.empty((0, 3), np.float32))
-    count: NDArray[np.int32] = field(default_factory=lambda: np.empty(0, np.int32))
+_Voxels = tuple[I64, F32, NDArray[np.int32]]
+"""Voxels by increasing code: (V,) the three indices in one number; (V, 3) sums of the offsets of the points
+from the lowest corner of their voxel; (V,) how many points."""
 
 
 def _reduced(code: I64, sum_m: F32, count: NDArray[np.int32]) -> _Voxels:
@@ -165,8 +144,5 @@ def _reduced(code: I64, sum_m: F32, count: NDArray[np.int32]) -> _Voxels:
     order = np.argsort(code, kind="stable")
     code = code[order]
     starts = np.flatnonzero(np.diff(code, prepend=-1))
-    return _Voxels(
-        code[starts],
-        np.add.reduceat(sum_m[order], starts, axis=0),
-        np.add.reduceat(count[order], starts),
-    )
+    sums, counts = (np.add.reduceat(values[order], starts, axis=0) for values in (sum_m, count))
+    return code[starts], sums, counts

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from pc2grid.clouds import cloud as cloud_of_points
 from pc2grid.clouds.cloud import VoxelCloud
 from pc2grid.errors import LimitExceeded
 
@@ -31,11 +32,11 @@ def test_points_far_from_zero_keep_their_place() -> None:
     assert cloud.points_m() == pytest.approx(np.array([far[2], far[:2].mean(axis=0)]), abs=1e-6)
 
 
-def test_what_cannot_be_a_building_is_refused() -> None:
+def test_what_cannot_be_a_building_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     cloud = VoxelCloud(0.05)
     cloud.add(np.zeros((1, 3)))
     with pytest.raises(LimitExceeded, match="km apart"):
         cloud.add(np.full((1, 3), 1e5))
-    small = VoxelCloud(0.05, max_voxels=10)
+    monkeypatch.setattr(cloud_of_points, "MAX_VOXELS", 10)
     with pytest.raises(LimitExceeded, match="more than 10 voxels"):
-        small.add(np.arange(60.0).reshape(-1, 3))
+        VoxelCloud(0.05).add(np.arange(60.0).reshape(-1, 3))
