@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.clouds.ground import CLOUD_PARAMETERS, Ground
-from pc2grid.geometry import F32, F64, U8, BoolGrid
+from pc2grid.geometry import F32, F64, U8
 from pc2grid.libraries import compiled
 from pc2grid.model import SENSOR_MODELS, SLICE_BORDERS_M, SLICES, SensorKind
 from pc2grid.settings import ProjectionConfig
@@ -64,16 +64,6 @@ class PlanarScan:
     height_m: float | None = None
     above_floor_m: float | None = None
     heights: U8 = field(default_factory=lambda: np.empty(0, np.uint8))
-
-    def only(self, kept: BoolGrid) -> PlanarScan:
-        """Return the scan with the hits (M,) that are `kept`."""
-        things = np.ones(len(self.low_m), np.bool_)
-        return replace(
-            self,
-            hits_m=self.hits_m[kept],
-            normal_rad=self.normal_rad[kept],
-            heights=self.heights[np.concatenate((kept, things))] if len(self.heights) else self.heights,
-        )
 
     def free_polygon(self, limit_m: float = np.inf) -> F64:
         """Return the outline (B, 2) of the free space up to `limit_m`, metres, levelled base frame."""
@@ -205,12 +195,6 @@ class DepthLimit:
     def __init__(self) -> None:
         self._farthest_m = 0.0
 
-    @property
-    def unbiased_m(self) -> float:
-        """Return the depth up to which the limit cuts off less than one pixel in forty."""
-        noise_per_m2 = SENSOR_MODELS["depth"].noise_per_m2
-        return self._farthest_m - CLOUD_PARAMETERS.limit_sigmas * noise_per_m2 * self._farthest_m**2
-
     def observe(self, points_m: NDArray[np.floating], T_base_sensor: F64) -> None:
         """Update the limit with the points (N, 3) of a scan, base frame, of a camera at `T_base_sensor` (4,
         4).
@@ -221,13 +205,21 @@ class DepthLimit:
             self._farthest_m = max(self._farthest_m, farthest_m)
 
     def before(self, planar_scan: PlanarScan, T_level_sensor: F64) -> PlanarScan:
-        """Return the planar scan without its hits at depths beyond `unbiased_m`.
+        """Return the planar scan without its hits at depths of which the limit cuts off a pixel in forty.
 
         T_level_sensor : (4, 4) pose of the camera in the levelled base frame, optical axes (z forward). The
         depth of a hit is that at the height of the camera.
         """
         depth_m = (planar_scan.hits_m - planar_scan.origin_m) @ T_level_sensor[:2, 2]
-        return planar_scan.only(depth_m <= self.unbiased_m)
+        noise_per_m2 = SENSOR_MODELS["depth"].noise_per_m2
+        cut_m = CLOUD_PARAMETERS.limit_sigmas * noise_per_m2 * self._farthest_m**2
+        kept, heights = depth_m <= self._farthest_m - cut_m, planar_scan.heights
+        return replace(
+            planar_scan,
+            hits_m=planar_scan.hits_m[kept],
+            normal_rad=planar_scan.normal_rad[kept],
+            heights=heights[kept] if len(heights) else heights,
+        )
 
 
 # --- compiled functions -------------------------------------------------------------------------------
@@ -258,15 +250,9 @@ def scan_bearings(
     Measured: 0.6 ms instead of 23 ms a scan of a lidar, 0.015 instead of 0.7 ms of a planar laser.
     """
     count = points.shape[0]
-    nearest, reach, ranges = np.empty(bearings), np.empty(bearings), np.empty(count)
-    order, starts, filled = (
-        np.empty(count, np.int64),
-        np.empty(bearings + 1, np.int64),
-        np.empty(bearings, np.int64),
-    )
-    bearing_of = np.empty(count, np.int64)
-    for b in range(bearings):
-        nearest[b], reach[b], filled[b] = math.inf, 0.0, 0
+    nearest, reach, ranges = np.full(bearings, math.inf), np.zeros(bearings), np.empty(count)
+    order, bearing_of = np.empty(count, np.int64), np.empty(count, np.int64)
+    starts, filled = np.zeros(bearings + 1, np.int64), np.empty(bearings, np.int64)
     sensor_height = plane[0] * sensor[0] + plane[1] * sensor[1] + plane[2] * sensor[2] + plane[3]
     for k in range(count):
         px, py = float(points[k, 0]), float(points[k, 1])
@@ -285,10 +271,9 @@ def scan_bearings(
             nearest[bearing] = min(nearest[bearing], distance)
             if distance <= limit:
                 bearing_of[k] = bearing
-                filled[bearing] += 1
-    starts[0] = 0
+                starts[bearing + 1] += 1
     for b in range(bearings):
-        starts[b + 1] = starts[b] + filled[b]
+        starts[b + 1] += starts[b]
         filled[b] = starts[b]
     for k in range(count):
         bearing = bearing_of[k]

@@ -173,8 +173,6 @@ def test_hits_of_a_lidar_tell_heights_and_those_of_a_laser_its_own() -> None:
     before_wall = is_table & (np.abs(planar_scan.hits_m[:, 1]) < 0.2)
     assert set(planar_scan.heights[before_wall].tolist()) == {TOP_ONLY}
     assert set(planar_scan.heights[~is_table].tolist()) == {ALL}
-    nearest = planar_scan.only(is_table)
-    assert len(nearest.hits_m) == len(nearest.heights) == np.count_nonzero(is_table)
     laser = projected(None, room)
     assert laser.height_m == SENSOR_M[2]
     assert not len(laser.heights)
@@ -224,7 +222,7 @@ def test_a_wall_behind_the_limit_is_left_out(behind_m: float) -> None:
     assert too_short_m(scan, wall_m) > 0.03  # what is left out is wrong indeed
     kept = limit.before(scan, CAMERA)
     assert len(kept.hits_m) < 0.1 * len(scan.hits_m)
-    assert len(kept.normal_rad) == len(kept.hits_m)
+    assert len(kept.normal_rad) == len(kept.heights) == len(kept.hits_m)
     np.testing.assert_array_equal(kept.free_m, scan.free_m)
 
 
