@@ -211,7 +211,7 @@ def _as_floor(points: F64, plane: Ground, p: CloudParameters) -> Ground | None:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LevelParameters:
-    """Parameters of `floor_height` and `FloorBelow`. Chosen by hand.
+    """Parameters of `floor_height`, `FloorBelow` and `vertical_of`. Chosen by hand.
 
     flat : least information along the vertical of a voxel of a level surface.
     level : a surface is level if the cosine between its normal and the vertical is higher.
@@ -221,24 +221,10 @@ class LevelParameters:
     seen_m : standard deviation of the height measured in one view.
     drift_per_m : variance that the height of a pose gains on a metre of travel, m2: 2 cm on the first, 10 cm
         on 25 m, where the odometry of a phone drifts by half a percent.
-    """
 
-    flat: float = 0.3
-    level: float = 0.97
-    least_m2: float = 0.4
-    thick_m: float = 0.2
-    seen_m: float = 0.03
-    drift_per_m: float = 0.02**2
-
-
-LEVEL = LevelParameters()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class UprightParameters:
-    """Parameters of `vertical_of`. Chosen by hand, on simulated scans of a 16-beam lidar. In two rooms by a
-    phone (`depth/room`) all 14 planes of 269 that are tilted by 14 to 28 degrees are distinguished from the
-    floor by it.
+    The vertical by the walls; chosen on simulated scans of a 16-beam lidar. In two rooms by a phone
+    (`depth/room`) all 14 planes of 269 that are tilted by 14 to 28 degrees are distinguished from the floor
+    by it.
 
     neighbours : points for the estimate of a normal.
     flatness : largest ratio of the variances across a surface and along its shorter side.
@@ -251,6 +237,13 @@ class UprightParameters:
         enough. Of cameras only.
     """
 
+    flat: float = 0.3
+    level: float = 0.97
+    least_m2: float = 0.4
+    thick_m: float = 0.2
+    seen_m: float = 0.03
+    drift_per_m: float = 0.02**2
+
     neighbours: int = 40
     flatness: float = 0.05
     steepest_rad: float = math.radians(37.0)
@@ -260,7 +253,7 @@ class UprightParameters:
     side_share: float = 0.1
 
 
-UPRIGHT = UprightParameters()
+LEVEL = LevelParameters()
 
 
 def level_floor(scan: Scan, points_m: NDArray[np.floating]) -> Ground | None:
@@ -283,7 +276,13 @@ def vertical_of(points_m: NDArray[np.floating], guess: F64, *, narrow: bool) -> 
     points_m : (N, 3) in the base frame, deskewed. guess : (3,) initial direction. The result is the direction
     near it that is perpendicular to most normals. narrow : True for a camera.
     """
-    p, normals = UPRIGHT, _normals(_downsample(points_m, CLOUD_PARAMETERS))
+    from pc2grid.open3d_core import o3d
+
+    p, thinned = LEVEL, _downsample(points_m, CLOUD_PARAMETERS)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(thinned))
+    cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(p.neighbours))
+    variances, axes = np.linalg.eigh(np.asarray(cloud.covariances))
+    normals = axes[variances[:, 0] < p.flatness * variances[:, 1], :, 0]
     walls = normals[np.abs(normals @ guess) < math.sin(p.steepest_rad)]
     vertical, spread, weight = guess, np.zeros(3), np.zeros(1)
     for _ in range(p.rounds):
@@ -295,14 +294,8 @@ def vertical_of(points_m: NDArray[np.floating], guess: F64, *, narrow: bool) -> 
     return vertical if spread[1] > p.least_share * float(weight.sum()) else None
 
 
-def _normals(points_m: F64) -> F64:
-    """Estimate the normals (K, 3) of those of the points (N, 3) that lie on flat surfaces."""
-    from pc2grid.open3d_core import o3d
-
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points_m))
-    cloud.estimate_covariances(o3d.geometry.KDTreeSearchParamKNN(UPRIGHT.neighbours))
-    variances, axes = np.linalg.eigh(np.asarray(cloud.covariances))
-    return np.asarray(axes[variances[:, 0] < UPRIGHT.flatness * variances[:, 1], :, 0])
+SYMMETRIC = np.array([0, 1, 2, 1, 3, 4, 2, 4, 5])
+"""Places in the upper triangle of a symmetric matrix (3, 3) of its elements, row by row."""
 
 
 def vertical_held(shapes: F64, up: F64) -> tuple[F64, F64]:
@@ -312,21 +305,21 @@ def vertical_held(shapes: F64, up: F64) -> tuple[F64, F64]:
     shapes : (V, 9) of the surfaces of the view, and up : (3,) expected vertical, both in the axes of the
     result. A surface that is neither nearly level nor nearly upright counts nothing.
     """
-    held, axes = np.linalg.eigh(shapes[:, [3, 4, 5, 4, 6, 7, 5, 7, 8]].reshape(-1, 3, 3))
+    held, axes = np.linalg.eigh(shapes[:, 3:][:, SYMMETRIC].reshape(-1, 3, 3))
     plane = held[:, 2] > LEVEL.flat
     # Of an edge two directions are held, and none is its normal.
     normals, flatness = axes[plane, :, 2], held[plane, 2] - held[plane, 1]
     vertical, scatter = up, np.eye(3)
-    for _ in range(UPRIGHT.rounds):
+    for _ in range(LEVEL.rounds):
         along = (normals @ vertical) ** 2
         level, upright = along > LEVEL.level**2, along < 1.0 - LEVEL.level**2
-        off = np.where(level, 1.0 - along, along) / UPRIGHT.scale**2
+        off = np.where(level, 1.0 - along, along) / LEVEL.scale**2
         weight = flatness * (level | upright) / (1.0 + off) ** 2
         scatter = (normals * np.where(level, -weight, weight)[:, None]).T @ normals
         scatter += weight[level].sum() * np.eye(3)
         axis = np.linalg.eigh(scatter)[1][:, 0]
         vertical = axis * np.sign(axis @ up)
-    turn = skew(vertical[None])[0] / UPRIGHT.scale
+    turn = skew(vertical[None])[0] / LEVEL.scale
     information = turn @ scatter @ turn.T
     return information, information @ np.cross(vertical, up)
 
