@@ -9,8 +9,6 @@ still.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,12 +32,15 @@ class KissRegistration:
     def __init__(
         self, config: RegistrationConfig, voxel_m: float | None = None, max_range_m: float | None = None
     ) -> None:
-        self._config = config
-        self._voxel_m, self._max_range_m = config.voxel_m or voxel_m, config.max_range_m or max_range_m
-        self._kiss_config: Any = None
-        self._registration: Any = None
-        self._threshold: Any = None
-        self._map: Any = None
+        from kiss_icp.config import KISSConfig
+        from kiss_icp.kiss_icp import KissICP
+
+        kiss = KISSConfig()
+        kiss.data.max_range = config.max_range_m or max_range_m or kiss.data.max_range
+        kiss.mapping.voxel_size = config.voxel_m or voxel_m or 0.01 * kiss.data.max_range  # its default
+        kiss.registration.max_num_threads = 1
+        self._is_control = config.icp == "none"
+        self._kiss = KissICP(kiss)
 
     def register(self, points_m: NDArray[np.floating], guess: F64) -> F64:
         """Align one scan to the local map.
@@ -50,57 +51,33 @@ class KissRegistration:
         pose. The scan becomes part of the local map only by `add`.
         """
         guess = _proper(guess)
-        if self._map is None or not len(points_m) or self._config.icp == "none":
+        if self._kiss.local_map.empty() or not len(points_m) or self._is_control:
             return guess
-        sigma = self._threshold.get_threshold()
-        frame = self._frame(points_m)
-        pose: F64 = self._registration.align_points_to_map(
-            points=frame if len(frame) <= _FEW else self._downsample(frame, 1.5),
-            voxel_map=self._map,
+        sigma = self._kiss.adaptive_threshold.get_threshold()
+        source, frame = self._voxelized(points_m)
+        pose: F64 = self._kiss.registration.align_points_to_map(
+            points=frame if len(frame) <= _FEW else source,
+            voxel_map=self._kiss.local_map,
             initial_guess=guess,
             max_correspondance_distance=3.0 * sigma,
             kernel=sigma,
         )
         if not np.isfinite(pose).all():
             return guess
-        self._threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
+        self._kiss.adaptive_threshold.update_model_deviation(np.linalg.inv(guess) @ pose)
         return pose
 
     def add(self, points_m: NDArray[np.floating], T_session_base: F64) -> None:
         """Add the points (N, 3) of a scan to the local map, at its final pose (4, 4)."""
-        if self._map is None:
-            self._start()
         if len(points_m):
-            self._map.update(self._frame(points_m), _proper(T_session_base))
+            self._kiss.local_map.update(self._voxelized(points_m)[1], _proper(T_session_base))
 
-    def _frame(self, points_m: NDArray[np.floating]) -> F64:
-        """Return the points (N, 3) within range, downsampled for the local map."""
+    def _voxelized(self, points_m: NDArray[np.floating]) -> tuple[F64, F64]:
+        """Return the points (N, 3) within range, thinned to be registered, and less for the local map."""
         points = np.ascontiguousarray(points_m, dtype=np.float64)
-        near = np.einsum("ij,ij->i", points, points) < self._kiss_config.data.max_range**2
-        return self._downsample(points[near], 0.5)
-
-    def _downsample(self, points: F64, voxels: float) -> F64:
-        """Return one point for each cube with an edge of so many voxels of the local map."""
-        from kiss_icp.voxelization import voxel_down_sample
-
-        sampled: F64 = voxel_down_sample(points, voxels * self._kiss_config.mapping.voxel_size)
-        return sampled
-
-    def _start(self) -> None:
-        """Begin the local map."""
-        from kiss_icp.config import KISSConfig
-        from kiss_icp.mapping import get_voxel_hash_map
-        from kiss_icp.registration import get_registration
-        from kiss_icp.threshold import get_threshold_estimator
-
-        config = KISSConfig()
-        config.data.max_range = self._max_range_m or config.data.max_range
-        config.mapping.voxel_size = self._voxel_m or 0.01 * config.data.max_range  # its default
-        config.registration.max_num_threads = 1
-        self._kiss_config = config
-        self._registration = get_registration(config)
-        self._threshold = get_threshold_estimator(config)
-        self._map = get_voxel_hash_map(config)
+        near = np.einsum("ij,ij->i", points, points) < self._kiss.config.data.max_range**2
+        source, frame = self._kiss.voxelize(points[near])
+        return source, frame
 
 
 def _proper(pose: F64) -> F64:
