@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from pydantic import TypeAdapter
 
-    from pc2grid.geometry import F64, U8
+    from pc2grid.geometry import F64
 
 UNKNOWN_GREY, FREE_GREY, WALL_GREY = 222, 255, 38
 PATH_BLUE, CENTRE_GREEN = (178, 114, 0), (115, 158, 0)
@@ -45,7 +45,10 @@ def map_png(
 
     known = np.argwhere(cells >= 0)
     (r0, c0), (r1, c1) = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else ((0, 0), cells.shape)
-    grey = _shades(cells[r0:r1, c0:c1])[::-1]
+    cells = cells[r0:r1, c0:c1][::-1]
+    # The darker, the more probably occupied.
+    shade = FREE_GREY - (FREE_GREY - WALL_GREY) / 100.0 * cells
+    grey = np.where(cells < 0, UNKNOWN_GREY, shade).astype(np.uint8)
     height, width = grey.shape
     scale = LONGEST_PX / max(height, width, 1)
     if scale > 1.0:  # whole pixels for each cell, and no more than are needed
@@ -64,12 +67,6 @@ def map_png(
     if path_m is not None and len(path_m) > 1:
         cv2.polylines(image, [pixels(path_m)], False, PATH_BLUE, 1, cv2.LINE_AA)
     return bytes(cv2.imencode(".png", image)[1])
-
-
-def _shades(cells: NDArray[np.int8]) -> U8:
-    """Return the grey of each cell: the darker, the more probably occupied."""
-    shade = FREE_GREY - (FREE_GREY - WALL_GREY) / 100.0 * cells
-    return np.where(cells < 0, UNKNOWN_GREY, shade).astype(np.uint8)
 
 
 def html_picture(png: bytes, description: str) -> str:

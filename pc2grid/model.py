@@ -429,13 +429,11 @@ class Loop:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Contradiction:
-    """A part of a trajectory along which the scans do not agree with the map that was drawn from them.
+class Stretch:
+    """A part of a trajectory.
 
-    from_ns, to_ns : stamps of its first and last scan.
-    x_m, y_m : position of the base, in the session frame, where the scans agree least.
-    length_m : planar distance driven.
-    share : of the wall hits there that lie on free ground of the map, 0..1.
+    from_ns, to_ns : stamps of its first and last scan. length_m : planar distance driven.
+    x_m, y_m : position of the base, in the session frame, where it is worst.
     """
 
     from_ns: int
@@ -443,6 +441,15 @@ class Contradiction:
     x_m: TwoDigits
     y_m: TwoDigits
     length_m: TwoDigits
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Contradiction(Stretch):
+    """A part of a trajectory along which the scans do not agree with the map that was drawn from them.
+
+    share : of the wall hits at the worst place that lie on free ground of the map, 0..1.
+    """
+
     share: FourDigits
 
 
@@ -467,19 +474,12 @@ class Consistency:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class UncertainSegment:
+class UncertainSegment(Stretch):
     """A part of a trajectory whose place relative to the rest of the map is known only roughly.
 
-    from_ns, to_ns : stamps of its ends. length_m : planar distance driven.
     sigma_m : largest standard deviation of a position along it, in the least certain direction.
-    x_m, y_m : position of the base, in the session frame, where that is so.
     """
 
-    from_ns: int
-    to_ns: int
-    x_m: TwoDigits
-    y_m: TwoDigits
-    length_m: TwoDigits
     sigma_m: ThreeDigits
 
 

@@ -68,7 +68,8 @@ class ProgressBars(Observer):
         self._update: Callable[[float], None] | None = None
 
     @contextmanager
-    def _bar(self, what: str) -> Iterator[None]:
+    def step(self, what: str, recorded_s: float | None = None) -> Iterator[None]:
+        """Surround a step of the work with its bar."""
         from rich.progress import BarColumn, SpinnerColumn, TaskProgressColumn, TimeElapsedColumn
 
         columns = (SpinnerColumn(), BarColumn(), TaskProgressColumn(), TimeElapsedColumn())
@@ -77,10 +78,6 @@ class ProgressBars(Observer):
             self._update = seldom(lambda share: bars.update(task, completed=share))
             yield
         self._update = None
-
-    def step(self, what: str, recorded_s: float | None = None) -> AbstractContextManager[None]:
-        """Surround a step of the work with its bar."""
-        return self._bar(what)
 
     def on_progress(self, share: float) -> None:
         """Move the bar."""

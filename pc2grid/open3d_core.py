@@ -19,29 +19,20 @@ _PLOTS = "open3d.visualization.draw_plotly"
 class _LaterLoaded(ModuleType):
     """A module whose public names are functions that load the module itself when they are called."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(name)
-        self._passed_on: set[str] = set()
-
     def __getattr__(self, name: str) -> Callable[..., Any]:
         if name.startswith("_"):
             raise AttributeError(name)
-        self._passed_on.add(name)
 
         def call(*arguments: Any, **keywords: Any) -> Any:
-            return getattr(self._load(), name)(*arguments, **keywords)
+            if sys.modules.get(self.__name__) is self:
+                del sys.modules[self.__name__]
+            module = importlib.import_module(self.__name__)
+            # The import has put the module where the package has its function of the same name.
+            package, _, function = self.__name__.rpartition(".")
+            setattr(sys.modules[package], function, getattr(module, function))
+            return getattr(module, name)(*arguments, **keywords)
 
         return call
-
-    def _load(self) -> ModuleType:
-        if sys.modules.get(self.__name__) is self:
-            del sys.modules[self.__name__]
-        module = importlib.import_module(self.__name__)
-        # The import has put the module where the package has its function of the same name.
-        package = sys.modules[self.__name__.rpartition(".")[0]]
-        for name in self._passed_on:
-            setattr(package, name, getattr(module, name))
-        return module
 
 
 if "open3d" not in sys.modules:

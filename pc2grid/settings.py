@@ -229,7 +229,11 @@ def dump_settings(settings: Section) -> str:
             value = getattr(section, key)
             lines.append(f"# {info.description}" if info.description else f"# ({key})")
             kept = value is None and getattr(usual, key) is None
-            lines.append(f"# {key} =" if kept else f"{key} = {_toml(value)}")
+            # TOML writes numbers, booleans, texts and lists of them as JSON does.
+            text = json.dumps("null" if value is None else value, ensure_ascii=False).replace(
+                "\x7f", "\\u007f"
+            )
+            lines.append(f"# {key} =" if kept else f"{key} = {text}")
     return "\n".join(lines) + "\n"
 
 
@@ -310,9 +314,3 @@ def _closest(model: type[Section], key: str) -> str | None:
     same = [name for name in known if name.rpartition(".")[2] == last]
     near = same or difflib.get_close_matches(key, known, n=1)
     return near[0] if near else None
-
-
-def _toml(value: Any) -> str:
-    """Return a value as TOML, which writes numbers, booleans, texts and lists of them as JSON does."""
-    text = "null" if value is None else value
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
