@@ -13,17 +13,18 @@ decides in the directions that the points do not fix.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import eigh
 
 from pc2grid.clouds.cloud import AXIS_BITS, HALF_VOXELS, random_subset
+from pc2grid.clouds.ground import SYMMETRIC
 from pc2grid.estimation.line_map import MATCHING_PARAMETERS, TRACKING, moved, steps, weakest
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.smoother import PoseWithCovariance
-from pc2grid.geometry import F32, F64, I64, BoolGrid
+from pc2grid.geometry import F32, F64, I64, skew, transform_points
 from pc2grid.libraries import compiled
 from pc2grid.settings import RegistrationConfig
 
@@ -98,80 +99,69 @@ class SurfaceMatch:
     measured: bool
 
 
-@dataclass(slots=True)
-class _Rows:
-    """The voxels of a map, one a row; `used` rows are in use.
-
-    codes : (V,) see `add`. moments : (V, 10). shapes : (V, 9), the mean of the points and the upper
-    triangle of their information, see `fit_shapes`.
-    """
-
-    codes: I64 = field(default_factory=lambda: np.empty(0, np.int64))
-    moments: F64 = field(default_factory=lambda: np.empty((0, 10)))
-    shapes: F64 = field(default_factory=lambda: np.empty((0, 9)))
-    used: int = 0
-
-    def reserve(self, more: int) -> None:
-        """Make room for more rows."""
-        need = self.used + more
-        if need <= len(self.codes):
-            return
-        room = max(2 * len(self.codes), need, 1 << 13)
-        # What is not written takes no memory: a scan is thinned by rows most of which stay unused.
-        codes, moments, shapes = np.empty(room, np.int64), np.empty((room, 10)), np.empty((room, 9))
-        for rows, more_rows in ((self.codes, codes), (self.moments, moments), (self.shapes, shapes)):
-            more_rows[: self.used] = rows[: self.used]
-        self.codes, self.moments, self.shapes = codes, moments, shapes
-
-    def keep(self, kept: BoolGrid) -> None:
-        """Keep some (used,) of the rows."""
-        count = int(kept.sum())
-        for rows in (self.codes, self.moments, self.shapes):
-            rows[:count] = rows[: self.used][kept]
-        self.used = count
-
-
 class VoxelShapes:
     """A map of voxels with the shape of the surface in each. edge_m : of a voxel."""
 
     def __init__(self, edge_m: float) -> None:
         self.edge_m = edge_m
-        self._rows = _Rows()
+        self._rows = _rows(0)
+        self._used = 0  # rows in use
         self._slots: NDArray[np.int32] = np.full(1 << 15, -1, np.int32)
         self._entered = 0  # rows that the slots hold
 
     def __len__(self) -> int:
         """Return the number of voxels in use."""
-        return self._rows.used
+        return self._used
 
     @property
     def shapes(self) -> F64:
         """Return (V, 9): mean of the points, m, and the upper triangle of their information, 0..1."""
-        return self._rows.shapes[: self._rows.used]
+        return self._rows[2][: self._used]
 
     def add(self, points_m: F64) -> None:
-        """Add points (N, 3), in the frame of the map."""
-        p, rows, touched = SURFACES, self._rows, np.unique(self.enter(points_m))
-        fit_shapes(rows.codes, rows.moments, rows.shapes, touched, self.edge_m, p.least, p.noise_m)
+        """Add points (N, 3), in the frame of the map, and fit the shapes of their voxels.
+
+        A shape is zero where there are too few points. Its information is the constraint of a point in each
+        direction, 0..1: s^2 / (v + s^2) for a variance v of the points along it and a noise s, less that of
+        the widest direction. So a plane constrains along its normal, an edge across its line, and a ball not
+        at all.
+        """
+        rows, (codes, moments, shapes) = np.unique(self.enter(points_m)), self._rows
+        code, count = codes[rows, None] >> np.array([2 * AXIS_BITS, AXIS_BITS, 0]), moments[rows, :1]
+        mean = moments[rows, 1:4] / count
+        shapes[rows, :3] = mean + ((code & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * self.edge_m
+        shapes[rows, 3:] = 0.0
+        some = count[:, 0] >= SURFACES.least
+        C = (moments[rows[some], 4:][:, SYMMETRIC] / count[some]).reshape(-1, 3, 3)
+        variances, axes = np.linalg.eigh(C - mean[some, :, None] * mean[some, None])
+        held = SURFACES.noise_m**2 / (np.maximum(variances, 0.0) + SURFACES.noise_m**2)
+        information = (axes * (held - held[:, 2:])[:, None]) @ axes.swapaxes(1, 2)
+        shapes[rows[some], 3:] = information.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
 
     def enter(self, points_m: F64) -> I64:
         """Add points (N, 3) to the moments alone; return the row (N,) of the voxel of each."""
-        rows = self._rows
-        rows.reserve(len(points_m))
-        size = 1 << (3 * (rows.used + len(points_m))).bit_length()
+        need = self._used + len(points_m)
+        if need > len(self._rows[0]):
+            before, self._rows = self._rows, _rows(max(2 * len(self._rows[0]), need, 1 << 13))
+            for rows, more in zip(before, self._rows, strict=True):
+                more[: self._used] = rows[: self._used]
+        size = 1 << (3 * need).bit_length()
         if len(self._slots) < size:
             self._slots, self._entered = np.full(size, -1, np.int32), 0
         touched = np.empty(len(points_m), np.int64)
-        rows.used = self._entered = add(
-            self._slots, rows.codes, rows.moments, self._entered, rows.used, points_m, self.edge_m,
-            SURFACES.most, touched,
+        self._used = self._entered = add(
+            self._slots, *self._rows[:2], self._entered, self._used, points_m, self.edge_m, SURFACES.most,
+            touched,
         )  # fmt: skip
         return touched
 
     def forget_beyond(self, center_m: F64, reach_m: float) -> None:
         """Forget the voxels farther than `reach_m` from a place (3,)."""
         away = self.shapes[:, :3] - center_m
-        self._rows.keep(np.einsum("ij,ij->i", away, away) < reach_m**2)
+        kept = np.flatnonzero(np.einsum("ij,ij->i", away, away) < reach_m**2)
+        for rows in self._rows:
+            rows[: len(kept)] = rows[kept]
+        self._used = len(kept)
         self._slots[:], self._entered = -1, 0
         self.enter(np.empty((0, 3)))
 
@@ -180,9 +170,10 @@ class VoxelShapes:
 
         Returns H (6, 6) and g (6,) of the step H d = -g, and the number of points with a shape.
         """
-        rows, H, g, J, room = self._rows, np.zeros((6, 6)), np.zeros(6), np.eye(3, 6), np.empty((3, 8))
+        H, g, J, room = np.zeros((6, 6)), np.zeros(6), np.eye(3, 6), np.empty((3, 8))
+        codes, _, shapes = self._rows
         found = normal_equations(
-            self._slots, rows.codes, rows.shapes, points_m, weights,
+            self._slots, codes, shapes, points_m, weights,
             np.ascontiguousarray(pose),  # or the kernel is compiled twice
             self.edge_m, scale_m, H, g, J, room,
         )  # fmt: skip
@@ -190,6 +181,14 @@ class VoxelShapes:
         R = np.zeros((6, 6))
         R[:3, :3] = R[3:, 3:] = pose[:3, :3]
         return R.T @ H @ R, R.T @ g, found
+
+
+def _rows(count: int) -> tuple[I64, F64, F64]:
+    """Return so many rows of voxels: codes (V,), see `add`; moments (V, 10); and shapes (V, 9), the mean of
+    the points and the upper triangle of their information.
+    """
+    # What is not written takes no memory: a scan is thinned by rows most of which stay unused.
+    return np.empty(count, np.int64), np.empty((count, 10)), np.empty((count, 9))
 
 
 class SurfaceMap:
@@ -225,7 +224,7 @@ class SurfaceMap:
     def add(self, points_m: F64, pose: F64) -> None:
         """Add thinned points (N, 3) at their pose (4, 4); voxels that are far by now are forgotten."""
         here = pose[:3, 3]
-        self.fine.add(points_m @ pose[:3, :3].T + here)
+        self.fine.add(transform_points(pose, points_m))
         self._kiss.add(points_m, pose)
         if self._cleared_at is None:
             self._cleared_at = here
@@ -287,7 +286,10 @@ class SurfaceMap:
             there = moved(pose[None], step[None])[0]
             return self.fine.equations(points, own, there, p.aside_scale * self.fine.edge_m)[:2]
 
-        displacement = _displacement(points)
+        # Mean square (6, 6) of the displacement of the points by changes of the base, m2.
+        displaced = np.zeros((len(points), 3, 6))
+        displaced[:, :, :3], displaced[:, :, 3:] = np.eye(3), skew(points).swapaxes(1, 2)
+        displacement = np.einsum("nai,naj->ij", displaced, displaced) / len(points) + 1e-9 * np.eye(6)
         tangents, changes = eigh(at(np.zeros(6))[0], displacement)
         secants = [
             change @ (at(aside_m * change)[1] - at(-aside_m * change)[1]) / (2.0 * aside_m)
@@ -306,43 +308,6 @@ def _step(pose: F64, information: F64, gradient: F64, prior: PoseWithCovariance)
         gradient + J.T @ prior.information @ away,
     )
     return step
-
-
-def _displacement(points_m: F64) -> F64:
-    """Return the mean square (6, 6), in m2, of the displacement of points (N, 3) by changes (6,) of the
-    base."""
-    x, y, z = points_m.T
-    displaced = np.zeros((len(points_m), 3, 6))
-    displaced[:, :, :3] = np.eye(3)
-    displaced[:, 0, 4], displaced[:, 0, 5], displaced[:, 1, 5] = z, -y, x
-    displaced[:, 1, 3], displaced[:, 2, 3], displaced[:, 2, 4] = -z, y, -x
-    mean: F64 = np.einsum("nai,naj->ij", displaced, displaced) / len(points_m)
-    return mean + 1e-9 * np.eye(6)
-
-
-_MATRIX = np.array([4, 5, 6, 5, 7, 8, 6, 8, 9])
-"""Columns of the second moments, as a symmetric matrix (3, 3) row by row."""
-
-
-def fit_shapes(
-    codes: I64, moments: F64, shapes: F64, rows: I64, edge: float, least: float, noise: float
-) -> None:
-    """Write mean and information (V, 9) of the voxels in `rows`; zero where there are too few points.
-
-    The information is the constraint of a point in each direction, 0..1: s^2 / (v + s^2) for a variance v of
-    the points along it and a noise s, less that of the widest direction. So a plane constrains along its
-    normal, an edge across its line, and a ball not at all.
-    """
-    code, count = codes[rows, None] >> np.array([2 * AXIS_BITS, AXIS_BITS, 0]), moments[rows, :1]
-    mean = moments[rows, 1:4] / count
-    shapes[rows, :3] = mean + ((code & (2 * HALF_VOXELS - 1)) - HALF_VOXELS) * edge
-    shapes[rows, 3:] = 0.0
-    some = count[:, 0] >= least
-    C = (moments[rows[some]][:, _MATRIX] / count[some]).reshape(-1, 3, 3)
-    variances, axes = np.linalg.eigh(C - mean[some, :, None] * mean[some, None])
-    held = noise**2 / (np.maximum(variances, 0.0) + noise**2)
-    information = (axes * (held - held[:, 2:])[:, None]) @ axes.swapaxes(1, 2)
-    shapes[rows[some], 3:] = information.reshape(-1, 9)[:, [0, 1, 2, 4, 5, 8]]
 
 
 @compiled(inline="always")
@@ -396,22 +361,17 @@ def add(
             kept = (most - 1.0) / m[0]
             for c in range(10):
                 m[c] *= kept
-        x, y, z = points[n, 0] - i * edge, points[n, 1] - j * edge, points[n, 2] - k * edge
-        m[0] += 1.0
-        m[1] += x
-        m[2] += y
-        m[3] += z
-        m[4] += x * x
-        m[5] += x * y
-        m[6] += x * z
-        m[7] += y * y
-        m[8] += y * z
-        m[9] += z * z
+        powers = 1.0, points[n, 0] - i * edge, points[n, 1] - j * edge, points[n, 2] - k * edge
+        place = 0
+        for a in range(4):
+            for b in range(a, 4):
+                m[place] += powers[a] * powers[b]
+                place += 1
         touched[n] = row
     return used
 
 
-_ROW = np.array([[3, 4, 5], [4, 6, 7], [5, 7, 8]])
+_ROW = 3 + SYMMETRIC.reshape(3, 3)
 """Columns of a shape that hold its information, as a symmetric matrix."""
 
 
