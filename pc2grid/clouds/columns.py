@@ -14,12 +14,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pc2grid.clouds.planar_scan import BEARINGS, PlanarScan, mean_per_cell, planar_normals
-from pc2grid.geometry import F32, F64, I64, SE2, U8
+from pc2grid.geometry import F32, F64, I64, SE2, BoolGrid
 from pc2grid.libraries import compiled
 from pc2grid.model import SENSOR_MODELS, SLICE_BORDERS_M, SLICES, SensorKind
 from pc2grid.settings import ProjectionConfig
@@ -69,13 +68,12 @@ class ColumnMap:
         reach_m: float,
         sensor: SensorKind,
         config: ProjectionConfig,
-        parameters: ColumnParameters = COLUMNS,
     ) -> None:
-        self._reach_m, self._config, self._parameters = reach_m, config, parameters
+        self._reach_m, self._config = reach_m, config
         self._noise_per_m2 = SENSOR_MODELS[sensor].noise_per_m2
         size = 2 * math.ceil(1.25 * reach_m / config.resolution_m)
-        self._evidence = np.zeros((size, size, parameters.layers), np.int8)
-        self._seen = np.zeros((size, size, parameters.layers), np.uint8)
+        self._evidence = np.zeros((size, size, COLUMNS.layers), np.int8)
+        self._seen = np.zeros((size, size, COLUMNS.layers), np.uint8)
         self._touched = np.zeros((size, size), np.uint8)
         self._columns = np.zeros((2, size, size), np.uint8)  # what each is, and its heights (`SLICES`)
         self._sums = np.zeros((size, size, 3), np.float32)
@@ -90,7 +88,7 @@ class ColumnMap:
         sensor_m : (3,) origin of the rays. floor_m : z of the floor. doubt_m : the floor may lie higher or
         lower by so much: points there are no obstacles.
         """
-        p, edge_m = self._parameters, self._config.resolution_m
+        p, edge_m = COLUMNS, self._config.resolution_m
         self._center(sensor_m)
         self._stamp += 1
         if self._stamp > np.iinfo(self._seen.dtype).max:
@@ -121,17 +119,17 @@ class ColumnMap:
 
         T_session_base : planar pose of the base, in whose frame the planar scan is.
         """
-        p, pose = self._parameters, T_session_base
-        to_base = pose.inverse()
+        p, to_base, edge_m = COLUMNS, T_session_base.inverse(), self._config.resolution_m
         origin = to_base.apply(sensor_m[None, :2])[0]
-        edge_m = self._config.resolution_m
         # A wall on the border of two cells is in both.
         free_m, sums, low_m = view(
-            self._columns[0], self._sums, self._low, sensor_m[:2], pose.yaw, self._reach_m, edge_m, p.gap_m,
-            (2.0 * edge_m, 4.0 * self._noise_per_m2), BEARINGS,
+            self._columns[0], self._sums, self._low, sensor_m[:2], T_session_base.yaw, self._reach_m, edge_m,
+            p.gap_m, (2.0 * edge_m, 4.0 * self._noise_per_m2), BEARINGS,
         )  # fmt: skip
         walls_m = mean_per_cell(sums, edge_m) if len(sums) else low_m[:0]
         hits: F32 = to_base.apply(walls_m).astype(np.float32)
+        obstacles_m: F64 = np.concatenate((walls_m, low_m))
+        column, row = (np.floor(obstacles_m / edge_m).astype(np.int64) % self._columns.shape[1]).T
         return PlanarScan(
             stamp_ns=stamp_ns,
             hits_m=hits,
@@ -139,7 +137,7 @@ class ColumnMap:
             origin_m=origin,
             free_m=free_m.astype(np.float32),
             low_m=to_base.apply(low_m).astype(np.float32),
-            heights=self._heights_at(np.concatenate((walls_m, low_m))),
+            heights=self._columns[1, column, row],
         )
 
     def agreement(self, points_m: F64) -> tuple[float, float]:
@@ -148,32 +146,22 @@ class ColumnMap:
         It is the share of points on surfaces minus the share in free space: among the points in observed
         cells, and among all points in the window.
         """
-        cell = self._config.resolution_m, self._parameters.layer_m
+        cell = self._config.resolution_m, COLUMNS.layer_m
         met, against, inside = agreement_counts(self._evidence, self._low, points_m, cell)
         return (met - against) / max(met + against, 1), (met - against) / max(inside, 1)
 
-    def walls(self, sigma_m: float) -> tuple[F32, F64]:
-        """Return the likelihood field (H, W), 0..1, of all obstacles, rows along y, and its corner (2,)."""
-        edge_m = self._config.resolution_m
-        walls = np.roll(self._columns[0] >= LOW, (-self._low[:2] % self._columns.shape[1]).tolist(), (0, 1)).T
-        away_m = edge_m * cv2.distanceTransform((~walls).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_3)
-        field: F32 = np.exp(np.float32(-0.5 / sigma_m**2) * away_m**2)
-        return field, edge_m * self._low[:2].astype(np.float64)
-
-    def _heights_at(self, points_m: F64) -> U8:
-        """Return the heights (N,) of the columns of points (N, 2), session frame; see `SLICES` of
-        `pc2grid.model`."""
-        column, row = (
-            np.floor(points_m.T / self._config.resolution_m).astype(np.int64) % self._columns.shape[1]
-        )
-        return np.asarray(self._columns[1, column, row], np.uint8)
+    def obstacles(self) -> tuple[BoolGrid, F64]:
+        """Return a mask (H, W) of all obstacles, rows along y, and its corner (2,)."""
+        shift = (-self._low[:2] % self._columns.shape[1]).tolist()
+        corner_m = self._config.resolution_m * self._low[:2].astype(np.float64)
+        return np.roll(self._columns[0] >= LOW, shift, (0, 1)).T, corner_m
 
     def _band_m(self, floor_m: float) -> tuple[float, float]:
         return floor_m + self._config.band_min_m, floor_m + self._config.band_max_m
 
     def _center(self, sensor_m: F64) -> None:
         """Move the window if the sensor is no longer near its middle."""
-        p, edge_m = self._parameters, self._config.resolution_m
+        p, edge_m = COLUMNS, self._config.resolution_m
         size = self._columns.shape[1]
         cell = np.array([edge_m, edge_m, p.layer_m])
         half = np.array([size // 2, size // 2, p.layers // 2])
@@ -181,19 +169,15 @@ class ColumnMap:
         if not self._stamp:
             self._low = low
         slack = np.array([size // 10, size // 10, p.layers // 10])
-        if (np.abs(low - self._low) > slack).any():
-            self._forget(low)
-            self._floor_m = math.nan  # states are made again
-
-    def _forget(self, low: I64) -> None:
-        """Forget the cells that leave the window when its lowest indices (3,) become `low`."""
-        for axis, size in enumerate(self._evidence.shape):
-            cells = np.arange(low[axis], low[axis] + size)
-            leaves = cells[np.abs(cells - self._low[axis] - 0.5 * (size - 1)) > 0.5 * size] % size
+        if not (np.abs(low - self._low) > slack).any():
+            return
+        for axis, count in enumerate(self._evidence.shape):  # cells that leave the window are forgotten
+            cells = np.arange(low[axis], low[axis] + count)
+            leaves = cells[np.abs(cells - self._low[axis] - 0.5 * (count - 1)) > 0.5 * count] % count
             np.moveaxis(self._evidence, axis, 0)[leaves] = 0
             if axis < 2:
                 np.moveaxis(self._sums, axis, 0)[leaves] = 0.0
-        self._low = low
+        self._low, self._floor_m = low, math.nan  # states are made again
 
 
 # --- compiled functions -------------------------------------------------------------------------------

@@ -25,7 +25,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pc2grid.geometry import F32, F64, SE2, SUBPIXEL_BITS, U8, polygon_corners, wrap_angle
+from pc2grid.geometry import F32, F64, SE2, SUBPIXEL_BITS, U8, BoolGrid, polygon_corners, wrap_angle
 from pc2grid.libraries import compiled
 
 
@@ -78,7 +78,7 @@ class TrackingParameters:
     reach_m, reach_rad : a refinement alone converges over so much. The search is made only if its half width,
         `KERNEL` standard deviations, exceeds one of these.
     search_most_m : largest half width.
-    search_sigma_m : of the likelihood field that is searched; its steps are 0.2 m and 2 degrees.
+    search_sigma_m : of the likelihood field that is searched.
 
     Local maps and keyframes:
 
@@ -138,6 +138,8 @@ Weights that fall with the square of the range were tried there, and made the he
 0.044 m): the noise of a hit is small beside the shape of walls, and far hits determine the heading.
 """
 TRACKING = TrackingParameters()
+_STEP_M, _STEP_RAD, _PLACEMENTS = 0.2, math.radians(2.0), 3
+"""Steps of `best_placements`, and the number of placements that it returns, at most."""
 _BORDER_CELLS = 5
 """Width of the border of free ground that may be a wall: a neighbourhood of the matching on either side."""
 
@@ -217,12 +219,9 @@ class PointGrid:
             inside = cv2.fillPoly(np.zeros_like(part), [corners], 1, shift=SUBPIXEL_BITS)
             part |= cv2.erode(inside, np.ones((_BORDER_CELLS, _BORDER_CELLS), np.uint8))
 
-    def likelihood(self, sigma_m: float) -> F32:
+    def likelihood(self) -> F32:
         """Return the likelihood field (H, W), 0..1, of the cells that hold points."""
-        empty = (self._index < 0).astype(np.uint8)
-        distance_m = self.cell_m * cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_3)
-        field: F32 = np.exp(np.float32(-0.5 / sigma_m**2) * distance_m**2)
-        return field
+        return likelihood_field(self._index >= 0, self.cell_m)
 
     def weighed(
         self,
@@ -308,36 +307,34 @@ def sector_of(normal_rad: F64, sectors: int) -> NDArray[np.int64]:
     return found
 
 
+def likelihood_field(stands: BoolGrid, cell_m: float) -> F32:
+    """Return the likelihood field (H, W), 0..1, of cells in which something stands, to be searched."""
+    empty = (~stands).astype(np.uint8)
+    distance_m = cell_m * cv2.distanceTransform(empty, cv2.DIST_L2, cv2.DIST_MASK_3)
+    field: F32 = np.exp(np.float32(-0.5 / TRACKING.search_sigma_m**2) * distance_m**2)
+    return field
+
+
 def best_placements(
-    field: F32,
-    low_m: F64,
-    cell_m: float,
-    points_m: F64,
-    guess: SE2,
-    window_m: float,
-    window_rad: float,
-    *,
-    step_m: float = 0.2,
-    step_rad: float = math.radians(2.0),
-    count: int = 3,
+    field: F32, low_m: F64, cell_m: float, points_m: F64, guess: SE2, window_m: float, window_rad: float
 ) -> list[tuple[float, SE2]]:
     """Search the best placements of points (N, 2) on a likelihood field: exhaustive correlative matching
     (Olson 2009).
 
     field : (H, W) in 0..1, cell (0, 0) at `low_m`. The window around `guess` is searched in equal steps.
-    Returns the best `count` placements no two of which are neighbours, best first, each with the mean
-    likelihood of the points.
+    Returns the best few placements no two of which are neighbours, best first, each with the mean likelihood
+    of the points.
     """
-    steps = math.ceil(window_m / step_m)
-    across = step_m * np.arange(-steps, steps + 1, dtype=np.float64)
-    turn_steps = math.ceil(window_rad / step_rad)
-    turns = step_rad * np.arange(-turn_steps, turn_steps + 1, dtype=np.float64)
+    steps = math.ceil(window_m / _STEP_M)
+    across = _STEP_M * np.arange(-steps, steps + 1, dtype=np.float64)
+    turn_steps = math.ceil(window_rad / _STEP_RAD)
+    turns = _STEP_RAD * np.arange(-turn_steps, turn_steps + 1, dtype=np.float64)
     points = np.asarray(points_m, dtype=np.float64) / cell_m
     origin = (np.array([guess.x, guess.y]) - low_m) / cell_m
-    first, step = round(float(across[0]) / cell_m), max(round(step_m / cell_m), 1)
+    first, step = round(float(across[0]) / cell_m), max(round(_STEP_M / cell_m), 1)
     scores = placement_scores(field, points, origin, guess.yaw + turns, first, step, len(across))
     found: list[tuple[float, SE2]] = []
-    while len(found) < count:
+    while len(found) < _PLACEMENTS:
         a, r, c = np.unravel_index(int(np.argmax(scores)), scores.shape)
         score = float(scores[a, r, c])
         if score <= 0.0:

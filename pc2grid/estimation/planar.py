@@ -60,7 +60,7 @@ class PlanarMatcher:
 
     def restart(self) -> None:
         """Forget the local maps: the next keyframe begins new ones."""
-        self._maps.restart()
+        self._maps = MatchingMaps(self._projection.max_range_m, self._matching)
         self._kiss = KissRegistration(self._registration)
 
     def levelled(self, pose: F64) -> F64:
@@ -174,8 +174,7 @@ class PlanarMatcher:
 
 def _turned(matrix: F64, yaw_rad: float) -> F64:
     """Rotate a covariance or information (3, 3) of x, y, yaw into other axes."""
-    c, s = math.cos(yaw_rad), math.sin(yaw_rad)
-    R = np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    R = SE2(yaw=-yaw_rad).matrix()
     turned: F64 = R @ matrix @ R.T
     return turned
 
@@ -204,8 +203,7 @@ class MatchingMaps:
         """Return the best placements of a planar scan around a guess T_session_base, to be refined."""
         p, grid = TRACKING, self._maps[0][0]
         hits = planar_scan.hits_m[evenly(len(planar_scan.hits_m), p.matched)].astype(np.float64)
-        field = grid.likelihood(p.search_sigma_m)
-        found = best_placements(field, grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
+        found = best_placements(grid.likelihood(), grid.low_m, grid.cell_m, hits, guess, window_m, window_rad)
         return [pose for _, pose in found]
 
     def match(self, planar_scan: PlanarScan, near: SE2, prior: SE2, information: F64) -> LineMatch:
@@ -237,10 +235,6 @@ class MatchingMaps:
         for grid, _ in self._maps:
             grid.add(hits_m, normal_rad)
             grid.clear(outline_m)
-
-    def restart(self) -> None:
-        """Forget the maps: the next scan begins new ones."""
-        self._maps, self._last = [], None
 
 
 class GroundModel:

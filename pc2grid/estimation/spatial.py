@@ -25,15 +25,17 @@ from pc2grid.clouds.columns import ColumnMap
 from pc2grid.clouds.ground import LEVEL, FloorBelow, level_floor, vertical_held
 from pc2grid.clouds.planar_scan import PlanarScan
 from pc2grid.estimation.line_map import (
+    MATCHING_PARAMETERS,
     TRACKING,
     best_placements,
     evenly,
+    likelihood_field,
     moved,
     steps,
 )
-from pc2grid.estimation.smoother import KERNEL, SPATIAL, Measurement, PoseWithCovariance, ScanMatch
-from pc2grid.estimation.surface_map import LEAST_INFORMATION, SURFACES, SurfaceMap, SurfaceMatch
-from pc2grid.geometry import F32, F64, SE2, BoolGrid, invert_pose, leveling, motion_size
+from pc2grid.estimation.smoother import KERNEL, SPATIAL, PoseWithCovariance, ScanMatch
+from pc2grid.estimation.surface_map import LEAST_INFORMATION, SURFACES, SurfaceMap
+from pc2grid.geometry import F32, F64, SE2, BoolGrid, invert_pose, leveling, motion_size, transform_points
 from pc2grid.model import SENSOR_MODELS, Scan
 from pc2grid.settings import ProjectionConfig, RegistrationConfig
 
@@ -130,12 +132,19 @@ class SpatialMatcher:
         surfaces, points_m, weights = space.surfaces, self._thinned.points_m, self._thinned.weights
         found = surfaces.match(points_m, weights, surfaces.near(points_m, weights, guess, held), held)
         of_known, of_all = space.agreement(self._thinned, found.pose)
+        # The pose by the points alone: the prior is removed.
+        independent = (SURFACES.noise_m / MATCHING_PARAMETERS.cell_m) ** 2 * min(
+            len(points_m), SURFACES.points
+        )
+        away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], found.pose[None]))
+        information = found.information + LEAST_INFORMATION
+        change = np.linalg.solve(information, J.T @ held.information @ away)
         return ScanMatch(
             pose=found.pose,
-            alone=_alone(found, held),
+            alone=(moved(found.pose[None], change[None])[0], information),
             overlap=found.overlap,
             measured=found.measured,
-            evidence=SURFACES.independent(len(self._thinned.points_m)) * of_all,
+            evidence=independent * of_all,
             credible=of_known >= SPATIAL_MATCHING.least_agreement,
         )
 
@@ -176,16 +185,6 @@ class SpatialMatcher:
         return self._space.cut(scan, pose)
 
 
-def _alone(found: SurfaceMatch, held: PoseWithCovariance) -> Measurement:
-    """Return the pose (4, 4) by the points alone, with its information (6, 6). held : the prior to be
-    removed.
-    """
-    away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], found.pose[None]))
-    information = found.information + LEAST_INFORMATION
-    change = np.linalg.solve(information, J.T @ held.information @ away)
-    return moved(found.pose[None], change[None])[0], information
-
-
 # --- the beginning of a session -----------------------------------------------------------------------
 
 
@@ -212,39 +211,32 @@ class Beginning:
 def begin(scans: Iterator[Scan]) -> Beginning:
     """Look ahead until the first scans decide between hand and wheels and, in the hand, which way is up.
 
-    A session in the hand begins with the first scan that shows which way is up. If none does, all scans are
-    kept, and the sensor is assumed to be held level.
+    A hand is level for a moment only. What tilts and rises later is on a ramp. A session in the hand begins
+    with the first scan that shows which way is up. If none does, all scans are kept, and the sensor is
+    assumed to be held level.
     """
     ahead = islice(scans, SPATIAL_MATCHING.most_waiting)
-    waiting, in_hand = _until_decided(ahead)
+    waiting: list[Scan] = []
+    in_hand = False
+    for scan in ahead:
+        waiting.append(scan)
+        in_hand = not is_rolling(scan, waiting[0])
+        upright_s = (scan.stamp_ns - waiting[0].stamp_ns) * 1e-9
+        if in_hand or SENSOR_MODELS[scan.sensor].planar or upright_s > TRACKING.standing_s:
+            break
     if not in_hand:
         return Beginning(waiting)
     unknown = "no floor, and neither odometry nor an IMU says which way is up"
     seen: list[Scan] = []
     for scan in chain(waiting, ahead):
-        if _knows_vertical(scan):
+        by_others = scan.T_odom_base is not None or scan.T_level_base is not None
+        if by_others or level_floor(scan, scan.points_m) is not None:
             said = f"{len(seen)} scans show {unknown}: they are left out; begin with the floor in view"
             rest = [scan, *waiting[len(seen) + 1 :]]
             return Beginning(rest, True, len(seen), said if seen else None)
         seen.append(scan)
     said = f"the scans show {unknown}: the sensor is taken to be held level; begin with the floor in view"
     return Beginning(seen, True, warning=said)
-
-
-def _until_decided(scans: Iterator[Scan]) -> tuple[list[Scan], bool]:
-    """Take scans until they decide between hand and wheels; returns them, and True for a sensor in the hand.
-
-    A hand is level for a moment only. What tilts and rises later is on a ramp.
-    """
-    waiting: list[Scan] = []
-    for scan in scans:
-        waiting.append(scan)
-        if not is_rolling(scan, waiting[0]):
-            return waiting, True
-        upright_s = (scan.stamp_ns - waiting[0].stamp_ns) * 1e-9
-        if SENSOR_MODELS[scan.sensor].planar or upright_s > TRACKING.standing_s:
-            break
-    return waiting, False
 
 
 def is_rolling(scan: Scan, first: Scan | None = None) -> bool:
@@ -260,12 +252,6 @@ def is_rolling(scan: Scan, first: Scan | None = None) -> bool:
     before = T if first is None or first.T_odom_base is None else first.T_odom_base
     level = float(T[2, 2]) > math.cos(_UPRIGHT_TILT_RAD)
     return level and abs(float(T[2, 3] - before[2, 3])) < _UPRIGHT_HEIGHT_M
-
-
-def _knows_vertical(scan: Scan) -> bool:
-    """Return True if odometry, an IMU or a floor in view gives the vertical."""
-    known = scan.T_odom_base is not None or scan.T_level_base is not None
-    return known or level_floor(scan, scan.points_m) is not None
 
 
 def first_pose(scan: Scan, points_m: F32) -> F64:
@@ -307,10 +293,6 @@ class ThinnedScan:
     points_m: F64
     weights: F64
     shapes: F64
-
-    def placed(self, pose: F64) -> F64:
-        """Return the points (N, 3) at a pose (4, 4)."""
-        return np.asarray(self.points_m @ pose[:3, :3].T + pose[:3, 3])
 
 
 class SpaceMap:
@@ -361,7 +343,7 @@ class SpaceMap:
         """Return the agreement of a scan at a pose (4, 4) with surfaces and free space, see
         `ColumnMap.agreement`.
         """
-        return self._columns.agreement(self._lowered(thinned.placed(pose)))
+        return self._columns.agreement(self._lowered(transform_points(pose, thinned.points_m)))
 
     def search(self, thinned: ThinnedScan, guess: F64, window_m: float) -> list[F64]:
         """Search the best few poses (4, 4) in all headings, with the height and the tilt of a guess (4, 4).
@@ -370,14 +352,14 @@ class SpaceMap:
         """
         planar = SE2.from_matrix(guess)
         T_level_base = planar.inverse().lift() @ guess
-        level = thinned.placed(T_level_base)
+        level = transform_points(T_level_base, thinned.points_m)
         heights = level[:, 2] - self._floor_m(guess[:3, 3])
         band = level[(heights > self._projection.band_min_m) & (heights < self._projection.band_max_m), :2]
         if not len(band):
             return []
-        field, corner_m = self._columns.walls(TRACKING.search_sigma_m)
-        chosen = band[evenly(len(band), TRACKING.matched)]
-        cell_m = self._projection.resolution_m
+        obstacles, corner_m = self._columns.obstacles()
+        chosen, cell_m = band[evenly(len(band), TRACKING.matched)], self._projection.resolution_m
+        field = likelihood_field(obstacles, cell_m)
         found = best_placements(field, corner_m, cell_m, chosen, planar, window_m, math.pi)
         return [pose.lift() @ T_level_base for _, pose in found]
 
@@ -391,17 +373,15 @@ class SpaceMap:
                 return
         self._added_at = pose
         self.surfaces.add(thinned.points_m, pose)
-        sensor_m, placed = (pose @ scan.T_base_sensor)[:3, 3], thinned.placed(pose)
-        near_m = points_m[self._near(scan, points_m)].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
+        sensor_m, rays_m = (pose @ scan.T_base_sensor)[:3, 3], transform_points(pose, thinned.points_m)
+        near_m = transform_points(pose, points_m[self._near(scan, points_m)])
         fine = self.surfaces.fine
         seen_m = self._floor.follow(travel_m, self.surfaces.alone(near_m), fine.shapes, fine.edge_m, sensor_m)
         if seen_m is not None:
             self._above_floor_m = float(pose[2, 3]) - seen_m
-        rays_m = placed
         if travel_m >= step_m:  # who turns on the spot may hold the sensor over a table
-            rays_m = np.concatenate(
-                (placed, sensor_m + _DOWN * (1.0, 1.0, sensor_m[2] - self._floor_m(sensor_m)))
-            )
+            down_m = sensor_m + _DOWN * (1.0, 1.0, sensor_m[2] - self._floor_m(sensor_m))
+            rays_m = np.concatenate((rays_m, down_m))
         self._columns.add(
             self._lowered(near_m),
             self._lowered(rays_m),

@@ -70,12 +70,6 @@ class SurfaceParameters:
     least_points: float = 5.0
     least_kept: float = 0.2
 
-    def independent(self, points: int) -> float:
-        """Return the number of points with independent errors that are worth as much as so many points of a
-        scan.
-        """
-        return (self.noise_m / MATCHING_PARAMETERS.cell_m) ** 2 * min(points, self.points)
-
 
 SURFACES = SurfaceParameters()
 LEAST_INFORMATION = 1e-3 * np.eye(6)

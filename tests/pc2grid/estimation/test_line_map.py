@@ -229,9 +229,11 @@ def test_a_match_is_that_of_its_definition(sigma: float, turns: int, radii: tupl
 def test_likelihood_falls_with_the_distance_from_the_points() -> None:
     grid = PointGrid((0.0, 0.0), (4.0, 4.0))
     grid.add(np.array([[2.05, 1.05]]), np.zeros(1))
-    field = grid.likelihood(0.2)
+    field = grid.likelihood()
     assert field.shape == grid.shape and field[10, 20] == 1.0
-    assert field[10, 22] == pytest.approx(math.exp(-0.5), abs=0.05) and field[35, 20] < 1e-6
+    assert (
+        field[10, 22] == pytest.approx(math.exp(-0.5 * (0.2 / 0.15) ** 2), abs=0.05) and field[35, 20] < 1e-6
+    )
 
 
 def test_placements_are_scored_as_by_their_definition() -> None:
