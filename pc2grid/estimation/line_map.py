@@ -19,7 +19,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -354,37 +353,16 @@ def evenly(length: int, count: int) -> NDArray[np.intp]:
 # --- poses as unknowns --------------------------------------------------------------------------------
 
 
-class Steps(NamedTuple):
-    """The steps from poses to others, in the axes of the first.
-
-    step : (N, 6). by_first, by_second : (N, 6, 6) its Jacobians with respect to changes of both.
+def steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
+    """Return the steps (N, 6) from poses (N, 4, 4) to others, in the axes of the first, and their Jacobians
+    (N, 6, 6) with respect to changes of the first and of the second.
     """
-
-    step: F64
-    by_first: F64
-    by_second: F64
-
-
-def steps(first: F64, second: F64) -> Steps:
-    """Return the steps from poses (N, 4, 4) to others."""
-    return Steps(*compiled_steps(*_for_compiled(first, second)))
+    return compiled_steps(*_for_compiled(first, second))
 
 
 def moved(poses: F64, changes: F64) -> F64:
     """Return poses (N, 4, 4) after changes (N, 6) in their own axes."""
     result: F64 = _compiled_moved(*_for_compiled(poses, changes))
-    return result
-
-
-def inverse_adjoint(motion: F64) -> F64:
-    """Return the adjoint (6, 6) of the inverse of a motion (4, 4).
-
-    It maps a change of a pose to the change of the pose after the motion.
-    """
-    R, (x, y, z) = motion[:3, :3].T, motion[:3, 3].tolist()
-    result = np.zeros((6, 6))
-    result[:3, :3] = result[3:, 3:] = R
-    result[:3, 3:] = R @ np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
     return result
 
 
@@ -564,7 +542,7 @@ def placement_scores(
 
 @compiled()
 def compiled_steps(first: F64, second: F64) -> tuple[F64, F64, F64]:
-    """Return the steps between poses (N, 4, 4) and their Jacobians, see `Steps`."""
+    """Return the steps between poses (N, 4, 4) and their Jacobians, see `steps`."""
     count = first.shape[0]
     step, by_first, by_second = np.zeros((count, 6)), np.zeros((count, 6, 6)), np.zeros((count, 6, 6))
     turn, right = np.empty((3, 3)), np.empty((3, 3))

@@ -19,7 +19,6 @@ The window of factors, its states and the marginalised prior are tuples of array
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from functools import cached_property
@@ -29,8 +28,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv, dpotrs
 
-from pc2grid.estimation.line_map import DAMPING, inverse_adjoint, moved, steps
-from pc2grid.geometry import F64, BoolGrid, invert_pose
+from pc2grid.estimation.line_map import DAMPING, moved, steps
+from pc2grid.geometry import F64, BoolGrid, invert_pose, skew
 from pc2grid.libraries import compiled
 
 PLANAR: tuple[int, ...] = (0, 1, 5)
@@ -119,7 +118,7 @@ class PoseWithCovariance:
 
     def chi2(self, pose: F64) -> float:
         """Return the squared Mahalanobis distance of a pose (4, 4)."""
-        away = steps(self.pose[None], pose[None]).step[0, self.free]
+        away = steps(self.pose[None], pose[None])[0][0, self.free]
         return float(away @ self.information @ away)
 
     def log_density(self, chi2: float) -> float:
@@ -127,11 +126,8 @@ class PoseWithCovariance:
 
         Far off it falls as slowly as that of a factor.
         """
-        return -0.5 * (KERNEL**2 * math.log1p(chi2 / KERNEL**2) + self._log_volume)
-
-    @cached_property
-    def _log_volume(self) -> float:
-        return float(np.linalg.slogdet(self.covariance)[1])
+        log_volume = float(np.linalg.slogdet(self.covariance)[1])
+        return -0.5 * (KERNEL**2 * math.log1p(chi2 / KERNEL**2) + log_volume)
 
 
 Measurement = tuple[F64, F64]
@@ -156,23 +152,6 @@ class ScanMatch:
     measured: bool
     evidence: float
     credible: bool
-
-
-@dataclass(frozen=True, slots=True)
-class ScanFactors:
-    """The measurements of one scan.
-
-    seconds : since the scan before. T_odom_base : (4, 4) the reading of odometry, None if there is none.
-    continues : True if that reading continues the one before. match : the pose (4, 4) of the scan on the
-    local map with its information (D, D); None if it fits nowhere. motion : (4, 4) T_last_now by
-    registration, with its information (D, D); None if it is not measured.
-    """
-
-    seconds: float
-    T_odom_base: F64 | None = None
-    continues: bool = True
-    match: Measurement | None = None
-    motion: Measurement | None = None
 
 
 class FactorWindow(NamedTuple):
@@ -259,7 +238,7 @@ class Smoother:
         p, d = self._parameters, len(self._free)
         reading = T_session_base if T_odom_base is None else T_odom_base
         self._state = WindowState(T_session_base[None].copy(), reading[None].copy(), np.zeros(ERRORS))
-        self._window = self._row(ScanFactors(seconds=0.0), T_session_base, reading, 0.0)
+        self._window = self._row(T_session_base, reading, 0.0, 0.0)
         self._begins = True  # no scan has been added since
         errors = np.array([p.systematic, p.direction_rad, p.yaw_rad_per_m, p.systematic])
         own = np.concatenate((np.full(d, 1e-4), self._noise(p.reading_m, p.reading_rad)))
@@ -315,67 +294,87 @@ class Smoother:
 
     def after(self, motion: F64, sigmas: F64) -> PoseWithCovariance:
         """Return the last pose after a motion (4, 4) with standard deviations (D,) of its own."""
-        F = inverse_adjoint(motion)[np.ix_(self._free, self._free)]
+        # The adjoint of the inverse: maps a change of the pose to that of the pose after the motion.
+        R, adjoint = motion[:3, :3].T, np.zeros((6, 6))
+        adjoint[:3, :3], adjoint[3:, 3:], adjoint[:3, 3:] = R, R, R @ skew(-motion[None, :3, 3])[0]
+        F = adjoint[np.ix_(self._free, self._free)]
         return PoseWithCovariance(
             self._state.poses[-1] @ motion, F @ self._covariance @ F.T + np.diag(sigmas**2), self._free
         )
 
     # ---------------------------------------------------------------------------------------------- update
 
-    def add(self, guess: F64, evidence: ScanFactors) -> PoseWithCovariance:
+    def add(
+        self,
+        guess: F64,
+        seconds: float,
+        T_odom_base: F64 | None = None,
+        continues: bool = True,
+        match: Measurement | None = None,
+        motion: Measurement | None = None,
+    ) -> PoseWithCovariance:
         """Add a scan, and estimate its pose and again those of the scans before it.
 
-        guess : (4, 4) initial T_session_base, for example the match with the local map.
+        guess : (4, 4) initial T_session_base, for example the match with the local map. seconds : since the
+        scan before. T_odom_base : (4, 4) the reading of odometry, None if there is none. continues : True if
+        that reading continues the one before. match : the pose (4, 4) of the scan on the local map with its
+        information (D, D); None if it fits nowhere. motion : (4, 4) T_last_now by registration, with its
+        information (D, D); None if it is not measured.
 
         Without odometry, the first motion is taken to be that of `start`.
         """
-        before, read = self._state, evidence.T_odom_base
+        before = self._state
         reading = before.readings[-1] @ invert_pose(before.poses[-1]) @ guess
-        if read is not None and not evidence.continues:
-            reading = read
-        if self._begins and read is None and evidence.motion is None:
-            motion, sigmas = self.constant_velocity(evidence.seconds)
-            evidence = dataclasses.replace(evidence, motion=(motion, np.diag(sigmas**-2)))
+        if T_odom_base is not None and not continues:
+            reading = T_odom_base
+        if self._begins and T_odom_base is None and motion is None:
+            steady, sigmas = self.constant_velocity(seconds)
+            motion = steady, np.diag(sigmas**-2)
         self._begins = False
-        self._window = self._window.then(self._row(evidence, guess, reading, self._window.seconds[-1]))
+        before_s = self._window.seconds[-1]
+        row = self._row(guess, reading, before_s, seconds, T_odom_base, continues, match, motion)
+        self._window = self._window.then(row)
         state = WindowState(
             np.concatenate((before.poses, guess[None])),
             np.concatenate((before.readings, reading[None])),
             before.errors,
         )
         self._state, factor = self._solved(state)
-        self._covariance = self._last_covariance(factor)
+        d, last = len(self._free), np.zeros((len(factor), len(self._free)))
+        last[-2 * d : -d] = np.eye(d)
+        self._covariance = dpotrs(factor, last)[0][-2 * d : -d]
         if len(self._state.poses) > self._parameters.lag:
             self._marginalise()
         return self.belief
 
-    def _row(self, evidence: ScanFactors, pose: F64, reading: F64, before_s: float) -> FactorWindow:
+    def _row(
+        self,
+        pose: F64,
+        reading: F64,
+        before_s: float,
+        seconds: float,
+        T_odom_base: F64 | None = None,
+        continues: bool = True,
+        match: Measurement | None = None,
+        motion: Measurement | None = None,
+    ) -> FactorWindow:
         """Return the row of one scan; a pose (4, 4) and a reading take the place of missing measurements.
 
-        before_s : duration of the step before.
+        before_s : duration of the step before. The others as of `add`.
         """
         p, d = self._parameters, len(self._free)
         nothing, read = np.zeros((d, d)), (reading, np.full(d, np.inf))
-        if evidence.T_odom_base is not None:
-            read = evidence.T_odom_base, self._noise(p.reading_m, p.reading_rad)
-        motion, information = evidence.motion or (np.eye(4), nothing)
-        step, _, _ = steps(np.eye(4)[None], motion[None])
-        match = evidence.match or (pose, nothing)
-        seconds, before_s = max(evidence.seconds, LEAST_S), max(before_s, LEAST_S)
-        ratio = min(seconds, max(before_s, p.steady_s)) / before_s
+        if T_odom_base is not None:
+            read = T_odom_base, self._noise(p.reading_m, p.reading_rad)
+        moved_by, information = motion or (np.eye(4), nothing)
+        step, _, _ = steps(np.eye(4)[None], moved_by[None])
+        placed = match or (pose, nothing)
+        lasts_s, before_s = max(seconds, LEAST_S), max(before_s, LEAST_S)
+        ratio = min(lasts_s, max(before_s, p.steady_s)) / before_s
         # Odometry that jumps measures a step only together with a match.
-        follows = evidence.T_odom_base is not None and (evidence.continues or match[1].trace() > 0.0)
-        steadiness = 0.0 if follows or information.trace() > 0.0 else self._change_sigma(seconds) ** -2.0
-        row = (
-            evidence.seconds,
-            not evidence.continues,
-            *read,
-            *match,
-            step[0],
-            information,
-            ratio,
-            steadiness,
-        )
+        follows = T_odom_base is not None and (continues or placed[1].trace() > 0.0)
+        steadiness = 0.0 if follows or information.trace() > 0.0 else self._change_sigma(lasts_s) ** -2.0
+        row = seconds, not continues, *read, *placed, step[0], information, ratio, steadiness
         return FactorWindow(*(np.array(value)[None] for value in row))
 
     def _solved(self, state: WindowState) -> tuple[WindowState, F64]:
@@ -397,15 +396,6 @@ class Smoother:
             if np.abs(delta).max() < p.converged:
                 break
         return state, factor
-
-    def _last_covariance(self, factor: F64) -> F64:
-        """Return the covariance (D, D) of the last pose from the Cholesky factor of all information."""
-        count, d = len(factor), len(self._free)
-        last = np.zeros((count, d))
-        last[count - 2 * d : count - d] = np.eye(d)
-        solved, _ = dpotrs(factor, last)
-        covariance: F64 = solved[count - 2 * d : count - d]
-        return covariance
 
     def _marginalise(self) -> None:
         """Marginalise the first scan: replace it by a prior on the next two."""
@@ -470,7 +460,7 @@ def normal_equations(
     H, g = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
     off = prior.shift.copy()
     off[:ERRORS] += errors - about.errors
-    off[ERRORS:] += linear.step[4 * n - 2 :, free].reshape(2, m, d).swapaxes(0, 1).reshape(-1)
+    off[ERRORS:] += linear[0][4 * n - 2 :, free].reshape(2, m, d).swapaxes(0, 1).reshape(-1)
     H[:own, :own] = prior.information
     error, information, jacobian = np.empty((n + 1, 6)), np.empty((6, 6)), np.empty((2, 6, 5 * 6 + ERRORS))
     drift_scale = _add_factors(

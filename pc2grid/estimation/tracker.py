@@ -36,7 +36,6 @@ from pc2grid.estimation.smoother import (
     SMOOTHER,
     Measurement,
     PoseWithCovariance,
-    ScanFactors,
     ScanMatch,
     Smoother,
 )
@@ -131,10 +130,13 @@ class Tracker:
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
         placed = MatchSelector(self._sensor).place(scan, points, first, expected)
         between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
-        evidence = ScanFactors(seconds, reading, continues, placed.alone, between)
-        estimate = self._estimated(placed, evidence)
+        if placed.first:  # a new local map has no tie to the one before
+            self._smoother.start(self._flat(placed.pose), reading, self._smoother.speed)
+            estimate = self._smoother.belief
+        else:
+            estimate = self._smoother.add(placed.pose, seconds, reading, continues, placed.alone, between)
         # 4. Judge the pose, and start again if nothing fits any more.
-        health = self._judged(placed, estimate, evidence)
+        health = self._judged(placed, estimate, reading, continues=continues)
         sure = placed.sure and not placed.first
         if self._standstill.left(scan, sure=sure) and self._fits_last(first):
             self._walls_changed, health = True, self._health.give_up()
@@ -144,19 +146,12 @@ class Tracker:
             self._restart()
         return tracked
 
-    def _estimated(self, placed: MatchedScan, evidence: ScanFactors) -> PoseWithCovariance:
-        """Estimate the pose of a scan from its match and its factors. A new local map has no tie to the one
-        before.
-        """
-        if not placed.first:
-            return self._smoother.add(placed.pose, evidence)
-        self._smoother.start(self._flat(placed.pose), evidence.T_odom_base, self._smoother.speed)
-        return self._smoother.belief
-
-    def _judged(self, placed: MatchedScan, estimate: PoseWithCovariance, evidence: ScanFactors) -> Health:
+    def _judged(
+        self, placed: MatchedScan, estimate: PoseWithCovariance, reading: F64 | None, *, continues: bool
+    ) -> Health:
         """Judge the pose of a scan."""
-        read = evidence.T_odom_base is not None
-        bridged = placed.motion is not None or (read and evidence.continues)
+        read = reading is not None
+        bridged = placed.motion is not None or (read and continues)
         unaided = estimate if self._in_hand and not read else None
         return self._health.judge(placed, unaided, bridged=bridged)
 
@@ -354,7 +349,7 @@ def _spread(found: Sequence[_Candidate], best: _Candidate) -> F64:
     """Return the covariance (6, 6) of all candidates about the best one, in the axes of the base there."""
     mass = np.exp([other.score - best.score for other in found])
     poses = np.array([other.fit.pose for other in found])
-    away = steps(np.tile(best.fit.pose, (len(poses), 1, 1)), poses).step
+    away = steps(np.tile(best.fit.pose, (len(poses), 1, 1)), poses)[0]
     spread: F64 = np.einsum("n,na,nb->ab", mass / mass.sum(), away, away)
     return spread
 

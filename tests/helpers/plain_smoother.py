@@ -51,7 +51,7 @@ def changed(smoother: Smoother, state: WindowState, by: F64) -> WindowState:
 
 def between(first: F64, second: F64) -> F64:
     """The step (6,) from a pose (4, 4) to another."""
-    return steps(first[None], second[None]).step[0]
+    return steps(first[None], second[None])[0][0]
 
 
 def factors(smoother: Smoother, state: WindowState, few: int) -> list[Factor]:

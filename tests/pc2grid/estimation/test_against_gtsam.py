@@ -10,7 +10,7 @@ import itertools
 import numpy as np
 import pytest
 
-from pc2grid.estimation.smoother import PLANAR, SMOOTHER, PoseWithCovariance, ScanFactors, Smoother
+from pc2grid.estimation.smoother import PLANAR, SMOOTHER, PoseWithCovariance, Smoother
 from pc2grid.geometry import F64, SE2
 
 gtsam = pytest.importorskip("gtsam")
@@ -41,7 +41,7 @@ def by_pc2grid(read: list[SE2], seen: dict[int, SE2]) -> PoseWithCovariance:
     for k in range(1, len(read)):
         match = (seen[k].lift(), MATCH) if k in seen else None
         guess = smoother.by_odometry(read[k].lift()).pose
-        smoother.add(guess, ScanFactors(0.1, read[k].lift(), match=match))
+        smoother.add(guess, 0.1, read[k].lift(), match=match)
     return smoother.belief
 
 

@@ -6,14 +6,13 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from pc2grid.estimation.line_map import Steps, moved, steps
+from pc2grid.estimation.line_map import moved, steps
 from pc2grid.estimation.smoother import (
     IN_THE_HAND,
     PLANAR,
     SMOOTHER,
     SPATIAL,
     PoseWithCovariance,
-    ScanFactors,
     Smoother,
     _without,
     normal_equations,
@@ -33,7 +32,7 @@ def rotation_vectors(rotations: F64) -> F64:
     return result
 
 
-def steps_plain(first: F64, second: F64) -> Steps:
+def steps_plain(first: F64, second: F64) -> tuple[F64, F64, F64]:
     """`steps`, in numpy."""
     R = first[:, :3, :3].transpose(0, 2, 1)
     turn = R @ second[:, :3, :3]
@@ -48,7 +47,7 @@ def steps_plain(first: F64, second: F64) -> Steps:
     by_first[:, 3:, 3:] = -right @ turn.transpose(0, 2, 1)
     by_second[:, :3, :3] = turn
     by_second[:, 3:, 3:] = right
-    return Steps(step, by_first, by_second)
+    return step, by_first, by_second
 
 
 Odometry = list[F64] | list[None]
@@ -96,7 +95,7 @@ def follow(true: list[F64], odometry: Odometry, information: F64, seed: int = 1)
             else smoother.by_odometry(reading)
         )
         guess = expected.pose if blind else placed
-        belief = smoother.add(guess, ScanFactors(0.1, reading, match=(placed, information)))
+        belief = smoother.add(guess, 0.1, reading, match=(placed, information))
         found.append(belief.pose)
     return np.array([motion_size(invert_pose(t) @ f) for t, f in zip(true, found, strict=True)])
 
@@ -161,7 +160,7 @@ def test_the_systematic_errors_of_odometry_are_learned() -> None:
     odometry = wheels(true, 0.95, 1.0)
     smoother.start(true[0], odometry[0])
     for pose, reading in zip(true[1:], odometry[1:], strict=True):
-        smoother.add(pose, ScanFactors(0.1, reading, match=(pose, WALLS_ALL_AROUND)))
+        smoother.add(pose, 0.1, reading, match=(pose, WALLS_ALL_AROUND))
     ahead = odometry[-1] @ SE2(0.95, 0.0, 0.0).lift()
     expected = smoother.by_odometry(ahead).pose
     off_m, _ = motion_size(invert_pose(true[-1] @ SE2(1.0, 0.0, 0.0).lift()) @ expected)
@@ -175,7 +174,7 @@ def test_one_scan_that_lies_elsewhere_is_left_out_after_the_next_ones() -> None:
     for k, (pose, reading) in enumerate(zip(true[1:], odometry[1:], strict=True)):
         placed = pose @ SE2(0.5, 0.0, 0.0).lift() if k == 25 else pose
         expected = smoother.by_odometry(reading).pose
-        belief = smoother.add(expected, ScanFactors(0.1, reading, match=(placed, WALLS_ALL_AROUND)))
+        belief = smoother.add(expected, 0.1, reading, match=(placed, WALLS_ALL_AROUND))
     assert motion_size(invert_pose(true[-1]) @ belief.pose)[0] < 0.005
 
 
@@ -189,7 +188,7 @@ def test_a_belief_says_how_far_off_it_is() -> None:
         for pose in true[1:20]:
             noise = rng.normal(size=3) / np.sqrt(np.diag(WALLS_ALL_AROUND))
             placed = pose @ SE2(*noise.tolist()).lift()
-            belief = smoother.add(placed, ScanFactors(0.1, pose, match=(placed, WALLS_ALL_AROUND)))
+            belief = smoother.add(placed, 0.1, pose, match=(placed, WALLS_ALL_AROUND))
         chi2.append(belief.chi2(true[19]))
     assert 1.0 < np.mean(chi2) < 4.5
 
@@ -203,9 +202,7 @@ def test_in_the_hand_six_directions_are_estimated() -> None:
         pose = pose @ pose_from_rotation_vector((0.01, -0.02, 0.05), (0.03, 0.0, 0.01))
         noise = rng.normal(size=(1, 6)) / np.sqrt(np.diag(information))
         match = (moved(pose[None], noise)[0], information) if k % 2 else None
-        belief = smoother.add(
-            smoother.after(*smoother.constant_velocity(0.1)).pose, ScanFactors(0.1, match=match)
-        )
+        belief = smoother.add(smoother.after(*smoother.constant_velocity(0.1)).pose, 0.1, match=match)
     assert motion_size(invert_pose(pose) @ belief.pose)[0] < 0.02  # half of a step, too
 
 
@@ -244,7 +241,7 @@ def test_the_compiled_equations_are_the_plain_ones(free: tuple[int, ...], few: i
             smoother.start(pose, reading)
             continue
         between = motion if k % 5 == 2 else None
-        smoother.add(placed[0], ScanFactors(0.08 + 0.01 * (k % 3), reading, k % 6 != 3, match, between))
+        smoother.add(placed[0], 0.08 + 0.01 * (k % 3), reading, k % 6 != 3, match, between)
     own = smoother._state, smoother._window, smoother._prior, smoother._free, smoother._parameters
     H, g, scale = normal_equations(*own, smoother._drift_scale, few)
     smoother._drift_scale = scale
@@ -277,7 +274,7 @@ def test_a_gyroscope_replaces_the_turn_of_the_motion_before() -> None:
     smoother.start(pose, None)
     for _ in range(3):
         pose = pose @ SE2(0.1, 0.0, 0.0).lift()
-        smoother.add(pose, ScanFactors(0.1, match=(pose, known)))
+        smoother.add(pose, 0.1, match=(pose, known))
     turn = pose_from_rotation_vector((0.0, 0.3, 0.0))
     belief = smoother.after(*smoother.constant_velocity(0.1, turn))
     np.testing.assert_allclose(belief.pose[:3, :3], turn[:3, :3], atol=1e-3)
@@ -292,7 +289,7 @@ def test_how_far_a_hand_goes_unseen_does_not_depend_on_how_often_it_is_looked_fo
         smoother = Smoother(SPATIAL, IN_THE_HAND)
         smoother.start(np.eye(4), None)
         for _ in range(rate):
-            belief = smoother.add(np.eye(4), ScanFactors(seconds=1.0 / rate))
+            belief = smoother.add(np.eye(4), seconds=1.0 / rate)
         sigmas.append(belief.sigmas[0])
     assert sigmas[0] == pytest.approx(sigmas[1], rel=0.3)
 
@@ -302,9 +299,7 @@ def test_after_a_new_beginning_the_motion_goes_on() -> None:
     smoother.start(np.eye(4), None)
     walked = pose_from_rotation_vector((0.0, 0.0, 0.0), (0.1, 0.0, 0.0))
     for _ in range(5):
-        smoother.add(
-            smoother.belief.pose @ walked, ScanFactors(seconds=0.1, motion=(walked, 1e6 * np.eye(6)))
-        )
+        smoother.add(smoother.belief.pose @ walked, seconds=0.1, motion=(walked, 1e6 * np.eye(6)))
     smoother.start(np.eye(4), None, smoother.speed)
     on, _ = smoother.constant_velocity(0.1)
     assert on[0, 3] == pytest.approx(0.1, abs=0.01)
