@@ -3,9 +3,9 @@
 Each source counts by its information. Odometry measures the motion to a few percent in every direction. A
 scan fixes the pose to millimetres, but only across the surfaces that it shows. A matcher (`PlanarMatcher` on
 wheels, `SpatialMatcher` in the hand) matches the scan by itself; the smoother fuses that with odometry and
-with the scans before. `HealthJudge` judges the result by the fit of the scan with the local map.
+with the scans before. The result is judged by the fit of the scan with the local map.
 
-The selection of a match (`MatchSelector`) is the same with three and with six degrees of freedom. KISS-ICP
+The selection of a match (`place`) is the same with three and with six degrees of freedom. KISS-ICP
 brings the scan near from each expected pose, and the matches begin there. If none fits, the scan is searched
 for. The posterior density of a match is the product of the likelihood of the scan and of the density of the
 expected pose. The best match is taken. Its covariance is widened by the spread of all matches: where two
@@ -80,27 +80,23 @@ class Tracker:
     def __init__(
         self,
         registration: RegistrationConfig,
-        projection: ProjectionConfig | None = None,
+        projection: ProjectionConfig = ProjectionConfig(),
         *,
         in_hand: bool,
     ) -> None:
         """Make a tracker. in_hand : see `pc2grid.estimation.spatial.begin`, which decides it."""
         self._config = registration
         self._last: Scan | None = None
-        self._odometer = Odometer()
         self._keyframe: SE2 | None = None  # where the last one was
         self._restarted = False  # no keyframe has been reported since tracking started again
         self._walls_changed = False  # why
         self._standstill = Standstill()
         self._in_hand = in_hand
-        projection = projection or ProjectionConfig()
-        self._sensor: ScanMatcher
-        if in_hand:
-            self._sensor = SpatialMatcher(registration, projection)
-        else:
-            self._sensor = PlanarMatcher(registration, projection)
+        self._sensor: ScanMatcher = (
+            SpatialMatcher(registration, projection) if in_hand else PlanarMatcher(registration, projection)
+        )
         self._smoother = Smoother(self._sensor.free, IN_THE_HAND if in_hand else SMOOTHER)
-        self._health = HealthJudge()
+        self._lost_scans = 0  # in a row
 
     def start(self, scan: Scan) -> Tracked:
         """Begin with the first scan: find the floor, and put the base at the origin of the session frame."""
@@ -118,7 +114,10 @@ class Tracker:
         reading, reported = self._reading(scan), self._odometer.reported(scan)
         continues = self._odometer.continues(scan, seconds)
         # 1. Predict: by odometry, or by constant velocity. An implausible prediction comes last.
-        steady = self._smoother.constant_velocity(seconds, turn := self._turn(scan))
+        turn, before = None, self._last.T_level_base
+        if self._in_hand and reading is None and before is not None and scan.T_level_base is not None:
+            turn = invert_pose(before) @ scan.T_level_base  # by its IMU
+        steady = self._smoother.constant_velocity(seconds, turn)
         predictions = [partial(self._smoother.after, *steady)]
         if reading is not None and reported is not None:
             predictions.insert(0 if continues else 1, partial(self._smoother.by_odometry, reading))
@@ -128,7 +127,7 @@ class Tracker:
         motion = invert_pose(self._smoother.belief.pose) @ first.pose
         points = self._deskewed(scan, motion, seconds)
         # 3. Place the scan by itself, and weigh that against odometry and the scans before.
-        placed = MatchSelector(self._sensor).place(scan, points, first, expected)
+        placed = place(self._sensor, scan, points, first, expected)
         between = placed.motion if turn is None else (steady[0], np.diag(steady[1] ** -2))
         if placed.first:  # a new local map has no tie to the one before
             self._smoother.start(self._flat(placed.pose), reading, self._smoother.speed)
@@ -136,41 +135,59 @@ class Tracker:
         else:
             estimate = self._smoother.add(placed.pose, seconds, reading, continues, placed.alone, between)
         # 4. Judge the pose, and start again if nothing fits any more.
-        health = self._judged(placed, estimate, reading, continues=continues)
-        sure = placed.sure and not placed.first
-        if self._standstill.left(scan, sure=sure) and self._fits_last(first):
-            self._walls_changed, health = True, self._health.give_up()
+        health = self._judged(scan, placed, estimate, first, continues=continues)
         pose = self._sensor.levelled(estimate.pose)
         tracked = self._finish(scan, points, pose, health)
-        if self._health.gives_up:
-            self._restart()
+        if self._lost_scans > TRACKING.give_up_scans:
+            # Forget the local maps; the poses continue from the last one.
+            self._sensor.restart()
+            self._lost_scans, self._keyframe, self._restarted = 0, None, True
         return tracked
 
     def _judged(
-        self, placed: MatchedScan, estimate: PoseWithCovariance, reading: F64 | None, *, continues: bool
+        self,
+        scan: Scan,
+        placed: MatchedScan,
+        estimate: PoseWithCovariance,
+        expected: PoseWithCovariance,
+        *,
+        continues: bool,
     ) -> Health:
-        """Judge the pose of a scan."""
-        read = reading is not None
-        bridged = placed.motion is not None or (read and continues)
-        unaided = estimate if self._in_hand and not read else None
-        return self._health.judge(placed, unaided, bridged=bridged)
+        """Judge a scan by its match, and count the lost ones in a row.
 
-    def _fits_last(self, belief: PoseWithCovariance) -> bool:
-        """Return True if the scan fits the scans before it, and they fix its position."""
-        motion = self._sensor.follow(belief)
-        return motion is not None and weakest(motion[1]) > TRACKING.known_m**-2
+        A scan that fits is FINE; DEGENERATE if one direction of its position is not determined; LOST if a
+        direction of the pose of a sensor in the hand without odometry is not known: wheels do not slip along
+        a wall. One that does not fit is also DEGENERATE if odometry gives its pose from a scan that was not
+        lost; else LOST. If it fits only the scans before it, which fix its position, the walls have changed.
+        """
+        p, read = TRACKING, scan.T_odom_base is not None
+        if self._standstill.left(scan, sure=placed.sure and not placed.first):
+            before = self._sensor.follow(expected)
+            if before is not None and weakest(before[1]) > p.known_m**-2:
+                self._walls_changed, self._lost_scans = True, p.give_up_scans + 1
+                return Health.LOST
+        sigma_m, sigma_rad = estimate.sigmas if self._in_hand and not read else (0.0, 0.0)
+        fits = placed.first or placed.alone is not None
+        if fits and sigma_m <= p.known_m and sigma_rad <= p.known_rad:
+            self._lost_scans = 0
+            return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
+        bridged = placed.motion is not None or (read and continues)
+        if bridged and not self._lost_scans:
+            return Health.DEGENERATE
+        # A pose that fits anywhere along a wall does not become known by waiting.
+        self._lost_scans += p.give_up_scans + 1 if fits else 1
+        return Health.LOST
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
         """Extend the maps by a scan that is due, and keep its final pose."""
         lost = health is Health.LOST
         planar_scan = self._sensor.cut(scan, points, pose, lost=lost)
         keyframe = not lost and len(planar_scan.hits_m) > 0 and self._is_due(pose)
-        if keyframe:
-            self._keyframe = SE2.from_matrix(pose)
-            self._sensor.extend(scan, points, pose)
         restart = keyframe and self._restarted
         walls_changed = restart and self._walls_changed
         if keyframe:
+            self._keyframe = SE2.from_matrix(pose)
+            self._sensor.extend(scan, points, pose)
             self._restarted = self._walls_changed = False
         found = None if lost else self._odometer.disagreement(scan, pose)
         if health is Health.FINE and found is not None and found.is_outlier:
@@ -194,13 +211,6 @@ class Tracker:
         p, step = TRACKING, self._keyframe.inverse() @ SE2.from_matrix(pose)
         return math.hypot(step.x, step.y) >= p.keyframe_travel_m or abs(step.yaw) >= p.keyframe_turn_rad
 
-    def _restart(self) -> None:
-        """Forget the local maps; the poses continue from the last one."""
-        self._sensor.restart()
-        self._health.restart()
-        self._keyframe = None
-        self._restarted = True
-
     def _flat(self, pose: F64) -> F64:
         """Return a pose (4, 4) in the free directions: on wheels those of the plane."""
         return pose if self._in_hand else SE2.from_matrix(pose).lift()
@@ -208,17 +218,6 @@ class Tracker:
     def _reading(self, scan: Scan) -> F64 | None:
         """Return the reading (4, 4) of odometry at a scan, or None."""
         return None if scan.T_odom_base is None else self._flat(scan.T_odom_base)
-
-    def _turn(self, scan: Scan) -> F64 | None:
-        """Return the turn (4, 4) of a sensor in the hand since the last scan, by its IMU.
-
-        None if that is not known, and beside odometry.
-        """
-        before = None if self._last is None else self._last.T_level_base
-        unaided = self._in_hand and scan.T_odom_base is None
-        if not unaided or before is None or scan.T_level_base is None:
-            return None
-        return invert_pose(before) @ scan.T_level_base
 
     def _deskewed(self, scan: Scan, motion: F64, seconds: float) -> F32:
         """Return the points (N, 3) of a scan that are used, without the motion while it was taken.
@@ -277,127 +276,75 @@ class _Candidate:
     near: bool = field(compare=False)
 
 
-class MatchSelector:
-    """Selects the most probable match of each scan of a sensor."""
+def place(
+    sensor: ScanMatcher,
+    scan: Scan,
+    points_m: F32,
+    belief: PoseWithCovariance,
+    others: Iterable[PoseWithCovariance] = (),
+) -> MatchedScan:
+    """Match the next scan of a sensor with the local map, and select the most probable match.
 
-    def __init__(self, sensor: ScanMatcher) -> None:
-        self._sensor = sensor
-
-    def place(
-        self, scan: Scan, points_m: F32, belief: PoseWithCovariance, others: Iterable[PoseWithCovariance] = ()
-    ) -> MatchedScan:
-        """Match the next scan with the local map.
-
-        points_m : (N, 3) deskewed, base frame. belief : the most credible prediction of the pose, which a
-        scan gets that fits nowhere, or is empty. others : less credible ones, made only where needed.
-        """
-        p = TRACKING
-        self._sensor.take(scan, points_m)
-        if not self._sensor:
-            return MatchedScan(belief.pose, sure=True, first=True)
-        found = self._candidates(belief, others)
-        best = max(found)
-        if best.fit.overlap < p.min_overlap or not (best.near or best.fit.credible):
-            # Odometry is trusted more than the last scans.
-            motion = None if scan.T_odom_base is not None else self._sensor.follow(belief)
-            return MatchedScan(belief.pose, motion=motion)
-        fit = self._sensor.observable(best.fit)
-        alone, information = fit.alone
-        if len(found) > 1:
-            spread = _spread(found, best)[np.ix_(belief.free, belief.free)]
-            # The inverse of the sum of both covariances, also where a match has none of a direction.
-            information = np.asarray(
-                np.linalg.solve(np.eye(len(spread)) + information @ spread, information), np.float64
-            )
-        estimate = alone, 0.5 * (information + information.T)
-        return MatchedScan(fit.pose, estimate, sure=best.sure, measured=fit.measured)
-
-    def _candidates(
-        self, first: PoseWithCovariance, others: Iterable[PoseWithCovariance]
-    ) -> list[_Candidate]:
-        """Return the matches at the expected poses, as many as are needed until one fits that an exact belief
-        has led to; if none fits, also those of a search.
-        """
-        expected: list[PoseWithCovariance] = []
-        fits: list[ScanMatch] = []
-        for belief in chain((first,), others):
-            expected.append(belief)
-            fits += self._sensor.match(belief)
-            found = [self._candidate(fit, expected) for fit in fits]
-            if max(found).sure and max(found).near and not self._is_vague(belief):
-                return found
-        if not max(found).sure and (self._is_vague(first) or not max(found).near):
-            found += [
-                replace(self._candidate(fit, expected), near=False) for fit in self._sensor.search(first)
-            ]
-        return found
-
-    def _candidate(self, fit: ScanMatch, expected: Sequence[PoseWithCovariance]) -> _Candidate:
-        """Weight a match by the expected pose that explains it best."""
-        chi2 = [belief.chi2(fit.pose) for belief in expected]
-        density = max(belief.log_density(c) for belief, c in zip(expected, chi2, strict=True))
-        sure = fit.credible and fit.overlap >= TRACKING.sure_overlap
-        return _Candidate(fit.evidence + density, fit, sure, near=min(chi2) < KERNEL**2)
-
-    def _is_vague(self, belief: PoseWithCovariance) -> bool:
-        """Return True if a belief is wider than the reach of a match."""
-        p, (sigma_m, sigma_rad) = TRACKING, belief.sigmas
-        return KERNEL * max(sigma_m / p.reach_m, sigma_rad / p.reach_rad) > 1.0
+    points_m : (N, 3) deskewed, base frame. belief : the most credible prediction of the pose, which a scan
+    gets that fits nowhere, or is empty. others : less credible ones, made only where needed.
+    """
+    sensor.take(scan, points_m)
+    if not sensor:
+        return MatchedScan(belief.pose, sure=True, first=True)
+    found = _candidates(sensor, belief, others)
+    best = max(found)
+    if best.fit.overlap < TRACKING.min_overlap or not (best.near or best.fit.credible):
+        # Odometry is trusted more than the last scans.
+        motion = None if scan.T_odom_base is not None else sensor.follow(belief)
+        return MatchedScan(belief.pose, motion=motion)
+    fit = sensor.observable(best.fit)
+    alone, information = fit.alone
+    if len(found) > 1:
+        # The covariance of all candidates about the best one, in the axes of the base there.
+        mass = np.exp([other.score - best.score for other in found])
+        poses = np.array([other.fit.pose for other in found])
+        away = steps(np.tile(best.fit.pose, (len(poses), 1, 1)), poses)[0]
+        spread = np.einsum("n,na,nb->ab", mass / mass.sum(), away, away)[np.ix_(belief.free, belief.free)]
+        # The inverse of the sum of both covariances, also where a match has none of a direction.
+        information = np.linalg.solve(np.eye(len(spread)) + information @ spread, information)
+    estimate = alone, 0.5 * (information + information.T)
+    return MatchedScan(fit.pose, estimate, sure=best.sure, measured=fit.measured)
 
 
-def _spread(found: Sequence[_Candidate], best: _Candidate) -> F64:
-    """Return the covariance (6, 6) of all candidates about the best one, in the axes of the base there."""
-    mass = np.exp([other.score - best.score for other in found])
-    poses = np.array([other.fit.pose for other in found])
-    away = steps(np.tile(best.fit.pose, (len(poses), 1, 1)), poses)[0]
-    spread: F64 = np.einsum("n,na,nb->ab", mass / mass.sum(), away, away)
-    return spread
+def _candidates(
+    sensor: ScanMatcher, first: PoseWithCovariance, others: Iterable[PoseWithCovariance]
+) -> list[_Candidate]:
+    """Return the matches at the expected poses, as many as are needed until one fits that an exact belief has
+    led to; if none fits, also those of a search.
+    """
+    expected: list[PoseWithCovariance] = []
+    fits: list[ScanMatch] = []
+    for belief in chain((first,), others):
+        expected.append(belief)
+        fits += sensor.match(belief)
+        found = [_candidate(fit, expected) for fit in fits]
+        if max(found).sure and max(found).near and not _is_vague(belief):
+            return found
+    if not max(found).sure and (_is_vague(first) or not max(found).near):
+        found += [replace(_candidate(fit, expected), near=False) for fit in sensor.search(first)]
+    return found
 
 
-# --- health and odometry -------------------------------------------------------------------------------
+def _candidate(fit: ScanMatch, expected: Sequence[PoseWithCovariance]) -> _Candidate:
+    """Weight a match by the expected pose that explains it best."""
+    chi2 = [belief.chi2(fit.pose) for belief in expected]
+    density = max(belief.log_density(c) for belief, c in zip(expected, chi2, strict=True))
+    sure = fit.credible and fit.overlap >= TRACKING.sure_overlap
+    return _Candidate(fit.evidence + density, fit, sure, near=min(chi2) < KERNEL**2)
 
 
-class HealthJudge:
-    """Judges each scan, and counts the lost ones in a row."""
+def _is_vague(belief: PoseWithCovariance) -> bool:
+    """Return True if a belief is wider than the reach of a match."""
+    sigma_m, sigma_rad = belief.sigmas
+    return KERNEL * max(sigma_m / TRACKING.reach_m, sigma_rad / TRACKING.reach_rad) > 1.0
 
-    def __init__(self) -> None:
-        self._lost_scans = 0
 
-    def judge(self, placed: MatchedScan, unaided: PoseWithCovariance | None, *, bridged: bool) -> Health:
-        """Judge a scan by its match.
-
-        unaided : the pose of a sensor in the hand without odometry, with its covariance; None on wheels,
-        which do not slip along a wall, and with odometry. bridged : odometry continues from the scan before.
-
-        A scan that fits is FINE; DEGENERATE if one direction of its position is not determined; LOST if a
-        direction of an unaided pose is not known. One that does not fit is also DEGENERATE if odometry gives
-        its pose from a scan that was not lost; else LOST.
-        """
-        p, (sigma_m, sigma_rad) = TRACKING, (0.0, 0.0) if unaided is None else unaided.sigmas
-        fits = placed.first or placed.alone is not None
-        if fits and sigma_m <= p.known_m and sigma_rad <= p.known_rad:
-            self.restart()
-            return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
-        if bridged and not self._lost_scans:
-            return Health.DEGENERATE
-        if fits:  # a pose that fits anywhere along a wall does not become known by waiting
-            return self.give_up()
-        self._lost_scans += 1
-        return Health.LOST
-
-    @property
-    def gives_up(self) -> bool:
-        """Return True if tracking must start again, after so many lost scans in a row."""
-        return self._lost_scans > TRACKING.give_up_scans
-
-    def give_up(self) -> Health:
-        """Start tracking again at once: the scan is lost."""
-        self._lost_scans += TRACKING.give_up_scans + 1
-        return Health.LOST
-
-    def restart(self) -> None:
-        """Start to count again."""
-        self._lost_scans = 0
+# --- odometry ------------------------------------------------------------------------------------------
 
 
 class Standstill:
@@ -418,20 +365,20 @@ class Standstill:
         T_odom_base = scan.T_odom_base
         if sure and T_odom_base is not None:
             self._known = scan.stamp_ns, T_odom_base
-        known = self._known
-        if sure or known is None or T_odom_base is None:
+        if sure or self._known is None or T_odom_base is None:
             return False
-        distance_m, turn_rad = motion_size(invert_pose(known[1]) @ T_odom_base)
+        since_ns, stood = self._known
+        distance_m, turn_rad = motion_size(invert_pose(stood) @ T_odom_base)
         if distance_m <= KERNEL * SMOOTHER.reading_m and turn_rad <= KERNEL * SMOOTHER.reading_rad:
             return False
         self._known = scan.stamp_ns, T_odom_base
-        return (scan.stamp_ns - known[0]) * 1e-9 > TRACKING.standing_s
+        return (scan.stamp_ns - since_ns) * 1e-9 > TRACKING.standing_s
 
 
 class Odometer:
     """Keeps the last reading, and the pose of the base then. begin_ns : stamp of the first scan."""
 
-    def __init__(self, begin_ns: int = 0) -> None:
+    def __init__(self, begin_ns: int) -> None:
         self._begin_ns = begin_ns
         self._scans = 0
         self._last: tuple[F64, F64] | None = None  # T_base_odom and T_session_base

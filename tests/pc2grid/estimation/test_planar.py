@@ -13,7 +13,7 @@ from pc2grid.estimation.planar import GroundModel, PlanarMatcher
 from pc2grid.estimation.registration import KissRegistration
 from pc2grid.estimation.smoother import PLANAR, PoseWithCovariance, ScanMatch
 from pc2grid.estimation.spatial import Beginning, begin, is_rolling
-from pc2grid.estimation.tracker import MatchedScan, MatchSelector, follow
+from pc2grid.estimation.tracker import MatchedScan, follow, place
 from pc2grid.geometry import F64, SE2, pose_from_rotation_vector
 from pc2grid.io.recording import open_log
 from pc2grid.model import Health, Scan
@@ -82,7 +82,7 @@ class Sensor:
 
 
 def placed(sensor: Sensor, belief: PoseWithCovariance) -> MatchedScan:
-    return MatchSelector(sensor).place(SCAN, SCAN.points_m, belief)  # type: ignore[arg-type]
+    return place(sensor, SCAN, SCAN.points_m, belief)  # type: ignore[arg-type]
 
 
 def test_what_fits_where_it_is_expected_is_not_searched_for() -> None:
@@ -101,8 +101,7 @@ def test_a_less_credible_prediction_is_made_only_for_a_scan_that_does_not_fit_th
 
     for at, needed in ((0.01, False), (0.5, True)):
         sensor = Sensor(fit_at(at, evidence=100.0))
-        selector = MatchSelector(sensor)  # type: ignore[arg-type]
-        selector.place(SCAN, SCAN.points_m, expected(0.0, 0.02), another())
+        place(sensor, SCAN, SCAN.points_m, expected(0.0, 0.02), another())  # type: ignore[arg-type]
         assert bool(made) is needed
 
 
