@@ -23,7 +23,7 @@ import sys
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from http import HTTPStatus
 from importlib.resources import files
@@ -121,7 +121,7 @@ class Locator:
                 path,
                 self._database,
                 self._settings,
-                observer=_Shares(events),
+                observer=progress,
                 see=see,
                 prior=lambda log, span: known_pose.prior(known, log, span),
                 index=self._index,
@@ -162,17 +162,6 @@ class Locator:
     def _index(self) -> MapIndex:
         """Return the maps, prepared once for all recordings."""
         return MapIndex.of(self._database, query_config(self._database, self._settings))
-
-
-class _Shares(Observer):
-    """Publishes the share of the recording that is done."""
-
-    def __init__(self, events: Events) -> None:
-        self._publish = seldom(lambda share: events.publish("share", {"share": round(share, 4)}))
-
-    def on_progress(self, share: float) -> None:
-        """See `Observer.on_progress`."""
-        self._publish(share)
 
 
 def live_page(database: SubmapDatabase, **answer: Any) -> bytes:
@@ -223,11 +212,6 @@ class Events:
         self._last: dict[str, bytes] = {}
         self._scans: list[Any] = []
         self._closed = False
-
-    @property
-    def looking_on(self) -> int:
-        """Return the number of pages that get the events."""
-        return len(self._pages)
 
     def publish(self, kind: str, data: Any) -> None:
         """Send an event; the last one of each kind, and all scans, are kept for pages that come later."""
@@ -286,21 +270,25 @@ def _put(page: queue.Queue[bytes | None], event: bytes | None) -> None:
                 page.get_nowait()
 
 
-@dataclass
-class Progress:
-    """Publishes the scans of one query, and its answers.
+class Progress(Observer):
+    """Publishes the scans of one query, its answers, and the share of the recording that is done.
 
     Events: `scans`, a list of x, y, yaw in the query's own frame, and 1 where another such frame begins,
     because registration was lost; `moment`, the state of the answer with the pose in the map and the base in
     the query's frame, from which a page draws the path on the map.
     """
 
-    events: Events
-    _waiting: list[list[float]] = field(default_factory=list)
-    _base: tuple[float, float, float] = (0.0, 0.0, 0.0)
-
-    def __post_init__(self) -> None:
+    def __init__(self, events: Events) -> None:
+        """Publish as `events`."""
+        self.events = events
+        self._waiting: list[list[float]] = []
+        self._base = (0.0, 0.0, 0.0)
         self._send = seldom(lambda share: self.flush())
+        self._publish_share = seldom(lambda share: events.publish("share", {"share": round(share, 4)}))
+
+    def on_progress(self, share: float) -> None:
+        """See `Observer.on_progress`."""
+        self._publish_share(share)
 
     def add(self, registered: RegisteredScan | None) -> None:
         """Add the next scan; None: what follows does not go on from what was before."""
@@ -356,6 +344,15 @@ _POLICY = (
 
 class Cancelled(Exception):
     """The client is gone, or the server stops: the work ends without an answer."""
+
+
+@dataclass(eq=False)
+class Refused(Exception):
+    """A request that is not answered, and what to do instead."""
+
+    status: HTTPStatus
+    error: str
+    hint: str | None = None
 
 
 Options = Mapping[str, str]
@@ -446,67 +443,57 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         """Locate the recording in the body of the request."""
         self._answered(self._post)
 
-    def _answered(self, answer: Callable[[], None]) -> None:
-        """Answer a request; an error of the program is printed, and the client is told that there was one."""
+    def _answered(self, answer: Callable[[str], None]) -> None:
+        """Answer a request; an error of the program is printed, and the client is told that there was one.
+
+        answer : is called with the name of what is asked for.
+        """
         try:
-            answer()
-        except (ConnectionError, TimeoutError):
-            raise  # nobody is there to be answered
+            answer(self._allowed())
+        except Refused as refusal:
+            self._send_refusal(refusal)
+        except (ConnectionError, TimeoutError, Cancelled):
+            return  # nobody is there to be answered
         except Exception:
             self.server.handle_error(self.request, self.client_address)
             if not self._begun:
-                status = HTTPStatus.INTERNAL_SERVER_ERROR
-                self._refuse(status, "internal error", "the terminal of pc2grid view shows it")
+                status, hint = HTTPStatus.INTERNAL_SERVER_ERROR, "the terminal of pc2grid view shows it"
+                self._send_refusal(Refused(status, "internal error", hint))
 
-    def _get(self) -> None:
-        name = self._allowed()
-        if name is None:
-            return
+    def _get(self, name: str) -> None:
         if name == "events":
             self._send_events()
         elif name in self.server.pages:
             self._send(HTTPStatus.OK, "text/html; charset=utf-8", self.server.pages[name])
         else:
-            self._refuse(HTTPStatus.NOT_FOUND, "there is no such page")
+            raise Refused(HTTPStatus.NOT_FOUND, "there is no such page")
 
-    def _post(self) -> None:
-        name = self._allowed()
-        if name is None:
-            return
+    def _post(self, name: str) -> None:
         if name != "locate":
-            self._refuse(HTTPStatus.NOT_FOUND, "recordings are sent to locate")
-            return
+            raise Refused(HTTPStatus.NOT_FOUND, "recordings are sent to locate")
         if self.server.stopping.is_set() or not self.server.busy.acquire(blocking=False):
-            self._refuse(HTTPStatus.CONFLICT, "something else is being located", "wait until it is done")
-            return
+            raise Refused(HTTPStatus.CONFLICT, "something else is being located", "wait until it is done")
         try:
-            reply = self._locate()
+            answer = self._locate()
         finally:
             self.server.busy.release()
         # Behind the work: whoever has the answer may send the next recording at once.
-        if reply is not None:
-            self._send_json(*reply)
+        self._send_json(HTTPStatus.OK, answer)
 
     # --- who asks -------------------------------------------------------------------------------------
 
-    def _allowed(self) -> str | None:
-        """Return the name of what is asked for, without the token; None, and an answer, if not allowed."""
-        port = self.server.server_port
-        hosts = {f"{host}:{port}" for host in (_ADDRESS, "localhost")}
-        origin = self.headers.get("Origin")
+    def _allowed(self) -> str:
+        """Return the name of what is asked for, without the token. Raises Refused."""
         try:
             path = urlsplit(self.path).path
         except ValueError as error:  # a host in brackets that is no address
-            self._refuse(HTTPStatus.BAD_REQUEST, f"not an address: {error}")
-            return None
+            raise Refused(HTTPStatus.BAD_REQUEST, f"not an address: {error}") from None
         _, token, name = f"{path}//".split("/", 2)
         ours = secrets.compare_digest(token.encode(), self.server.token.encode())
-        from_here = self.headers.get("Host") in hosts and (
-            origin is None or origin in {f"http://{host}" for host in hosts}
-        )
-        if not ours or not from_here:
-            self._refuse(HTTPStatus.FORBIDDEN, "not allowed", "open the address that pc2grid view printed")
-            return None
+        hosts = {f"{host}:{self.server.server_port}" for host in (_ADDRESS, "localhost")}
+        origins = {None, *(f"http://{host}" for host in hosts)}
+        if not ours or self.headers.get("Host") not in hosts or self.headers.get("Origin") not in origins:
+            raise Refused(HTTPStatus.FORBIDDEN, "not allowed", "open the address that pc2grid view printed")
         return name.strip("/")
 
     def _is_gone(self) -> bool:
@@ -546,8 +533,8 @@ class _Handler(http.server.BaseHTTPRequestHandler):
     def _send_json(self, status: HTTPStatus, document: Any) -> None:
         self._send(status, "application/json", json_text(document).encode())
 
-    def _refuse(self, status: HTTPStatus, error: str, hint: str | None = None) -> None:
-        self._send_json(*_refusal(status, error, hint))
+    def _send_refusal(self, refusal: Refused) -> None:
+        self._send_json(refusal.status, {"error": refusal.error, "hint": refusal.hint})
 
     def _send_events(self) -> None:
         with self.server.events.subscribed() as events:
@@ -563,15 +550,15 @@ class _Handler(http.server.BaseHTTPRequestHandler):
 
     # --- an upload ------------------------------------------------------------------------------------
 
-    def _locate(self) -> tuple[HTTPStatus, Any] | None:
-        """Return the answer, or why there is none; None if nobody waits for it."""
+    def _locate(self) -> Any:
+        """Return the answer. Raises Refused, and Cancelled if nobody waits for it."""
         options = {key: values[-1] for key, values in parse_qs(urlsplit(self.path).query).items()}
         text = self.headers.get("Content-Length", "")
         if not re.fullmatch(r"[0-9]{1,18}", text):
-            return _refusal(HTTPStatus.LENGTH_REQUIRED, "the size of the recording is not said")
+            raise Refused(HTTPStatus.LENGTH_REQUIRED, "the size of the recording is not said")
         size = int(text)
         if size > self.server.most_bytes:
-            return _refusal(
+            raise Refused(
                 HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
                 f"the recording has {size / 1e9:.1f} GB; the limit is {self.server.most_bytes / 1e9:.1f} GB",
                 "pc2grid view --most-gb, or pc2grid relocalize, which needs no copy",
@@ -579,12 +566,9 @@ class _Handler(http.server.BaseHTTPRequestHandler):
         path = self.server.folder / safe_name(options.get("name", ""))
         try:
             self._receive(path, size)
-            return HTTPStatus.OK, self.server.work(path, options, self._check)
+            return self.server.work(path, options, self._check)
         except Pc2GridError as error:
-            return _refusal(HTTPStatus.UNPROCESSABLE_ENTITY, error.message, error.hint)
-        except Cancelled:
-            self.close_connection = True
-            return None
+            raise Refused(HTTPStatus.UNPROCESSABLE_ENTITY, error.message, error.hint) from error
         finally:
             path.unlink(missing_ok=True)
 
@@ -593,10 +577,7 @@ class _Handler(http.server.BaseHTTPRequestHandler):
             while size:
                 if self.server.stopping.is_set():
                     raise Cancelled
-                try:
-                    block = self.rfile.read(min(size, _BLOCK_BYTES))
-                except (ConnectionError, TimeoutError):
-                    raise Cancelled from None
+                block = self.rfile.read(min(size, _BLOCK_BYTES))
                 if not block:
                     raise LogTruncated(f"{path.name}: {size} bytes of it were not sent")
                 try:
@@ -607,10 +588,6 @@ class _Handler(http.server.BaseHTTPRequestHandler):
                         hint="set TMPDIR to a larger disk, or use pc2grid relocalize, which needs no copy",
                     ) from error
                 size -= len(block)
-
-
-def _refusal(status: HTTPStatus, error: str, hint: str | None = None) -> tuple[HTTPStatus, Any]:
-    return status, {"error": error, "hint": hint}
 
 
 def safe_name(name: str) -> str:
