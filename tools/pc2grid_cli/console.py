@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from pc2grid.errors import one_line
+from pc2grid.errors import Pc2GridError, one_line
 from pc2grid.observer import ProgressBars, bars_on_stderr, seldom
 
 if TYPE_CHECKING:
@@ -81,12 +81,6 @@ class Console(ProgressBars):
 
             yield seldom(update)
 
-    def compiling_begins(self) -> None:
-        """Tell the user, once, that functions are compiled."""
-        if not self.compiling:
-            self.compiling = True
-            self.note(_COMPILING)
-
     @contextlib.contextmanager
     def step(self, what: str, recorded_s: float | None = None) -> Iterator[None]:
         """Show the progress of a step."""
@@ -104,8 +98,6 @@ class Console(ProgressBars):
 
     def report_error(self, error: BaseException) -> int:
         """Print what went wrong in one line, and what to do next in another; returns the exit code."""
-        from pc2grid.errors import Pc2GridError
-
         if self.debug:
             import traceback
 
@@ -208,7 +200,9 @@ def _compiling_noted(console: Console) -> Iterator[None]:
 
     class Note(event.Listener):
         def on_start(self, event: Any) -> None:
-            console.compiling_begins()
+            if not console.compiling:
+                console.compiling = True
+                console.note(_COMPILING)
 
         def on_end(self, event: Any) -> None:
             """Do nothing."""

@@ -71,11 +71,6 @@ class ConvertedInputs:
             self.lossy = True
             self.severe = self.severe or output.ends_with_3(report, given.strict)
 
-    def fail(self, job: Job) -> None:
-        """Count an input that failed while others go on."""
-        self.failed.append(str(job.path))
-        self.lossy = self.severe = True
-
 
 def run(given: options.Convert, terminal: console.Console) -> int | None:
     """Convert and store what is not stored yet, join it, and print what there is. Return the exit code."""
@@ -121,24 +116,29 @@ def _convert_all(
     keep : the sessions that the database holds.
     """
     done = ConvertedInputs(database=maintenance.shown(given.output))
-    with contextlib.ExitStack() as stack:
-        if len(jobs) > 1:
-            stack.enter_context(_note_stored(terminal, done, len(jobs)))
+    try:
         # If this block is left early, the cluster ends before anything is printed about it.
-        for outcome in stack.enter_context(_outcomes(jobs, given, terminal)):
-            error = _store(outcome, given, keep=keep)
-            if error is not None and len(jobs) == 1:
-                raise error
-            if error is not None:
-                terminal.report_error(error)
-                done.fail(outcome.job)
-            elif not outcome.entries:
-                terminal.note(f"{outcome.job.name}: stored already")
-                done.unchanged.append(outcome.job.name)
-            else:
-                keep = True
-                for entry in outcome.entries:
-                    done.add(entry, given)
+        with _outcomes(jobs, given, terminal) as outcomes:
+            for outcome in outcomes:
+                error = _store(outcome, given, keep=keep)
+                if error is not None and len(jobs) == 1:
+                    raise error
+                if error is not None:
+                    terminal.report_error(error)
+                    done.failed.append(str(outcome.job.path))
+                    done.lossy = done.severe = True
+                elif not outcome.entries:
+                    terminal.note(f"{outcome.job.name}: stored already")
+                    done.unchanged.append(outcome.job.name)
+                else:
+                    keep = True
+                    for entry in outcome.entries:
+                        done.add(entry, given)
+    except BaseException:
+        if len(jobs) > 1:
+            ready = len(done.sessions) + len(done.unchanged)
+            terminal.note(f"{ready} of {len(jobs)} are stored; the same command continues from there")
+        raise
     return done
 
 
@@ -172,17 +172,6 @@ def _store(outcome: conversion_jobs.Outcome, given: options.Convert, *, keep: bo
             raise
         return refusal
     return outcome.error
-
-
-@contextlib.contextmanager
-def _note_stored(terminal: console.Console, done: ConvertedInputs, count: int) -> Iterator[None]:
-    """Print, if the block fails, how many sessions are stored: they stay."""
-    try:
-        yield
-    except BaseException:
-        ready = len(done.sessions) + len(done.unchanged)
-        terminal.note(f"{ready} of {count} are stored; the same command continues from there")
-        raise
 
 
 def _as_text(d: Document) -> str:
