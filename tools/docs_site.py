@@ -42,12 +42,10 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
             files.append(File.generated(config, f"docs/{file.src_uri}", abs_src_path=file.abs_src_path))
     for path in PAGES:
         add(path, (ROOT / path).read_text("utf-8").replace(f"{NOTEBOOK}.ipynb", f"{NOTEBOOK}.md"))
-    for source in sorted((ROOT / "examples").rglob("*")):
-        if source.is_file():
-            path = source.relative_to(ROOT).as_posix()
-            files.append(File.generated(config, path, abs_src_path=str(source)))
-    for path in LINKED:
-        files.append(File.generated(config, path, abs_src_path=str(ROOT / path)))
+    examples = (file for file in sorted((ROOT / "examples").rglob("*")) if file.is_file())
+    for source in (*examples, *(ROOT / path for path in LINKED)):
+        path = source.relative_to(ROOT).as_posix()
+        files.append(File.generated(config, path, abs_src_path=str(source)))
     add(f"{NOTEBOOK}.md", notebook_page(ROOT / f"{NOTEBOOK}.ipynb"))
     add("reference/settings.md", settings_page())
     for path, text in (*command_pages(), *python_pages("pc2grid"), *python_pages("signature")):
