@@ -23,6 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor, as_completed
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
@@ -111,24 +112,29 @@ def names_of(files: Sequence[Path]) -> list[str]:
 
 
 def in_processes(
-    function: Callable[..., T], tasks: Iterable[tuple[Any, ...]], *, jobs: int | None, advance: Advance
+    function: Callable[..., T],
+    tasks: Iterable[tuple[Any, ...]],
+    *,
+    jobs: int | None,
+    progress: AbstractContextManager[Advance],
 ) -> list[T]:
     """Return what a function returns for the arguments of each task, in their order.
 
-    jobs : processes, None: one a core; with one the tasks run in this process. advance : called with the
-        share that is done.
+    jobs : processes, None: one a core; with one the tasks run in this process. progress : shows the share
+        that is done.
     """
     given, count = list(tasks), jobs or os.cpu_count() or 1
-    if count == 1 or len(given) < 2:
-        found = []
-        for arguments in given:
-            found.append(function(*arguments))
-            advance(len(found) / len(given))
-        return found
-    libraries.use_one()  # the processes run in parallel; they read it when they load their libraries
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,))
-    return _run_in(pool, function, given, advance)
+    with progress as advance:
+        if count == 1 or len(given) < 2:
+            found = []
+            for arguments in given:
+                found.append(function(*arguments))
+                advance(len(found) / len(given))
+            return found
+        libraries.use_one()  # the processes run in parallel; they read it when they load their libraries
+        spawn = multiprocessing.get_context("spawn")
+        pool = ProcessPoolExecutor(count, mp_context=spawn, initializer=cv2.setNumThreads, initargs=(1,))
+        return _run_in(pool, function, given, advance)
 
 
 def _run_in(

@@ -359,15 +359,11 @@ def compare_sensors(given: CompareSensors, terminal: Console) -> None:
     names = names_of(plans)
     make_folder(out)
     drives = PlanDrives(out=out, **setting)
-    with terminal.progress("map") as advance:
-        mapped = [(drives, *one) for one in product(plans, SENSORS)]
-        in_processes(PlanDrives.map, mapped, jobs=given.jobs, advance=advance)
-    with terminal.progress("locate") as advance:
-        asked = [
-            (drives, *one, plans)
-            for one in product(range(given.seed, given.seed + given.queries), plans, SENSORS)
-        ]
-        found = in_processes(_locate, asked, jobs=given.jobs, advance=advance)
+    mapped = [(drives, *one) for one in product(plans, SENSORS)]
+    in_processes(PlanDrives.map, mapped, jobs=given.jobs, progress=terminal.progress("map"))
+    seeds = range(given.seed, given.seed + given.queries)
+    asked = [(drives, *one, plans) for one in product(seeds, plans, SENSORS)]
+    found = in_processes(_locate, asked, jobs=given.jobs, progress=terminal.progress("locate"))
     trials = [trial for some in found for trial in some]
     cells, elsewhere = matrix(trials), Counter(t.row.status for t in trials if not t.in_building)
     document = {

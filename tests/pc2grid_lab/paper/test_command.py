@@ -27,8 +27,7 @@ from pc2grid_lab.paper.experiment import (
     draw_queries,
     evaluate,
 )
-from pc2grid_lab.paper.methods import ABLATION, make_methods
-from pc2grid_lab.paper.rivals import DistanceFeatures
+from pc2grid_lab.paper.methods import ABLATION, DistanceFeatures, make_methods
 from pc2grid_lab.paper.tables import (
     MAPS,
     TABLE_3,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pc2grid.geometry import F32
-from pc2grid_lab.paper import rivals
+from pc2grid_lab.paper import methods
 
 SEEDS = pytest.mark.parametrize("seed", range(4))
 
@@ -46,6 +46,6 @@ def test_the_most_that_one_motion_explains(seed: int, matches: int) -> None:
     nearest[1] = 60 + np.arange(matches)
     nearest[2, ::2], nearest[3, ::5] = nearest[1, ::2], nearest[1, ::5]
     nearest[4] = -1
-    found = rivals._consensus(a, b, nearest, 0.25, 400)
+    found = methods._consensus(a, b, nearest, 0.25, 400)
     assert found.tolist() == [*(consensus(a, b[row], 0.25, 400) for row in nearest[:4]), 0]
     assert matches < 37 or found[1] > 2 * found[0]

@@ -8,8 +8,14 @@ import pytest
 from pc2grid.geometry import F64
 from pc2grid.model import Submap
 from pc2grid_lab.paper.experiment import Matcher, rotated_submap
-from pc2grid_lab.paper.methods import EXTRA_METHOD_NAMES, METHOD_NAMES, make_methods, submap_vector
-from pc2grid_lab.paper.rivals import DistanceFeatures, context
+from pc2grid_lab.paper.methods import (
+    EXTRA_METHOD_NAMES,
+    METHOD_NAMES,
+    DistanceFeatures,
+    context,
+    make_methods,
+    submap_vector,
+)
 from signature.freespace import shortest_paths
 from tests.helpers.rooms import cross, degenerate, disc, l_shape, polygon, random_rooms, rectangle, submap_of
 

@@ -58,8 +58,14 @@ class BestMatches:
     correct: NDArray[np.bool_]
 
     def curve(self) -> PrecisionRecall:
-        """Return precision and recall as functions of the similarity threshold."""
-        return precision_recall(self.similarity, self.correct)
+        """Return precision and recall as functions of the similarity threshold; empty if no match is true."""
+        if not self.correct.any():
+            return PrecisionRecall(recall=np.empty(0), precision=np.empty(0))
+        from sklearn.metrics import precision_recall_curve
+
+        precision, recall, _ = precision_recall_curve(self.correct, self.similarity)
+        # scikit-learn begins at the lowest threshold, and ends with a point that no match has.
+        return PrecisionRecall(recall=recall[-2::-1], precision=precision[-2::-1])
 
     def measures(self) -> MatchMeasures:
         """Return all measures of these matches."""
@@ -110,17 +116,6 @@ class PrecisionRecall(NamedTuple):
 
     recall: F64
     precision: F64
-
-
-def precision_recall(similarity: F64, correct: NDArray[np.bool_]) -> PrecisionRecall:
-    """Return the curve of best matches with similarity (Q,) and truth (Q,); empty if no match is true."""
-    if not correct.any():
-        return PrecisionRecall(recall=np.empty(0), precision=np.empty(0))
-    from sklearn.metrics import precision_recall_curve
-
-    precision, recall, _ = precision_recall_curve(correct, similarity)
-    # scikit-learn begins at the lowest threshold, and ends with a point that no match has.
-    return PrecisionRecall(recall=recall[-2::-1], precision=precision[-2::-1])
 
 
 def draw_queries(

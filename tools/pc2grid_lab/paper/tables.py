@@ -222,16 +222,14 @@ def within_others(asked: Path, radius_m: float, seed: int, folder: Path) -> F64:
             f"{asked.parent}: no other map to learn from",
             hint="put other maps beside it, or leave out the methods that learn",
         )
-    found = []
-    for path in others:
-        file = folder / f"differences.{path.stem}.r{radius_m:g}.seed{seed}.pickle"
-        found.append(once(file, partial(_differences, path, radius_m, seed)))
+
+    def made(path: Path) -> F64:
+        grid = read_map(path)
+        return differences(grid, partition(grid, PartitionConfig.paper(radius_m)), seed)
+
+    ending = f"r{radius_m:g}.seed{seed}.pickle"
+    found = [once(folder / f"differences.{path.stem}.{ending}", partial(made, path)) for path in others]
     return np.concatenate(found)
-
-
-def _differences(path: Path, radius_m: float, seed: int) -> F64:
-    grid = read_map(path)
-    return differences(grid, partition(grid, PartitionConfig.paper(radius_m)), seed)
 
 
 def known_maps(path: Path) -> list[Path]:
@@ -271,17 +269,19 @@ def print_tables(results: Sequence[PaperCell], methods: Sequence[str]) -> None:
         for group in (OURS, METHOD_NAMES, EXTRA_METHOD_NAMES, ("proposed", *ABLATION))
     )
     rivals, beyond = ([name for name in group if name not in OURS] for group in (rivals, beyond))
+    at_8_m = [(str(level), level, 8.0) for level in range(len(_LEVELS))]
+    by_radius = [(f"{radius_m:g} m", 1, radius_m) for radius_m in RADII_M]
     for offset_m in dict.fromkeys(r.task.offset_m for r in results):
         plain = [r for r in results if r.task.offset_m == offset_m]
-        where = f"queries within {offset_m:g} m of a submap centre"
-        at_8_m = [(str(level), level, 8.0) for level in range(len(_LEVELS))]
-        _print_measures(f"Table III, does it hold: {where}", "noise", at_8_m, plain, maps, ours)
-        by_radius = [(f"{radius_m:g} m", 1, radius_m) for radius_m in RADII_M]
-        _print_measures(f"Table IV, noise level 1: {where}", "radius", by_radius, plain, maps, ours)
-        _print_measures(f"Table III, its rivals: {where}", "noise", at_8_m, plain, maps, rivals)
-        _print_measures(f"What beats it: {where}", "noise", at_8_m, plain, maps, beyond)
-        if len(parts) > 1:
-            _print_measures(f"What each signature adds: {where}", "noise", at_8_m, plain, maps, parts)
+        for title, heading, settings, group in (
+            ("Table III, does it hold", "noise", at_8_m, ours),
+            ("Table IV, noise level 1", "radius", by_radius, ours),
+            ("Table III, its rivals", "noise", at_8_m, rivals),
+            ("What beats it", "noise", at_8_m, beyond),
+            ("What each signature adds", "noise", at_8_m, parts if len(parts) > 1 else []),
+        ):
+            where = f"{title}: queries within {offset_m:g} m of a submap centre"
+            _print_measures(where, heading, settings, plain, maps, group)
 
 
 def _print_measures(
@@ -362,13 +362,10 @@ def compare_paper(given: ComparePaper, terminal: Console) -> None:
     tasks = list(
         paper_tasks(found, methods=chosen, offsets_m=offsets_m, queries=given.queries, seed=given.seed)
     )
-    with terminal.progress(f"{len(tasks)} cells of the tables") as advance:
-        folder = kept_in(out, found)
-        groups = [(group, folder) for group in that_share_submaps(tasks)]
-        cells = itertools.chain.from_iterable(
-            in_processes(computed_cells, groups, jobs=given.jobs, advance=advance)
-        )
-    by_task = {cell.task: cell for cell in cells}
+    folder, progress = kept_in(out, found), terminal.progress(f"{len(tasks)} cells of the tables")
+    groups = [(group, folder) for group in that_share_submaps(tasks)]
+    cells = in_processes(computed_cells, groups, jobs=given.jobs, progress=progress)
+    by_task = {cell.task: cell for group in cells for cell in group}
     results = [by_task[task] for task in tasks]
     document = {"queries": given.queries, "seed": given.seed, "cells": [cell.summary() for cell in results]}
     write_text(out / "results.json", json_text(document) + "\n")
@@ -386,11 +383,11 @@ def kept_in(out: Path, maps: Sequence[Path]) -> Path:
 
 def _chosen(methods: Sequence[str] | None) -> tuple[str, ...]:
     """Return the methods that are compared. Raises ConfigError if one is not known."""
-    chosen, known = tuple(methods or METHOD_NAMES), METHOD_NAMES + EXTRA_METHOD_NAMES
-    for name in chosen:
+    known = METHOD_NAMES + EXTRA_METHOD_NAMES
+    for name in methods or ():
         if name not in known:
             raise ConfigError(f"--methods: no method {name!r}", hint=f"one of {', '.join(known)}")
-    return chosen
+    return tuple(methods or METHOD_NAMES)
 
 
 # --- how recall falls with the number of places; not in the paper -------------------------------------
@@ -501,7 +498,7 @@ def _count(
     centers_m = np.array([submap.center_m for submap in partition(grid, PartitionConfig.paper())])
     drawn = draw_queries(grid, centers_m, PLACES.radius_m, experiment, NOISE_LEVELS[level])
     queries = Described.of(drawn)
-    at_m = queries.signatures.center_m
+    q, at_m = queries.signatures, queries.signatures.center_m
     columns = [column for part in BOUNDARY_PARTS for column in range(*COLUMNS[part].indices(1000))]
     learned = metric(within_others(asked, PLACES.radius_m, experiment.seed, folder)[:, columns])
     own = own_of(asked)
@@ -515,19 +512,15 @@ def _count(
         others = source.places(folder)
         counts = is_other if source is own else np.ones((1, len(others.vectors)), bool)
         places[:, source.kind] += counts.sum(axis=1)
-        for method, away in _distances(queries, others, learned).items():
+        distances = {
+            "proposed": score_matrix(q.boundary, q.freespace, q.symmetry, others.signatures, LETTER),
+            "learned": cdist(queries.vectors @ learned, others.vectors @ learned),
+        }
+        for method, away in distances.items():
             if source is own:
                 limits[method] = away[np.arange(len(right)), right, None]
             before[method][:, source.kind] += (counts & (away <= limits[method])).sum(axis=1)
     return Counted(asked.stem, level, places, before)
-
-
-def _distances(queries: Described, others: Described, learned: F64) -> dict[str, F64]:
-    q = queries.signatures
-    return {
-        "proposed": score_matrix(q.boundary, q.freespace, q.symmetry, others.signatures, LETTER),
-        "learned": cdist(queries.vectors @ learned, others.vectors @ learned),
-    }
 
 
 def mean_recall(
@@ -625,12 +618,12 @@ def compare_scale(given: CompareScale, terminal: Console) -> None:
     make_folder(out)
     folder = kept_in(out, sorted(maps.glob("*.yaml")))
     experiment = Experiment(queries=queries, seed=seed)
-    with terminal.progress(f"places of {len(sources)} maps") as advance:
-        described = [(source, folder) for source in [*map(own_of, asked), *sources]]
-        in_processes(MapSource.places, described, jobs=given.jobs, advance=advance)
+    described = [(source, folder) for source in [*map(own_of, asked), *sources]]
+    progress = terminal.progress(f"places of {len(sources)} maps")
+    in_processes(MapSource.places, described, jobs=given.jobs, progress=progress)
     tasks = [(path, level, experiment, sources, folder) for level in LEVELS for path in asked]
-    with terminal.progress(f"queries of {len(asked)} maps") as advance:
-        results = in_processes(count, tasks, jobs=given.jobs, advance=advance)
+    progress = terminal.progress(f"queries of {len(asked)} maps")
+    results = in_processes(count, tasks, jobs=given.jobs, progress=progress)
     drawn = list(curves(results))
     write_text(out / "results.json", json_text({"queries": queries, "seed": seed, "curves": drawn}) + "\n")
     draw_curves(drawn, out / "scale.png")

@@ -16,6 +16,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
 from itertools import chain, islice, permutations
@@ -258,7 +259,7 @@ def run_all(
     read = {recording.name: recording for recording, _ in maps.values()}
     read |= {pair.query: catalogue.recordings[pair.query] for pair in pairs}
     waiting = [(folder, one) for one in read.values() if not folder.source(one).exists()]
-    in_processes(_make, waiting, jobs=jobs, advance=lambda share: None)
+    in_processes(_make, waiting, jobs=jobs, progress=nullcontext(lambda share: None))
     tasks = [_convert(folder, name, recording, until_s) for name, (recording, until_s) in maps.items()]
     # Bare KISS-ICP knows lidars, and the real ones are there to be compared.
     real = [r for r in catalogue.mapped if r.drive is None and not folder.missing(r)]
