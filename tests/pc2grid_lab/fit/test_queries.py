@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pc2grid.geometry import SE2
 from pc2grid.observer import TimeSpan
 from pc2grid_lab.fit import queries
 from pc2grid_lab.fit.queries import KnownWindow, office_floor, pairs_of
@@ -26,7 +25,7 @@ def test_a_view_of_a_query_is_like_what_the_map_shows_there() -> None:
         first = first or truth
         window.add(registered, planar_scan)
     assert first is not None
-    pairs = pairs_of([(window.map(), first, [(office(), SE2())])], [office_floor(1)], Config())
+    pairs = pairs_of([(window.map(), first, office())], [office_floor(1)], Config())
     assert pairs.queries.shape == pairs.same.shape and len(pairs.queries) >= 8
     one = np.linalg.norm(pairs.queries - pairs.same, axis=1)
     two = np.linalg.norm(pairs.queries[:, None] - pairs.other[None], axis=2)
@@ -47,7 +46,7 @@ def test_windows_are_taken_one_at_a_time_where_the_map_knows_them(monkeypatch: p
 
     monkeypatch.setattr(queries, "index_of_database", lambda _: OFFICE)
     asked = queries.in_maps(known(), Folder(Path("data"), Path("work")))
-    _, T_map_query, ((grid, _),) = next(asked)
+    _, T_map_query, grid = next(asked)
     assert taken == [False, True] and grid is OFFICE.grid_of(0)
     assert T_map_query.apply(np.array([query.center_m]))[0] == pytest.approx((end.x, end.y))
     assert len(list(asked)) == 1

@@ -26,7 +26,6 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import softmax
 from sklearn.metrics import roc_auc_score
@@ -139,7 +138,8 @@ def fit(queries: Sequence[Known], in_use: F64, unit: F64 | float = 1.0) -> F64:
     found = np.array([bool(q.right) for q in queries])
     if found.all() or not found.any():
         raise ValueError("a fit needs queries whose place was found and others")
-    weights = balanced(found)
+    # Those whose place was found weigh as much as all others.
+    weights = 0.5 * np.where(found, 1.0 / found.sum(), 1.0 / (~found).sum())
 
     def loss(x: F64) -> float:
         p = np.array([q.of_truth(x * unit) for q in queries])
@@ -150,11 +150,6 @@ def fit(queries: Sequence[Known], in_use: F64, unit: F64 | float = 1.0) -> F64:
     # The masses of alike places are those of the best of them, so the loss has edges.
     options = {"xatol": 0.01}
     return np.asarray(minimize(loss, start, bounds=bounds, method="Nelder-Mead", options=options).x * unit)
-
-
-def balanced(found: NDArray[np.bool_]) -> F64:
-    """Return weights (N,), by which queries whose place was found weigh as much as all others."""
-    return np.asarray(0.5 * np.where(found, 1.0 / max(found.sum(), 1), 1.0 / max((~found).sum(), 1)))
 
 
 def left_out(queries: Sequence[Known], fit: Callable[[Sequence[Known]], F64]) -> list[F64]:

@@ -51,7 +51,7 @@ from pc2grid_lab.recordings.catalogue import UNTIL_S, Catalogue, Pair
 from pc2grid_lab.recordings.judging import Judge, config_of
 from pc2grid_lab.recordings.run import Folder
 from pc2grid_lab.runner import kept
-from pc2grid_lab.sensors import PlanMap, RegisteredSession
+from pc2grid_lab.sensors import RegisteredSession
 from pc2grid_lab.truth import apart
 from signature.config import Config
 from signature.database import open_database
@@ -101,29 +101,34 @@ def queries_of(session: RegisteredSession, config: Config) -> Iterator[tuple[Que
 
 LOGS = ("fr079", "intel", "csail", "killian")
 """Logs with true poses, of which the beginning becomes the map."""
+_LOG_QUERIES = 24
+"""Later parts of each of them."""
+DRAWN_MAPS = ("aces.yaml", "workshop_1.yaml")
+"""Maps that have other places."""
 
 Drawn = tuple[OccupancyGrid, list[RegisteredSession]]
 """The map of the first part of a log, and its later parts as registered queries."""
 
 
-def read(data: Path, name: str, queries: int, folder: Path, config: Config) -> Drawn:
+def read(data: Path, name: str, folder: Path, config: Config) -> Drawn:
     """Read the map of the first part of a log, and its later parts as queries, kept in a folder."""
-    log = data / "laser" / f"{name}.mcap"
-    travel_m, mapped_s = ASKED_AFTER_M[-1] + 2.0, UNTIL_S[name]
-    site = recorded_site(log, folder / name, config, queries=queries, travel_m=travel_m, mapped_s=mapped_s)
+    site = recorded_site(
+        data / "laser" / f"{name}.mcap",
+        folder / name,
+        config,
+        queries=_LOG_QUERIES,
+        travel_m=ASKED_AFTER_M[-1] + 2.0,
+        mapped_s=UNTIL_S[name],
+    )
     sessions = [kept(site.stem(number).with_suffix(".pickle")) for number in site.queries()]
     return load_map(site.map_stem.with_suffix(".yaml")), sessions
 
 
-Asked = tuple[QueryMap, SE2, Sequence[PlanMap]]
-"""A query, its true frame in the plan, and the maps of that plan."""
+Asked = tuple[QueryMap, SE2, OccupancyGrid]
+"""A query, its true frame in a map, and this map."""
 
 
-def pairs_of(
-    queries: Iterable[Asked],
-    floors: Sequence[OccupancyGrid],
-    config: Config,
-) -> Pairs:
+def pairs_of(queries: Iterable[Asked], floors: Sequence[OccupancyGrid], config: Config) -> Pairs:
     """Return views of queries, and what the maps show at the same points.
 
     floors : maps of other buildings, taken at their viewpoints.
@@ -138,19 +143,16 @@ def pairs_of(
 
     found: list[F32] = []
     same: list[F32] = []
-    for query, T_plan_query, maps in queries:
+    for query, T_map_query, grid in queries:
         if not query.views:
             continue
         path_m = np.array([view.center_m for view in query.views])
         views_m = np.array(best_observed(query.grid, path_m, config.partition, closer))
-        views = described(query.grid, views_m)
-        for grid, T_plan_map in maps:
-            there = (T_plan_map.inverse() @ T_plan_query).apply(views_m)
-            there = there + rng.uniform(-_BESIDE_M, _BESIDE_M, there.shape)
-            free = grid.look_up(grid.free, there, outside=False)
-            if free.any():
-                found.append(views[free])
-                same.append(described(grid, there[free]))
+        there = T_map_query.apply(views_m) + rng.uniform(-_BESIDE_M, _BESIDE_M, views_m.shape)
+        free = grid.look_up(grid.free, there, outside=False)
+        if free.any():
+            found.append(described(query.grid, views_m)[free])
+            same.append(described(grid, there[free]))
     other = [
         described(grid, viewpoints_of(grid, submap_centers(grid, config.partition))[0][::_EVERY])
         for grid in floors
@@ -186,10 +188,9 @@ def windows(catalogue: Catalogue, folder: Folder) -> Iterator[KnownWindow]:
         recording = catalogue.recordings[pair.query]
         if folder.missing(recording) or not folder.map(pair.map_name).exists():
             continue
+        config = config_of(recording)
         for span, truth, seen in judge.truths(pair):
-            config = config_of(recording)
-            query = Query(config, config.relocalize, in_space=True)
-            last = Query(config, config.relocalize)
+            query, last = (Query(config, config.relocalize, in_space=whole) for whole in (True, False))
             try:
                 with open_log(folder.source(recording), config.read) as log:
                     for scan in follow(log.scans(span.start_s, span.duration_s), config):
@@ -204,10 +205,9 @@ def rows(
     window: KnownWindow, index: MapIndex, others: Mapping[str, MapIndex], catalogue: Catalogue
 ) -> Iterator[dict[str, Any]]:
     """Yield the evidence of the places of a window, in its map and in those of other buildings, by name."""
-    building = {name: r.building for name, r in catalogue.recordings.items()}
     row = {
-        "log": building[window.pair.query],
-        "map": building[window.pair.map],
+        "log": catalogue.building(window.pair.query),
+        "map": catalogue.building(window.pair.map),
         "start": f"{window.pair.query} {window.span.start_s:.1f}",
         "travel_m": window.whole.path_m,
         "place": "in the map" if window.truth else "elsewhere",
@@ -215,7 +215,7 @@ def rows(
     yield row | _asked(index, window.whole, window.truth, window.in_space)
     for name, elsewhere in others.items():
         asked = _asked(elsewhere, window.whole, {}, window.in_space)
-        yield row | {"map": building[name], "place": "elsewhere"} | asked
+        yield row | {"map": catalogue.building(name), "place": "elsewhere"} | asked
     if window.covered:
         yield row | {"travel_m": 0.0} | _asked(index, window.standing, window.truth)
         yield row | {"place": "blanked"} | _asked(_blanked(index, window), window.whole, window.truth)
@@ -299,7 +299,7 @@ def in_logs(logs: Mapping[str, Drawn], config: Config) -> Iterator[Asked]:
     for grid, driven in logs.values():
         for session in driven:
             for query, T_map_query in queries_of(session, config):
-                yield query, T_map_query, [(grid, SE2())]
+                yield query, T_map_query, grid
 
 
 def in_maps(known: Iterable[KnownWindow], folder: Folder) -> Iterator[Asked]:
@@ -310,7 +310,7 @@ def in_maps(known: Iterable[KnownWindow], folder: Folder) -> Iterator[Asked]:
             index = index_of_database(folder.map(window.pair.map_name))
             session, T_map_base = next(iter(window.truth.items()))
             grid = index.grid_of(index.sessions.index(session))
-            yield window.whole, T_map_base @ window.whole.T_odom_base.inverse(), [(grid, SE2())]
+            yield window.whole, T_map_base @ window.whole.T_odom_base.inverse(), grid
 
 
 app = typer.Typer(add_completion=False)
@@ -328,11 +328,10 @@ def evidence(
 ) -> None:
     """Collect the evidence of the windows of `compare recordings`, whose DATA and WORK these are."""
     folder, catalogue = Folder(data.resolve(), work.resolve()), Catalogue.of(only=only)
-    building = {name: r.building for name, r in catalogue.recordings.items()}
     collected: list[dict[str, Any]] = []
     for number, window in enumerate(windows(catalogue, folder)):
-        of = (building[window.pair.query], building[window.pair.map])
-        others = [name for name in OTHERS if building[name] not in of and folder.map(name).exists()]
+        own = {catalogue.building(name) for name in (window.pair.query, window.pair.map)}
+        others = [n for n in OTHERS if catalogue.building(n) not in own and folder.map(n).exists()]
         if not others:
             raise SystemExit(f"{folder.work}: holds no map of another building")
         chosen = others if everywhere else [others[number % len(others)]]
@@ -350,24 +349,21 @@ def weights(
     work: Path,
     out: Path,
     without: Annotated[str, typer.Option(help="building that is left out")] = "",
-    logs: str = ",".join(LOGS),
-    maps: str = "aces,workshop_1",
-    queries: int = 24,
 ) -> None:
     """Learn and store the statistics."""
     config, catalogue, folder = Config(), Catalogue.of(), Folder(data.resolve(), work.resolve())
     # Beside what this version of the program has made: another one would not read it.
     made = folder.work / "logs"
     made.mkdir(exist_ok=True)
-    building = {name: recording.building for name, recording in catalogue.recordings.items()}
-    drawn = {name: read(data, name, queries, made, config) for name in logs.split(",") if name != without}
+    drawn = {name: read(data, name, made, config) for name in LOGS if name != without}
     asked = [
         pair
         for pair in catalogue.pairs
-        if pair.kind != "elsewhere" and building[pair.map] != without and folder.map(pair.map_name).exists()
+        if pair.kind != "elsewhere"
+        and catalogue.building(pair.map) != without
+        and folder.map(pair.map_name).exists()
     ]
-    names = [name for name in maps.split(",") if building[f"{name}.yaml"] != without]
-    floors = [load_map(data / "maps" / f"{name}.yaml") for name in names]
+    floors = [load_map(data / "maps" / name) for name in DRAWN_MAPS if catalogue.building(name) != without]
     floors += [office_floor(_FIRST_FLOOR + number) for number in range(_FLOORS)]
     floors += [grid for grid, _ in drawn.values()]
     floors += [
