@@ -19,7 +19,7 @@ from pc2grid.io.trajectory import read_tum
 from pc2grid.simulate import SimulationConfig, simulate_session
 from pc2grid_cli.main import app, main
 from pc2grid_cli.output import schema
-from pc2grid_lab.recordings.run import McapPart, write_joined
+from pc2grid_lab.recordings.run import write_joined
 from signature.localization.localizer import ResetPolicy
 from tests.helpers.interruptible import interruptible
 from tests.helpers.json_schema import closed
@@ -209,9 +209,7 @@ def test_a_robot_that_was_carried_away_is_told_so_in_words(here: Path, tmp_path:
     """Along the corridor of the office, with wheels that do not turn."""
     config = SimulationConfig(length_m=6.0, seed=5, clutter=0, start_m=(2.0, 7.0))
     simulate_session(tmp_path / "there.mcap", sensor="laser", grid=office(), config=config)
-    write_joined(
-        McapPart(here / "tuesday.mcap"), McapPart(tmp_path / "there.mcap"), tmp_path / "carried.mcap"
-    )
+    write_joined(here / "tuesday.mcap", tmp_path / "there.mcap", tmp_path / "carried.mcap")
     result = CliRunner().invoke(app, ["watch", str(tmp_path / "carried.mcap"), "-d", "plan.submaps"])
     assert result.exit_code == 0
     said = [line.partition(" m: ")[2] for line in result.stdout.splitlines()]

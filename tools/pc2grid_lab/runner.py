@@ -179,6 +179,11 @@ class Finished:
         """Return whether there is no result."""
         return self.code not in _ANSWERED or self.document is None
 
+    @property
+    def result(self) -> Any:
+        """Return the document of a command that did its work; else None."""
+        return None if self.failed else self.document
+
 
 def pc2grid(*arguments: str | Path) -> Finished:
     """Run `pc2grid` with these arguments; after half an hour of elapsed time it is stopped."""
@@ -244,9 +249,15 @@ def _error(code: int, complaint: str) -> str:
     return f"ended by signal {-code}" if code < 0 else said
 
 
-def kept_result(file: Path) -> Finished | None:
-    """Return the result that is kept in a file; None if it is not there."""
-    return Finished(**json.loads(file.read_text())) if file.exists() else None
+NOT_RUN = "was not run"
+"""The error of a command that was not run, because the run ended early."""
+
+
+def kept_result(file: Path) -> Finished:
+    """Return the result that is kept in a file; without the file, one with the error `NOT_RUN`."""
+    if not file.exists():
+        return Finished(code=1, cpu_s=0.0, document=None, error=NOT_RUN)
+    return Finished(**json.loads(file.read_text()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,7 +278,7 @@ def run_tasks(tasks: Sequence[Task], jobs: int, advance: Advance) -> None:
 
 
 def _do(task: Task) -> None:
+    task.file.parent.mkdir(parents=True, exist_ok=True)
     done = task.do()
     if done.code not in _STOPPED:  # else the next run does it
-        task.file.parent.mkdir(parents=True, exist_ok=True)
         write_text(task.file, json.dumps(asdict(done)))

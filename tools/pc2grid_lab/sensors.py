@@ -36,7 +36,7 @@ from pc2grid_cli.output import make_folder
 from pc2grid_lab.commands import CompareSensors
 from pc2grid_lab.pages import Cell, print_cells
 from pc2grid_lab.recordings.catalogue import MAP_DRIVE
-from pc2grid_lab.recordings.table import Counts, QueryRow
+from pc2grid_lab.recordings.table import QueryRow, counts_of
 from pc2grid_lab.runner import in_processes, names_of, once, write_text
 from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, apart, fit_frame, is_right
 from signature.config import Config
@@ -335,14 +335,14 @@ def matrix(trials: Sequence[Trial]) -> list[Cell]:
 
 
 def _figures(rows: Sequence[QueryRow]) -> Cell:
-    counts, statuses, count = Counts.of(rows), Counter(row.status for row in rows), len(rows)
-    errors_m = [r.error_m for r in rows if r.located and r.right and r.error_m is not None]
+    counts, statuses, count = counts_of(rows), Counter(row.status for row in rows), len(rows)
+    errors_m = [r.error_m for r in rows if r.outcome == "right" and r.error_m is not None]
     median_m, p95_m = np.percentile(errors_m, (50, 95)).tolist() if errors_m else (None, None)
     ranks = [math.inf if row.rank is None else row.rank for row in rows]
     return {
         "trials": count,
-        "located_right": counts.right / count,
-        "wrong": counts.wrong / max(counts.located, 1),
+        "located_right": counts["right"] / count,
+        "wrong": counts["wrong"] / max(counts["located"], 1),
         "ambiguous": statuses["ambiguous"] / count,
         "not_found": statuses["not_found"] / count,
         "recall": [sum(rank < k for rank in ranks) / count for k in RECALL_AT],

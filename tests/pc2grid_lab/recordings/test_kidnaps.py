@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pc2grid.io.recording import open_log
 from pc2grid_lab.recordings.judging import Look, followed_row
-from pc2grid_lab.recordings.run import McapPart, write_part
+from pc2grid_lab.recordings.run import write_part
 from pc2grid_lab.recordings.table import FollowedRow
 from tests.helpers.recordings import laser_drive, write_mcap
 
@@ -59,7 +59,7 @@ def test_a_drive_is_located_by_the_first_look_that_is_not_wrong() -> None:
 
 def test_the_later_part_of_a_recording_has_its_odometry(tmp_path: Path) -> None:
     whole = write_mcap(tmp_path / "whole.mcap", laser_drive(count=40))
-    write_part(McapPart(whole, begin_s=3.0), tmp_path / "part.mcap")
+    write_part(whole, 3.0, tmp_path / "part.mcap")
     with open_log(whole) as log, open_log(tmp_path / "part.mcap") as part:
         scans, later = list(log.scans()), list(part.scans())
     assert len(later) == 10 and later[0].stamp_ns == scans[30].stamp_ns

@@ -18,7 +18,7 @@ from pc2grid_cli.main import app
 from pc2grid_lab.recordings import catalogue, run
 from pc2grid_lab.recordings.catalogue import Pair, Recording, SimulatedDrive
 from pc2grid_lab.recordings.run import Followed
-from pc2grid_lab.runner import Finished, Task, kept_result, run_tasks
+from pc2grid_lab.runner import NOT_RUN, Finished, Task, kept_result, run_tasks
 from tests.helpers.recordings import ros, write_mcap
 from tests.helpers.rooms import RESOLUTION_M
 from tests.helpers.shared_folders import shared_folder
@@ -213,7 +213,7 @@ def test_a_command_that_was_stopped_is_done_by_the_next_run(tmp_path: Path, code
     file, told = tmp_path / "answers" / "a.json", list[float]()
     run_tasks([Task(file, lambda: done, 0.0)], 1, told.append)
     assert told == [1]
-    assert (kept_result(file) is not None) == is_kept
+    assert (kept_result(file).error != NOT_RUN) == is_kept
 
 
 def test_a_disturbed_recording_has_other_last_bits(tmp_path: Path) -> None:

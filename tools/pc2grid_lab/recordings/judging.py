@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import networkx as nx
@@ -29,7 +29,6 @@ from pc2grid_lab.recordings.catalogue import Catalogue, Pair, Placed, Recording
 from pc2grid_lab.recordings.run import Folder, Followed
 from pc2grid_lab.recordings.table import (
     MISSING,
-    NOT_RUN,
     FollowedRow,
     JoinRow,
     MapRow,
@@ -40,7 +39,7 @@ from pc2grid_lab.recordings.table import (
     Warned,
     WarningVerdict,
 )
-from pc2grid_lab.runner import Finished, kept_result
+from pc2grid_lab.runner import NOT_RUN, Finished, kept_result
 from pc2grid_lab.truth import (
     AGREEMENT,
     AHEAD_M,
@@ -118,16 +117,12 @@ class RecordedDrive:
         """Return t_world_base by the true poses; where they are far apart, carried on by the own
         trajectory."""
         assert self.truth is not None
-        T = pose_at_stamp(self.truth, stamp_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
-        return self._carried(stamp_ns) if T is None else SE2.from_matrix(T)
-
-    def _carried(self, stamp_ns: int) -> SE2 | None:
-        """Return the own trajectory around a stamp, laid on the true poses there."""
-        assert self.truth is not None
-        own = self.own_pose(stamp_ns)
-        near = np.flatnonzero(np.abs(self.truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
+        T, own = pose_at_stamp(self.truth, stamp_ns, same_ns=SAME_NS, gap_ns=_GAP_NS), self.own_pose(stamp_ns)
+        if T is not None:
+            return SE2.from_matrix(T)
         if own is None:
             return None
+        near = np.flatnonzero(np.abs(self.truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
         pairs = [
             (there[1], SE2.from_matrix(self.truth.T_session_base[k]))
             for k in near.tolist()
@@ -187,12 +182,10 @@ def hits_at(folder: Folder, recording: Recording, stamp_ns: int) -> F64:
     config = config_of(recording)
     with open_log(folder.source(recording), config.read) as log:
         start_s = max((stamp_ns - log.info.start_ns) * 1e-9 - _BEFORE_S, 0.0)
-        last = None
-        for scan in log.scans(start_s, 2.0 * _BEFORE_S):
-            if last is not None and scan.stamp_ns > stamp_ns:
-                break
+        scans = iter(log.scans(start_s, 2.0 * _BEFORE_S))
+        last = next(scans)
+        for scan in itertools.takewhile(lambda scan: scan.stamp_ns <= stamp_ns, scans):
             last = scan
-        assert last is not None  # `scans` raises NoScans
         ((_, planar_scan),) = follow([last], config)
     return np.asarray(planar_scan.hits_m, np.float64)
 
@@ -227,23 +220,21 @@ def map_row(recording: Recording, folder: Folder) -> MapRow:
     """Return the row of a recording as a map; what cannot be judged is a row that says why."""
     row = MapRow(name=recording.name, building=recording.building, sensor=recording.sensor_shown)
     done = kept_result(folder.kept("maps", recording.name))
-    problem = MISSING if folder.missing(recording) else problem_of(done)
-    if problem or done is None:
-        return replace(row, problem=problem, cpu_s=None if done is None else done.cpu_s)
+    problem = MISSING if folder.missing(recording) else done.error
+    if problem:
+        return replace(row, problem=problem, cpu_s=done.cpu_s or None)
+    return _judged(row, lambda: _figures(recording, folder, done))
+
+
+Row = TypeVar("Row", MapRow, PairRow, FollowedRow, JoinRow)
+
+
+def _judged(row: Row, judge: Callable[[], dict[str, Any]]) -> Row:
+    """Return a row with what `judge` says of it; if it cannot be judged, with the reason."""
     try:
-        return replace(row, cpu_s=done.cpu_s, **_figures(recording, folder, done))
+        return replace(row, **judge())
     except Exception as error:
-        return replace(row, problem=said(error))
-
-
-def problem_of(done: Finished | None) -> str:
-    """Return why a command has no result; empty if it has one."""
-    return NOT_RUN if done is None else done.error
-
-
-def said(error: Exception) -> str:
-    """Return what became of a row that cannot be judged."""
-    return f"{type(error).__name__}: {error}"
+        return replace(row, problem=f"{type(error).__name__}: {error}")
 
 
 def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, Any]:
@@ -251,8 +242,7 @@ def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, 
     reports = [session["report"] for session in stored]
     read = sum(report["scans_read"] for report in reports)
     skipped = sum(sum(report["scans_skipped"].values()) for report in reports)
-    bare = kept_result(folder.kept("bare", recording.name))
-    bare_of: dict[str, Any] = {} if bare is None or bare.failed else bare.document
+    bare = kept_result(folder.kept("bare", recording.name)).result or {}
     error = _error(recording, folder)
     texts = itertools.chain.from_iterable(report["warnings"] for report in reports)
     sums = {name: sum(session[name] for session in stored) for name in ("duration_s", "path_m", "area_m2")}
@@ -260,11 +250,12 @@ def _figures(recording: Recording, folder: Folder, done: Finished) -> dict[str, 
         "minutes": sums["duration_s"] / 60.0,
         "metres": sums["path_m"],
         "area_m2": sums["area_m2"],
-        "over_bare": done.cpu_s / bare_of["cpu_s"] if bare_of else None,
+        "cpu_s": done.cpu_s,
+        "over_bare": done.cpu_s / bare["cpu_s"] if bare else None,
         "parts": len(stored),
         "lost": skipped / read if read else None,
         "warnings": warned(texts, error_m=error.get("error_m")),
-        "bare_m": bare_of.get("ate_m"),
+        "bare_m": bare.get("ate_m"),
         **error,
     }
 
@@ -367,21 +358,22 @@ def judged_table(
 class LocatedWindow:
     """A window, its answer, and what it has last seen.
 
-    answer : the document of `relocalize`; None if it failed. where : the part of the drive, and the pose of
-        the base there at the last scan; of a drive with true poses the part is -1 and the pose the true one.
+    where : the part of the drive, and the pose of the base there at the last scan; of a drive with true poses
+        the part is -1 and the pose the true one.
     """
 
     query: str
     window: int
     span: TimeSpan
-    done: Finished | None
+    done: Finished
     where: tuple[int, SE2] | None = None
     hits_m: F64 = field(default_factory=lambda: np.empty((0, 2)))
 
     @property
     def answer(self) -> dict[str, Any] | None:
-        """Return the document of `relocalize`."""
-        return None if self.done is None or self.done.failed else self.done.document
+        """Return the document of `relocalize`; None if it failed."""
+        answer: dict[str, Any] | None = self.done.result
+        return answer
 
     @property
     def places(self) -> list[tuple[str, SE2, int]]:
@@ -398,7 +390,7 @@ class Judge:
         self._catalogue, self._folder = catalogue, folder
         self._windows: dict[Pair, list[LocatedWindow]] = {}
         self._followed: dict[Followed, Frame | None] = {}
-        self._lie: dict[str, nx.Graph] = {}
+        self._lie: dict[str, nx.DiGraph] = {}
 
     def row(self, pair: Pair) -> PairRow:
         """Return the row of a pair; what cannot be judged is a row that says why."""
@@ -410,16 +402,17 @@ class Judge:
             building=map_.building,
             sensors=" in ".join(dict.fromkeys((query.sensor_shown, map_.sensor_shown))),
         )
-        try:
-            problem = self._problem(pair)
-            if problem:
-                return replace(row, problem=problem)
-            truth, windows, frames = self._frames(pair)
-            agreeing = sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None
-            queries = tuple(self._row_of(pair, one, frames) for one in windows)
-            return replace(row, truth=truth, agreeing=agreeing, queries=queries)
-        except Exception as error:
-            return replace(row, problem=said(error))
+        return _judged(row, lambda: self._answers(pair))
+
+    def _answers(self, pair: Pair) -> dict[str, Any]:
+        """Return what a row holds of the answers of a pair."""
+        problem = self._problem(pair)
+        if problem:
+            return {"problem": problem}
+        truth, windows, frames = self._frames(pair)
+        agreeing = sum(len(f.clues) for f in frames.values()) if truth == "agreement" else None
+        queries = tuple(self._row_of(pair, one, frames) for one in windows)
+        return {"truth": truth, "agreeing": agreeing, "queries": queries}
 
     def truths(self, pair: Pair) -> Iterator[tuple[TimeSpan, dict[str, SE2], bool]]:
         """Yield the windows of a pair whose place is known: the window, the base at its end in each session
@@ -437,10 +430,25 @@ class Judge:
     def _row_of(self, pair: Pair, one: LocatedWindow, frames: Frames) -> QueryRow:
         """Judge an answer by where the query is in the sessions of the map; where it is missed, with what
         `--check` says of its true pose."""
-        row, expected = _answered(one), _expected(one, frames)
-        if one.answer is not None and pair.kind == "elsewhere":
+        row = QueryRow(
+            window=one.window,
+            start_s=one.span.start_s,
+            problem=one.done.error,
+            cpu_s=one.done.cpu_s or None,
+        )
+        if one.answer is None:
+            return row
+        expected, space = _expected(one, frames), one.answer.get("in_space")
+        row = replace(
+            row,
+            status=one.answer["status"],
+            confidence=one.answer["confidence"],
+            travel_m=one.answer["query"]["path_m"],
+            in_space=None if space is None else space["status"],
+        )
+        if pair.kind == "elsewhere":
             return replace(row, right=False, covered=False)
-        if one.answer is None or not expected:
+        if not expected:
             return row
         row = replace(row, covered=self._covered(pair, one, expected), **_best(one.places, expected))
         return replace(row, fine=self._fine(pair, one, expected)) if row.missed else row
@@ -458,7 +466,7 @@ class Judge:
     ) -> float | None:
         """Return the probability of the true pose of a window by `check_pose`; None if that does not call it
         fine."""
-        query, folder, found = self._catalogue.recordings[pair.query], self._folder, []
+        query, folder, sure = self._catalogue.recordings[pair.query], self._folder, []
         config = config_of(query)
         for session, (T_map_base, _) in expected.items():
             with (
@@ -467,16 +475,17 @@ class Judge:
             ):
                 scans = follow(log.scans(one.span.start_s, one.span.duration_s), config)
                 checked = check_pose(scans, MapIndex.of(database, config), T_map_base, session=session)
-            found += [checked.probability] if checked.status == "fine" else []
-        return max(found, default=None)
+            if checked.status == "fine":
+                sure.append(checked.probability)
+        return max(sure, default=None)
 
     def followed_row(self, one: Followed) -> FollowedRow:
         """Return the row of a recording that was followed; where there is no result, one that says why."""
-        building = self._catalogue.recordings[one.map].building
+        building = self._catalogue.building(one.map)
         row = FollowedRow(before=one.before, after=one.after, map=one.map_name, building=building)
         done = kept_result(self._folder.kept("followed", one.asked))
-        if done is None or done.failed:
-            return replace(row, problem=problem_of(done))
+        if done.failed:
+            return replace(row, problem=done.error)
         if one.after is not None:
             begin_ns = done.document["put_down_ns"] - done.document["shift_ns"]
             row = replace(row, shown=self._shows(one, one.after, begin_ns) is True)
@@ -520,11 +529,10 @@ class Judge:
         drive = drive_of(self._catalogue.recordings[name], self._folder)
         alone = replace(one, before=name, after=None)
         if alone not in self._followed:
-            done = kept_result(self._folder.kept("followed", alone.asked))
-            looks = [] if done is None or done.failed else done.document["looks"]
+            found = kept_result(self._folder.kept("followed", alone.asked)).result or {"looks": []}
             clues = [
                 Clue(own[1], _pose(said), (name, number), said["confidence"])
-                for number, said in enumerate(looks)
+                for number, said in enumerate(found["looks"])
                 if said["pose"] is not None and (own := drive.own_pose(said["stamp_ns"])) is not None
             ]
             self._followed[alone] = agreed_frame(clues) if clues else None
@@ -533,39 +541,42 @@ class Judge:
 
     def join_row(self, target: str, source: str) -> JoinRow:
         """Return the row of two maps that were compared; where there is no result, one that says why."""
-        building, other = (self._catalogue.recordings[name].building for name in (target, source))
+        building, other = (self._catalogue.building(name) for name in (target, source))
         row = JoinRow(target=target, source=source, same=building == other)
         done = kept_result(self._folder.kept("joins", f"{source}.in.{target}"))
-        if done is None or done.failed:
-            return replace(row, problem=problem_of(done))
-        found, right, error_m = done.document, None if row.same else False, None
-        T, middle = (SE2(**found[name]) for name in ("T_target_source", "middle"))
-        try:
-            lie = self._lying(building) if row.same else nx.Graph()
-        except Exception as error:
-            return replace(row, problem=said(error))
-        if {target, source} <= {*lie} and nx.has_path(lie, source, target):
-            expected, within_m = middle, 0.0
-            for a, b in itertools.pairwise(nx.shortest_path(lie, source, target)):
-                expected, hop_m = lie.edges[a, b]["frames"][a].place(expected)
-                within_m += hop_m
-            right, error_m = is_right(T @ middle, expected, within_m)
-        told = {name: found[name] for name in ("status", "probability", "common_m2")}
-        return replace(row, **told, right=right, error_m=error_m, cpu_s=done.cpu_s)
+        if done.failed:
+            return replace(row, problem=done.error)
+        told = {name: done.document[name] for name in ("status", "probability", "common_m2")}
+        return _judged(row, lambda: {**told, **self._joined(row, done.document), "cpu_s": done.cpu_s})
 
-    def _lying(self, building: str) -> nx.Graph:
-        """Return which maps of a building are known to lie how in which: an edge holds a `Frame` by the name
-        of the map whose poses it places in the other one."""
+    def _joined(self, row: JoinRow, found: dict[str, Any]) -> dict[str, Any]:
+        """Return whether two maps lie to each other as was found, and how far off that is."""
+        if not row.same:
+            return {"right": False}
+        lie = self._lying(self._catalogue.building(row.target))
+        if not {row.target, row.source} <= {*lie} or not nx.has_path(lie, row.source, row.target):
+            return {}
+        T, middle = (SE2(**found[name]) for name in ("T_target_source", "middle"))
+        expected, within_m = middle, 0.0
+        for a, b in itertools.pairwise(nx.shortest_path(lie, row.source, row.target)):
+            expected, hop_m = lie.edges[a, b]["frame"].place(expected)
+            within_m += hop_m
+        right, error_m = is_right(T @ middle, expected, within_m)
+        return {"right": right, "error_m": error_m}
+
+    def _lying(self, building: str) -> nx.DiGraph:
+        """Return which maps of a building are known to lie how in which: an edge from a map to another one
+        has the `Frame` that places poses of the first in the second."""
         if building in self._lie:
             return self._lie[building]
-        lie = self._lie[building] = nx.Graph()
+        lie = self._lie[building] = nx.DiGraph()
         known = [r for r in self._catalogue.mapped if r.building == building and not r.disturbed]
         for query, map_ in itertools.permutations(known, 2):
             if lie.has_edge(query.name, map_.name) or query.sensor == "map":
                 continue
-            names, clues, within_m = (query.name, map_.name), [], []
-            pair = next((p for p in self._catalogue.pairs if (p.query, p.map_name) == names), None)
-            known_by = {} if pair is None or self._problem(pair) else self._frames(pair)[2]
+            clues, within_m = [], []
+            pair = self._asked(query.name, map_.name)
+            known_by = {} if pair is None else self._frames(pair)[2]
             for part in drive_of(query, self._folder).parts[:1]:
                 for k in _steps(part, AGREEMENT.place_m):
                     place = self._lies_at(query, map_, int(part.stamps_ns[k]), known_by)
@@ -573,12 +584,9 @@ class Judge:
                         clues.append(Clue(SE2.from_matrix(part.T_session_base[k]), place[0]))
                         within_m.append(place[1])
             if len(clues) >= 2:
-                back = [Clue(clue.T_map_base, clue.T_drive_base) for clue in clues]
-                frames = {
-                    name: Frame(tuple(of), min(within_m))
-                    for name, of in zip(names, (clues, back), strict=True)
-                }
-                lie.add_edge(*names, frames=frames)
+                back = tuple(Clue(clue.T_map_base, clue.T_drive_base) for clue in clues)
+                lie.add_edge(query.name, map_.name, frame=Frame(tuple(clues), min(within_m)))
+                lie.add_edge(map_.name, query.name, frame=Frame(back, min(within_m)))
         return lie
 
     def _lies_at(
@@ -598,9 +606,14 @@ class Judge:
         if gaps := self._folder.gaps(self._catalogue, pair):
             return f"{gaps[0]}: {MISSING}"
         done = kept_result(self._folder.kept("maps", pair.map_name))
-        if done is None:
-            return f"{pair.map_name}: {NOT_RUN}"
-        return f"no map: {done.error}" if done.failed else ""
+        return f"{pair.map_name if done.error == NOT_RUN else 'no map'}: {done.error}" if done.failed else ""
+
+    def _asked(self, query: str, map_: str, until_s: float | None = None) -> Pair | None:
+        """Return the pair of a recording that was located in the map of another one, or of the first
+        `until_s` of it; None if there is none."""
+        pairs = (p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == (query, map_, until_s))
+        pair = next(pairs, None)
+        return None if pair is None or self._problem(pair) else pair
 
     def _located_windows(self, pair: Pair) -> list[LocatedWindow]:
         """Return the windows of a pair with their answers."""
@@ -642,15 +655,9 @@ class Judge:
 
         Nothing where true poses place one of them, or where it was not asked.
         """
-        wanted = (pair.map, pair.query, pair.until_s)
-        back = next((p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == wanted), None)
+        back = self._asked(pair.map, pair.query)
         recordings = [self._catalogue.recordings[name] for name in (pair.query, pair.map)]
-        if (
-            pair.until_s is not None
-            or back is None
-            or any(r.poses for r in recordings)
-            or self._problem(back)
-        ):
+        if pair.until_s is not None or back is None or any(r.poses for r in recordings):
             return
         parts, names = (list(sessions(self._folder, r.name)) for r in recordings)
         for (number, session), clue in _said(self._located_windows(back)):
@@ -663,7 +670,7 @@ class Judge:
 
         None if there are not several.
         """
-        building = self._catalogue.recordings[pair.map].building
+        building = self._catalogue.building(pair.map)
         in_map = [p for p in self._catalogue.pairs if p.map_name == pair.map_name and p.kind != "elsewhere"]
         for root in self._catalogue.recordings.values():
             if root.building != building or len(in_map) < 2:
@@ -678,13 +685,11 @@ class Judge:
         there."""
         if pair.query == root:
             return self._located_windows(pair)
-        wanted = (pair.query, root, None)
-        link = next((p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == wanted), None)
-        if link is None or self._problem(link):
+        link = self._asked(pair.query, root)
+        frames = {} if link is None else _agreed(_said(self._located_windows(link)))
+        if (0, _SESSION) not in frames:
             return None
-        frame = _agreed(_said(self._located_windows(link))).get((0, _SESSION))
-        if frame is None:
-            return None
+        frame = frames[0, _SESSION]
         return [
             replace(one, where=(0, frame.place(one.where[1])[0]) if one.where and one.where[0] == 0 else None)
             for one in self._located_windows(pair)
@@ -694,14 +699,13 @@ class Judge:
         """Return how the sessions of the map lie in the world, or in the whole drive that they are a part of:
         by their own scans, one on each `_STEP_M`."""
         drive = drive_of(map_, self._folder)
-        clues: dict[tuple[int, str], list[Clue]] = {}
-        for session, trajectory in sessions(self._folder, pair.map_name).items():
-            for k in _steps(trajectory):
-                where = drive.where(int(trajectory.stamps_ns[k]))
-                if where is not None:
-                    clue = Clue(where[1], SE2.from_matrix(trajectory.T_session_base[k]))
-                    clues.setdefault((where[0], session), []).append(clue)
-        return {key: Frame(tuple(found)) for key, found in clues.items() if len(found) >= 2}
+        found = (
+            ((where[0], session), Clue(where[1], SE2.from_matrix(trajectory.T_session_base[k])))
+            for session, trajectory in sessions(self._folder, pair.map_name).items()
+            for k in _steps(trajectory)
+            if (where := drive.where(int(trajectory.stamps_ns[k]))) is not None
+        )
+        return _frames_by(found, lambda clues: Frame(tuple(clues)) if len(clues) >= 2 else None)
 
     def _placed(self, query: Recording, known: Placed) -> Frames:
         """Return the frame of the recording's first part in the map, by one pose."""
@@ -730,27 +734,18 @@ def _said(windows: Iterable[LocatedWindow]) -> Iterator[tuple[tuple[int, str], C
 
 def _agreed(said: Iterable[tuple[tuple[int, str], Clue]]) -> Frames:
     """Return how the parts of drives lie in the sessions of a map, by what answers agree on."""
+    return _frames_by(said, agreed_frame)
+
+
+def _frames_by(
+    said: Iterable[tuple[tuple[int, str], Clue]], frame_of: Callable[[list[Clue]], Frame | None]
+) -> Frames:
+    """Return the frames that follow from the clues of each part of a drive and session of a map."""
     groups: dict[tuple[int, str], list[Clue]] = {}
     for key, clue in said:
         groups.setdefault(key, []).append(clue)
-    found = ((key, agreed_frame(clues)) for key, clues in groups.items())
+    found = ((key, frame_of(clues)) for key, clues in groups.items())
     return {key: frame for key, frame in found if frame is not None}
-
-
-def _answered(one: LocatedWindow) -> QueryRow:
-    """Return what a row holds of an answer before it is judged."""
-    row = QueryRow(window=one.window, start_s=one.span.start_s, problem=problem_of(one.done))
-    row = row if one.done is None else replace(row, cpu_s=one.done.cpu_s)
-    if one.answer is None:
-        return row
-    space = one.answer.get("in_space")
-    return replace(
-        row,
-        status=one.answer["status"],
-        confidence=one.answer["confidence"],
-        travel_m=one.answer["query"]["path_m"],
-        in_space=None if space is None else space["status"],
-    )
 
 
 def _expected(one: LocatedWindow, frames: Frames) -> dict[str, tuple[SE2, float]]:
@@ -826,15 +821,13 @@ def followed_row(row: FollowedRow, looks: Sequence[Look]) -> FollowedRow:
     after = looks[len(before) :]
     knew = bool(before) and before[-1].state in ("located", "recovered", "off_map", "doubtful")
     if knew:  # until it is noticed, the old place is told
-        noticed = (k for k, look in enumerate(after) if look.state in NOTICED)
-        after = after[next(noticed, len(after)) :]
-    told = [look for look in (*before, *after) if look.tells]
-    rights = [look.right for look in told]
+        after = [*itertools.dropwhile(lambda look: look.state not in NOTICED, after)]
+    rights = [look.right for look in (*before, *after) if look.tells]
     row = replace(
         row,
         looks=len(looks),
-        located=len(told),
-        judged=len(told) - rights.count(None),
+        located=len(rights),
+        judged=len(rights) - rights.count(None),
         wrong=rights.count(False),
         alarms=sum(look.alarm for look in before),
         knew=knew,

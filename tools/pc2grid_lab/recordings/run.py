@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from fnmatch import fnmatch
+from functools import partial
 from itertools import chain, islice, permutations
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -114,8 +115,8 @@ class Folder:
 
     def cpu_s(self) -> float:
         """Return the processor time of all commands whose result is here."""
-        results = (kept_result(file) for kind in RESULTS for file in (self.work / kind).glob("*.json"))
-        return sum(done.cpu_s for done in results if done is not None)
+        files = (file for kind in RESULTS for file in (self.work / kind).glob("*.json"))
+        return sum(kept_result(file).cpu_s for file in files)
 
     def length_s(self, recording: Recording) -> float:
         """Return how long a recording lasts. Raises the errors of `open_log`."""
@@ -217,19 +218,17 @@ def _watched(catalogue: Catalogue, folder: Folder, one: Followed) -> Task:
     """Return the task that watches every scan of a row."""
 
     def do() -> Finished:
+        before = source = folder.source(catalogue.recordings[one.before])
         put_down_ns = shift_ns = None
-        source = folder.source(catalogue.recordings[one.before])
         made = folder.work / "carried" / f"{as_file_name(one.name)}.mcap"
         made.parent.mkdir(parents=True, exist_ok=True)
         if one.until_s is not None:
             source = made
-            write_part(McapPart(folder.source(catalogue.recordings[one.before]), begin_s=one.until_s), source)
+            write_part(before, one.until_s, made)
         elif one.after is not None:
-            source = made
-            before, after = (folder.source(catalogue.recordings[name]) for name in (one.before, one.after))
+            source, after = made, folder.source(catalogue.recordings[one.after])
             half_s = 0.5 * folder.length_s(catalogue.recordings[one.before]) if before == after else None
-            parts = McapPart(before, begin_s=half_s or 0.0), McapPart(after, end_s=half_s)
-            put_down_ns, shift_ns = write_joined(*parts, source)
+            put_down_ns, shift_ns = write_joined(before, after, made, half_s)
         done = pc2grid("-q", "watch", source, "-d", folder.map(one.map_name), "--json")
         looks = done.document if isinstance(done.document, list) else [done.document]
         document = {"looks": looks, "put_down_ns": put_down_ns, "shift_ns": shift_ns}
@@ -311,29 +310,19 @@ def _questions(catalogue: Catalogue, folder: Folder, pair: Pair) -> list[Task]:
         return []
     asked: tuple[str | Path, ...] = (folder.source(query), "-d", folder.map(pair.map_name), *query.options)
 
-    def locate(window: TimeSpan) -> Task:
+    tasks = []
+    for _, window in windows:
         span = ("--start", f"{window.start_s:.3f}", "--duration", f"{window.duration_s:g}", "--json")
-        return Task(folder.answer(pair, window), lambda: pc2grid("-q", "relocalize", *asked, *span))
-
-    return [locate(window) for _, window in windows]
+        tasks.append(Task(folder.answer(pair, window), partial(pc2grid, "-q", "relocalize", *asked, *span)))
+    return tasks
 
 
 def _convert(folder: Folder, name: str, recording: Recording, until_s: float | None) -> Task:
     database, source = folder.map(name), folder.source(recording)
     part = () if until_s is None else ("--duration", f"{until_s:g}")
-    options: tuple[str | Path, ...] = (
-        *recording.options,
-        "--name",
-        "map",
-        "--json",
-        "--force",
-        "-o",
-        database,
-        *part,
-    )
+    options = (*recording.options, "--name", "map", "--json", "--force", "-o", database, *part)
 
     def do() -> Finished:
-        database.parent.mkdir(parents=True, exist_ok=True)
         database.unlink(missing_ok=True)
         return pc2grid("-q", "convert", source, *options)
 
@@ -366,8 +355,14 @@ def print_join() -> None:
         maps = [MapIndex.of_session(one, one.sessions()[0].name) for one in (target, source)]
         found = join_maps(*map(JoinableMap, maps))
     middle = SE2(*np.mean([link.center_m for link in found.links] or [(0.0, 0.0)], axis=0).tolist())
-    names = ("status", "probability", "T_target_source", "common_m2")
-    print(json.dumps(plain({**{name: getattr(found, name) for name in names}, "middle": middle})))
+    told = {
+        "status": found.status,
+        "probability": found.probability,
+        "T_target_source": found.T_target_source,
+        "common_m2": found.common_m2,
+        "middle": middle,
+    }
+    print(json.dumps(plain(told)))
 
 
 _SCANS = ("PointCloud2", "PointCloud", "LaserScan", "Image", "CompressedImage")
@@ -457,54 +452,50 @@ _TYPES = get_typestore(Stores.ROS2_HUMBLE)
 _STATIC = "/tf_static"
 
 
-@dataclass(frozen=True, slots=True)
-class McapPart:
-    """A part of an MCAP. begin_s, end_s : seconds after its first scan; end_s None: to its last scan."""
+def write_part(source: Path, begin_s: float, target: Path) -> None:
+    """Write the MCAP file `target`: scans and odometry of a recording from `begin_s` on, and its
+    static transforms.
 
-    path: Path
-    begin_s: float = 0.0
-    end_s: float | None = None
-
-
-def write_part(part: McapPart, target: Path) -> None:
-    """Write the MCAP file `target`: scans and odometry of a part of a recording, and static transforms.
-
-    Raises OSError, and the errors of `mcap` and `rosbags`.
+    begin_s : seconds after its first scan. Raises OSError, and the errors of `mcap` and `rosbags`.
     """
-    messages = _messages(part)
-    write_messages(target, chain(_static(part, messages[0].log_time_ns), messages))
+    messages = _messages(source, begin_s)
+    write_messages(target, chain(_static(source, messages[0].log_time_ns), messages))
 
 
-def write_joined(before: McapPart, after: McapPart, target: Path) -> tuple[int, int]:
+def write_joined(before: Path, after: Path, target: Path, half_s: float | None = None) -> tuple[int, int]:
     """Write the MCAP file `target`: the scans and odometry of `before`, then those of `after`.
 
-    Moving transforms are left out, as they may hold the odometry; static ones are those of `before`.
+    half_s : only what comes after that in `before`, and what comes before it in `after`. Moving transforms
+    are left out, as they may hold the odometry; static ones are those of `before`.
     Returns, in nanoseconds of the recording, the first scan after the robot was carried, and by how much the
     stamps of the second part are later than in its own recording.
     Raises OSError, and the errors of `mcap` and `rosbags`.
     """
-    first, second = _messages(before), _messages(after)
+    first, second = _messages(before, half_s or 0.0), _messages(after, end_s=half_s)
     shift_ns = first[-1].log_time_ns + _CARRIED_NS - second[0].log_time_ns
-    last, next_ = (next((m for m in some if _is_odometry(m)), None) for some in (first[::-1], second))
+    last, next_ = (next(filter(_is_odometry, some), None) for some in (first[::-1], second))
     T = None if last is None or next_ is None else _pose_of(last) @ _pose_of(next_).inverse()
     moved = (_moved(message, shift_ns, T) for message in second)
     write_messages(target, chain(_static(before, first[0].log_time_ns), first, moved))
     return second[0].log_time_ns + shift_ns, shift_ns
 
 
-def _static(part: McapPart, time_ns: int) -> Iterator[Stored]:
+def _static(source: Path, time_ns: int) -> Iterator[Stored]:
     """Yield the static transforms of a recording, as if stored at a time."""
-    for message in stored_messages(part.path):
+    for message in stored_messages(source):
         if message.channel.topic == _STATIC:
             yield message._replace(log_time_ns=time_ns)
 
 
-def _messages(part: McapPart) -> list[Stored]:
-    """Return scans and odometry of a part, from its first scan to its last one."""
-    found = [m for m in stored_messages(part.path) if m.schema.name.endswith(("/LaserScan", "/Odometry"))]
+def _messages(source: Path, begin_s: float = 0.0, end_s: float | None = None) -> list[Stored]:
+    """Return scans and odometry of a part of a recording, from its first scan to its last one.
+
+    begin_s, end_s : seconds after the first scan of the recording; end_s None: to its last scan.
+    """
+    found = [m for m in stored_messages(source) if m.schema.name.endswith(("/LaserScan", "/Odometry"))]
     scans_ns = [m.log_time_ns for m in found if not _is_odometry(m)]
-    begin_ns = scans_ns[0] + round(part.begin_s * 1e9)
-    end_ns = scans_ns[-1] if part.end_s is None else scans_ns[0] + round(part.end_s * 1e9)
+    begin_ns = scans_ns[0] + round(begin_s * 1e9)
+    end_ns = scans_ns[-1] if end_s is None else scans_ns[0] + round(end_s * 1e9)
     wanted_ns = [time_ns for time_ns in scans_ns if begin_ns <= time_ns <= end_ns]
     return [m for m in found if wanted_ns[0] <= m.log_time_ns <= wanted_ns[-1]]
 

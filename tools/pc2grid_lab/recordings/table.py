@@ -17,13 +17,13 @@ from typing import Any, Literal
 
 from pydantic import TypeAdapter
 
+from pc2grid.display import counted
 from pc2grid_cli import output
-from pc2grid_lab.pages import ALPHA, by_chance, markdown, number, share, strong
+from pc2grid_lab.pages import ALPHA, Heads, by_chance, markdown, number, share, strong
 from pc2grid_lab.recordings.catalogue import FOREIGN_MAPS, PAIR_KINDS
+from pc2grid_lab.runner import NOT_RUN
 
 MISSING = "not in the data folder"
-NOT_RUN = "was not run"
-"""The problem of a row whose commands were not run, because the run ended early."""
 FINE = 0.9
 """A missed window whose true pose is at least so probable by `--check` is missed by the search, not by the
 walls; by hand."""
@@ -102,6 +102,13 @@ class QueryRow:
         return self.status == "located"
 
     @property
+    def outcome(self) -> str:
+        """Return what became of it, in a word."""
+        if self.problem:
+            return "failed"
+        return judged(self.right) if self.located else "refused"
+
+    @property
     def missed(self) -> bool:
         """Return whether it is covered, and the answer is not its place."""
         return self.covered is True and not (self.located and self.right)
@@ -112,45 +119,26 @@ class QueryRow:
         return self.missed and (self.fine or 0.0) >= FINE
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Counts:
-    """The queries of a row, or of several.
+def judged(right: bool | None) -> str:
+    """Return whether what was found is right, in words."""
+    return "not judged" if right is None else "right" if right else "wrong"
 
-    right, wrong : located and right, located and wrong, of those whose answer can be judged; unjudged :
-        located, of the others. refused : not located. covered : judged, and in the map; covered_right : of
-        those, located and right. overlooked : missed by the search alone, see `FINE`.
+
+def counts_of(queries: Iterable[QueryRow]) -> Counter[str]:
+    """Return how many queries have each outcome, and how many are of a kind.
+
+    queries : all. located : right, wrong, or not judged. covered : judged, and in the map; covered right : of
+    those, located and right. overlooked : missed by the search alone, see `FINE`.
     """
-
-    queries: int
-    covered: int
-    located: int
-    right: int
-    covered_right: int
-    overlooked: int
-    wrong: int
-    unjudged: int
-    failed: int
-
-    @staticmethod
-    def of(queries: Sequence[QueryRow]) -> Counts:
-        """Return the counts of queries."""
-        located = [q for q in queries if q.located]
-        return Counts(
-            queries=len(queries),
-            covered=sum(q.covered is True for q in queries),
-            located=len(located),
-            right=sum(q.right is True for q in located),
-            covered_right=sum(q.right is True and q.covered is True for q in located),
-            overlooked=sum(q.overlooked for q in queries),
-            wrong=sum(q.right is False for q in located),
-            unjudged=sum(q.right is None for q in located),
-            failed=sum(bool(q.problem) for q in queries),
-        )
-
-    @property
-    def refused(self) -> int:
-        """Return the number of queries that are not located."""
-        return self.queries - self.located - self.failed
+    counts: Counter[str] = Counter()
+    for query in queries:
+        counts[query.outcome] += 1
+        counts["queries"] += 1
+        counts["located"] += query.located
+        counts["covered"] += query.covered is True
+        counts["covered right"] += query.covered is True and query.outcome == "right"
+        counts["overlooked"] += query.overlooked
+    return counts
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -177,20 +165,9 @@ class PairRow:
         return f"{self.query} in {self.map}"
 
     @property
-    def counts(self) -> Counts:
+    def counts(self) -> Counter[str]:
         """Return the counts of its queries."""
-        return Counts.of(self.queries)
-
-    @property
-    def median_error_m(self) -> float | None:
-        """Return the median error of the answers that are located and right."""
-        errors = [q.error_m for q in self.queries if q.located and q.right and q.error_m is not None]
-        return median(errors) if errors else None
-
-    @property
-    def ranks(self) -> list[int | None]:
-        """Return the ranks of the right place, of the covered queries that are not located."""
-        return [q.rank for q in self.queries if not q.located and not q.problem and q.covered]
+        return counts_of(self.queries)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -226,11 +203,6 @@ class FollowedRow:
     located_s: float | None = None
     located_m: float | None = None
 
-    @property
-    def name(self) -> str:
-        """Return the name of the row."""
-        return f"{self.before}{'' if self.after is None else f', {self.after}'} followed in {self.map}"
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class JoinRow:
@@ -256,7 +228,7 @@ class JoinRow:
         """Return what became of them, in a word."""
         if self.problem or self.status != "joined":
             return "failed" if self.problem else "not joined"
-        return "not judged" if self.right is None else "right" if self.right else "wrong"
+        return judged(self.right)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -275,9 +247,10 @@ class Table:
     def to_text(self) -> str:
         """Return the table as a JSON text with a line for each row, so that versions can be compared; numbers
         are rounded to what the page could show."""
-        text = json.dumps({"schema_version": 1, **asdict(self)})
         document: dict[str, Any] = json.loads(
-            text, parse_float=lambda digits: round(float(digits), 4), parse_constant=lambda _: None
+            json.dumps({"schema_version": 1, **asdict(self)}),
+            parse_float=lambda digits: round(float(digits), 4),
+            parse_constant=lambda _: None,
         )
         rows = {name: document.pop(name) for name in ("maps", "pairs", "followed", "joins")}
         head = json.dumps(document)[1:-1]
@@ -475,37 +448,30 @@ def _places(table: Table) -> list[str]:
 def _pair_cells(row: PairRow) -> list[str]:
     if row.problem:
         return [row.query, row.map, row.sensors, *[""] * 13, row.problem]
-    counts = row.counts
-    judged = {
-        "poses": "poses",
-        "elsewhere": "elsewhere",
-        "clouds": "clouds",
-        "agreement": f"{row.agreeing} answers",
-        "trajectory": "trajectory",
-        "hand": "hand",
-        None: "not judged",
-    }[row.truth]
-    failed = f" ({counts.failed} failed)" if counts.failed else ""
-    known = row.truth is not None
+    counts, known = row.counts, row.truth is not None
+    failed = f" ({counts['failed']} failed)" if counts["failed"] else ""
+    errors_m = [q.error_m for q in row.queries if q.outcome == "right" and q.error_m is not None]
+    # Of the right place, of the covered queries that are not located.
+    ranks = [q.rank for q in row.queries if q.outcome == "refused" and q.covered]
     seconds = [q.cpu_s for q in row.queries if q.cpu_s is not None]
     return [
         row.query,
         row.map,
         row.sensors,
-        f"{counts.queries}{failed}",
-        str(counts.covered) if known else "",
-        str(counts.located),
-        str(counts.right) if known else "",
-        strong(counts.wrong) if known else "",
-        str(counts.unjudged),
-        str(counts.refused),
-        share(counts.covered_right, counts.covered),
-        strong(counts.overlooked) if known else "",
-        " ".join("-" if rank is None else str(rank) for rank in row.ranks),
-        number(row.median_error_m, 3),
+        f"{counts['queries']}{failed}",
+        str(counts["covered"]) if known else "",
+        str(counts["located"]),
+        str(counts["right"]) if known else "",
+        strong(counts["wrong"]) if known else "",
+        str(counts["not judged"]),
+        str(counts["refused"]),
+        share(counts["covered right"], counts["covered"]),
+        strong(counts["overlooked"]) if known else "",
+        " ".join("-" if rank is None else str(rank) for rank in ranks),
+        number(median(errors_m) if errors_m else None, 3),
         _in_space(row),
         number(sorted(seconds)[len(seconds) // 2] if seconds else None, 1),
-        judged,
+        f"{row.agreeing} answers" if row.truth == "agreement" else row.truth or "not judged",
     ]
 
 
@@ -561,12 +527,12 @@ def _sensor_cell(rows: Sequence[PairRow]) -> str:
     if not rows:
         return "-"
     counts, buildings = _total(rows), len({row.building for row in rows})
-    judged = f"{counts.covered_right} of {counts.covered}, {counts.wrong} wrong"
+    said = f"{counts['covered right']} of {counts['covered']}, {counts['wrong']} wrong"
     if all(row.truth is None for row in rows):
-        judged = f"{counts.located} of {counts.queries} located, not judged"
-    elif counts.unjudged:
-        judged += f", {counts.unjudged} not judged"
-    return f"{judged} ({buildings} building{'s' if buildings > 1 else ''})"
+        said = f"{counts['located']} of {counts['queries']} located, not judged"
+    elif counts["not judged"]:
+        said += f", {counts['not judged']} not judged"
+    return f"{said} ({counted(buildings, 'building')})"
 
 
 def _by_building(table: Table) -> list[str]:
@@ -592,9 +558,8 @@ def _by_building(table: Table) -> list[str]:
         for building in dict.fromkeys(row.building for row in table.pairs)
     ]
     cells.append(_building_cells("all queries", inside, outside))
-    judged = inside + outside
-    buildings = sorted({row.building for row in judged})
-    wrong = [building for building in buildings if _total(_of(building, judged)).wrong]
+    buildings = sorted({row.building for row in inside + outside})
+    wrong = [building for building in buildings if _total(_of(building, inside + outside))["wrong"]]
     first = [query.rank == 0 for row in inside for query in row.queries if query.overlooked]
     return [
         *markdown(heads, cells),
@@ -616,13 +581,13 @@ def _building_cells(name: str, inside: Sequence[PairRow], outside: Sequence[Pair
     return [
         name,
         str(len({row.query for row in inside})),
-        str(counts.queries),
-        str(counts.covered),
-        share(counts.covered_right, counts.covered),
-        strong(counts.overlooked),
-        share(counts.wrong, counts.right + counts.wrong),
-        str(counts.unjudged),
-        share(other.wrong, other.queries),
+        str(counts["queries"]),
+        str(counts["covered"]),
+        share(counts["covered right"], counts["covered"]),
+        strong(counts["overlooked"]),
+        share(counts["wrong"], counts["right"] + counts["wrong"]),
+        str(counts["not judged"]),
+        share(other["wrong"], other["queries"]),
     ]
 
 
@@ -663,23 +628,23 @@ _CARRIED = (
 
 def _followed(table: Table) -> list[str]:
     """Return the recordings that were followed, and those that were followed as one robot that is carried."""
-    drives, carried = _drives(table), _carried(table)
+    drives, carried = _drives_and_carried(table)
     page = []
     if drives:
-        shown = markdown(_DRIVES, [_drive_cells(row) for row in drives])
-        page += ["## Along drives", "", *shown, "", *wrap(_about_drives(drives), 105), ""]
+        page += _section("Along drives", _DRIVES, map(_followed_cells, drives), _about_drives(drives))
     if carried:
-        shown = markdown(_CARRIED, [_carried_cells(row) for row in carried])
-        page += ["## Carried away", "", *shown, "", *wrap(_about_carried(carried), 105), ""]
+        page += _section("Carried away", _CARRIED, map(_followed_cells, carried), _about_carried(carried))
     return page
 
 
-def _drives(table: Table) -> list[FollowedRow]:
-    return [row for row in table.followed if row.after is None]
+def _drives_and_carried(table: Table) -> tuple[list[FollowedRow], list[FollowedRow]]:
+    drives = [row for row in table.followed if row.after is None]
+    return drives, [row for row in table.followed if row.after is not None]
 
 
-def _carried(table: Table) -> list[FollowedRow]:
-    return [row for row in table.followed if row.after is not None]
+def _section(title: str, heads: Heads, cells: Iterable[list[str]], about: str) -> list[str]:
+    """Return a table of the page with what is said of it."""
+    return [f"## {title}", "", *markdown(heads, list(cells)), "", *wrap(about, 105), ""]
 
 
 def _about_drives(rows: Sequence[FollowedRow]) -> str:
@@ -737,14 +702,7 @@ def _joined(table: Table) -> list[str]:
         f"{count['not joined']} are not joined. Of {len(others)} pairs of two buildings {len(wrong)} are "
         "joined; each would be wrong. right: as answers are, in the middle of what agrees."
     )
-    return [
-        "## Joined",
-        "",
-        *markdown(_JOINS, [_join_cells(row) for row in (*same, *wrong)]),
-        "",
-        *wrap(about, 105),
-        "",
-    ]
+    return _section("Joined", _JOINS, map(_join_cells, (*same, *wrong)), about)
 
 
 def _join_cells(row: JoinRow) -> list[str]:
@@ -773,26 +731,18 @@ def _middle(name: str, rows: Sequence[FollowedRow]) -> str:
     return f"{middle:.1f}" if math.isfinite(middle) else "no"
 
 
-def _drive_cells(row: FollowedRow) -> list[str]:
-    if row.problem:
-        return [row.map, row.before, *[""] * 7, row.problem]
-    times = (number(value, 1) for value in (row.located_s, row.located_m))
-    return [row.map, row.before, *times, str(row.looks), *_told(row), ""]
-
-
-def _carried_cells(row: FollowedRow) -> list[str]:
-    names = [row.map, row.before, row.after or ""]
-    if row.problem:
-        return [*names, *[""] * 8, row.problem]
-    times = (row.noticed_s, row.noticed_m, row.located_s, row.located_m)
-    note = "" if row.knew else "was not located before"
-    if row.knew and not row.shown:
-        note = "the map does not show where it was put down"
-    return [*names, *(number(value, 1) for value in times), *_told(row), note]
-
-
-def _told(row: FollowedRow) -> list[str]:
-    return [str(row.located), str(row.judged), strong(row.wrong), strong(row.alarms)]
+def _followed_cells(row: FollowedRow) -> list[str]:
+    names, note = [row.map, row.before], ""
+    cells = [number(row.located_s, 1), number(row.located_m, 1)]
+    if row.after is None:
+        cells.append(str(row.looks))
+    else:
+        names.append(row.after)
+        cells = [number(row.noticed_s, 1), number(row.noticed_m, 1), *cells]
+        note = "" if row.shown else "the map does not show where it was put down"
+        note = note if row.knew else "was not located before"
+    cells += [str(row.located), str(row.judged), strong(row.wrong), strong(row.alarms)]
+    return [*names, *[""] * len(cells), row.problem] if row.problem else [*names, *cells, note]
 
 
 def _failures(table: Table) -> list[str]:
@@ -816,7 +766,8 @@ def _failures(table: Table) -> list[str]:
         if query.problem not in ("", NOT_RUN)
     ]
     counts = _total(table.pairs)
-    none = f"Of {counts.located} located answers none is known to be wrong; {counts.unjudged} are not judged."
+    located, not_judged = counts["located"], counts["not judged"]
+    none = f"Of {located} located answers none is known to be wrong; {not_judged} are not judged."
     found = ["## Wrong answers", "", *wrong, ""] if wrong else [none, ""]
     for title, lines in (("Not judged", unjudged), ("Failed", problems)):
         found += [f"## {title}", "", *lines, ""] if lines else []
@@ -829,12 +780,12 @@ _HIDDEN = {"building", "over KISS-ICP", "bare KISS-ICP", "right of covered", "ov
 
 def show(table: Table) -> None:
     """Print the rows on a terminal, and which answers are wrong."""
-    tables = []
+    tables, (drives, carried) = [], _drives_and_carried(table)
     for title, heads, cells in (
         ("Maps", _MAPS, [_map_cells(row) for row in table.maps]),
         ("Places", _PLACES, [_pair_cells(row) for row in table.pairs]),
-        ("Along drives", _DRIVES, [_drive_cells(row) for row in _drives(table)]),
-        ("Carried away", _CARRIED, [_carried_cells(row) for row in _carried(table)]),
+        ("Along drives", _DRIVES, [_followed_cells(row) for row in drives]),
+        ("Carried away", _CARRIED, [_followed_cells(row) for row in carried]),
         ("Joined", _JOINS, [_join_cells(row) for row in table.joins]),
     ):
         names = [name for side in heads for name in side]
@@ -858,8 +809,8 @@ def change_lines(changed: Sequence[RowChange]) -> list[str]:
     return [f"- {'**worse** ' if change.worse else ''}{change.row}: {change.text}" for change in changed]
 
 
-def _total(rows: Iterable[PairRow]) -> Counts:
-    return Counts.of([query for row in rows for query in row.queries])
+def _total(rows: Iterable[PairRow]) -> Counter[str]:
+    return counts_of(query for row in rows for query in row.queries)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -986,22 +937,22 @@ def _pair_changes(
 ) -> Iterator[RowChange]:
     if old_problem != new_problem:
         yield _problem(name, old_problem, new_problem, "asked")
-    before, after = (Counter(_outcome(pair[k]) for pair in windows) for k in (0, 1))
+    before, after = (Counter(pair[k].outcome for pair in windows) for k in (0, 1))
     for what in ("right", "wrong", "refused", "not judged", "failed"):
         if before[what] != after[what]:
             text = f"{what} {before[what]} -> {after[what]} of {len(windows)}"
             yield RowChange(row=name, text=text, worse=what == "failed" and after[what] > before[what])
     for old, new in windows:
-        if _outcome(new) == "wrong" != _outcome(old):
+        if new.outcome == "wrong" != old.outcome:
             sure = f" at {new.confidence:.3f}" if new.confidence is not None else ""
             off = f", {new.error_m:.2f} m off" if new.error_m is not None else ""
-            text = f"newly wrong: the window from {old.start_s:.1f} s{off}{sure} ({_outcome(old)} before)"
+            text = f"newly wrong: the window from {old.start_s:.1f} s{off}{sure} ({old.outcome} before)"
             yield RowChange(row=name, text=text, worse=True)
 
 
 def _worse(name: str, windows: Sequence[tuple[QueryRow, QueryRow]]) -> Iterator[RowChange]:
     """Yield how many are located and right now and were not, or no longer; worse by a sign test."""
-    counts = Counter((_outcome(a) == "right", _outcome(b) == "right") for a, b in windows)
+    counts = Counter((a.outcome == "right", b.outcome == "right") for a, b in windows)
     lost, won = counts[True, False], counts[False, True]
     if lost == won:
         return
@@ -1009,11 +960,3 @@ def _worse(name: str, windows: Sequence[tuple[QueryRow, QueryRow]]) -> Iterator[
     text = f"{won} windows more are located and right, {lost} are no longer (p {chance:.3f})"
     if chance < ALPHA or name == "all queries":
         yield RowChange(row=name, text=text, worse=lost > won and chance < ALPHA)
-
-
-def _outcome(query: QueryRow) -> str:
-    if query.problem:
-        return "failed"
-    if not query.located:
-        return "refused"
-    return "not judged" if query.right is None else "right" if query.right else "wrong"
