@@ -257,8 +257,8 @@ def _present(database: str, jobs: Sequence[Job], *, add: bool) -> dict[str, Prov
     except DatabaseError:
         if add:
             raise
-        where = maintenance.shown(database)
-        raise OutputError(f"{where}: exists already", hint="--force replaces it") from None
+        text = f"{maintenance.shown(database)}: exists already"
+        raise OutputError(text, hint="--force replaces it") from None
 
 
 def _refuse_others(

@@ -71,7 +71,6 @@ def describe_map(path: Path, assignments: list[str] | None = None) -> dict[str, 
     drawn = load_drawn_map(path, options.Settings(assignments=assignments).settings())
     grid, R = drawn.grid, drawn.T_map_file[:3, :3]
     height, width = grid.cells.shape
-    cell_m2 = grid.resolution_m**2
     return {
         "path": str(path),
         "format": drawn.kind,
@@ -80,7 +79,7 @@ def describe_map(path: Path, assignments: list[str] | None = None) -> dict[str, 
         "resolution_m": grid.resolution_m,
         "origin_m": list(grid.origin_m),
         "free_m2": round(grid.free_m2, 2),
-        "occupied_m2": round(float(np.count_nonzero(grid.occupied)) * cell_m2, 2),
+        "occupied_m2": round(float(np.count_nonzero(grid.occupied)) * grid.resolution_m**2, 2),
         "voxels": len(drawn.level_points_m),
         "floor_z_m": round(_floor_z_m(drawn), 3),
         "tilt_deg": round(math.degrees(math.acos(min(1.0, float(R[2, 2])))), 2),

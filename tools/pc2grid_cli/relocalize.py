@@ -36,7 +36,7 @@ from signature.config import Config
 from signature.database import SubmapDatabase
 from signature.database.maintenance import is_database
 from signature.database.protocol import BuildingFrame
-from signature.localization.answer import AmbiguousLine, Answer, answer_in_building, pose_text
+from signature.localization.answer import Answer, answer_in_building, pose_text
 from signature.places.map_index import MapIndex
 from signature.session.quality import PROMISED_M
 from signature.sessions import find, query_config
@@ -210,8 +210,10 @@ class Said:
         stated = answer_in_building(found, self.frames)
         located = in_map(found.poses, found)
         # Printed first: a file that cannot be written must not cost the answer.
-        text = as_text(stated, is_map=found.drawn is not None)
-        text += _about_map(map_sigma_m(found, self.database))
+        text, sigma_m = as_text(stated, is_map=found.drawn is not None), map_sigma_m(found, self.database)
+        if sigma_m is not None and sigma_m > PROMISED_M:
+            off = f"the map itself may be off by {sigma_m:.1f} m here (standard deviation)"
+            text += f"\n  {off}, see `pc2grid db info`"
         console.print_result(self._document(found, stated) if self.given.json else text)
         outputs = self._fillable(located=located is not None)
         if "csv" in outputs:
@@ -344,15 +346,6 @@ def map_sigma_m(answer: Answer, database: SubmapDatabase) -> float | None:
     return info.precision.at(int(trajectory.stamps_ns[nearest]))
 
 
-def _about_map(sigma_m: float | None) -> str:
-    """Return a line about the map where it is not known well enough to rely on; else nothing."""
-    if sigma_m is None or sigma_m <= PROMISED_M:
-        return ""
-    return (
-        f"\n  the map itself may be off by {sigma_m:.1f} m here (standard deviation), see `pc2grid db info`"
-    )
-
-
 def _warn_of_prior(answer: Answer) -> None:
     """Warn of what the known pose had to do with the answer, if that is not what the user expects."""
     if answer.prior == "lapsed":
@@ -420,18 +413,14 @@ def as_text(answer: Answer, *, is_map: bool = False) -> str:
     for h in answer.hypotheses[:5]:
         pose = h.T_map_query @ answer.T_odom_base
         lines.append(f"  {_named(answer, h)}: x {pose.x:.2f} m, y {pose.y:.2f} m, score {h.score:.2f}")
-    if answer.line is not None:
-        lines.append(_on_line(answer.line))
+    line = answer.line
+    if line is not None:
+        lines.append(
+            f"  on one line of {line.length_m:.1f} m with probability {probability(line.probability)}:"
+            f" from x {line.begin.x:.1f} m, y {line.begin.y:.1f} m to x {line.end.x:.1f} m,"
+            f" y {line.end.y:.1f} m, yaw {math.degrees(line.yaw_rad):.0f} deg"
+        )
     return "\n".join(lines) + _in_space(answer)
-
-
-def _on_line(line: AmbiguousLine) -> str:
-    """Return what is known of a base that is somewhere on a line."""
-    return (
-        f"  on one line of {line.length_m:.1f} m with probability {probability(line.probability)}:"
-        f" from x {line.begin.x:.1f} m, y {line.begin.y:.1f} m to x {line.end.x:.1f} m, y {line.end.y:.1f} m,"
-        f" yaw {math.degrees(line.yaw_rad):.0f} deg"
-    )
 
 
 def _in_space(answer: Answer) -> str:

@@ -44,16 +44,8 @@ ResultT = TypeVar("ResultT")
 def run(given: options.Watch, terminal: console.Console) -> int | None:
     """Follow a robot or a recording, and print what is found. Return the exit code."""
     libraries.require(libraries.of_addresses(given.source, given.database))
-    settings = given.settings()
-    prior, check_topic = known_pose.region(given), given.check_topic
-    if given.first and (given.publish == "tf" or check_topic is not None):
-        goes_on = "--publish tf" if given.publish == "tf" else "--check-topic"
-        raise ConfigError(f"--first: {goes_on} goes on until it is stopped", hint="leave --first out")
-    if given.publish != "none" or given.publish_map:
-        if check_topic is not None:
-            raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
-        if not is_robot(given.source):
-            raise ConfigError(f"--publish: {given.source} takes no messages", hint="ws://ROBOT:8765 does")
+    settings, prior, check_topic = given.settings(), known_pose.region(given), given.check_topic
+    _check_options(given)
     end_s = math.inf if given.timeout is None else time.monotonic() + given.timeout
     as_robot = given.real_time or is_robot(given.source)
     with (
@@ -68,6 +60,18 @@ def run(given: options.Watch, terminal: console.Console) -> int | None:
             good = _search(following, prior and replace(prior, stamp_ns=0))
         _summarize(drive, terminal)
     return None if good else console.UNSURE
+
+
+def _check_options(given: options.Watch) -> None:
+    """Raise ConfigError for options that do not go together."""
+    if given.first and (given.publish == "tf" or given.check_topic is not None):
+        goes_on = "--publish tf" if given.publish == "tf" else "--check-topic"
+        raise ConfigError(f"--first: {goes_on} goes on until it is stopped", hint="leave --first out")
+    if given.publish != "none" or given.publish_map:
+        if given.check_topic is not None:
+            raise ConfigError("--check-topic and --publish do not go together", hint="run `watch` twice")
+        if not is_robot(given.source):
+            raise ConfigError(f"--publish: {given.source} takes no messages", hint="ws://ROBOT:8765 does")
 
 
 @dataclass(frozen=True)
