@@ -216,8 +216,8 @@ def main(
     fitted, without = fitted_to(queries), left_out(queries, fitted_to)
     print_judged(queries, "in use", (q.masses(in_use) for q in queries))
     print_judged(queries, "fitted", (q.masses(fitted) for q in queries))
-    judged = (q.masses(x) for q, x in zip(queries, without, strict=True))
-    print_judged(queries, "fitted without the building", judged)
+    pairs = zip(queries, without, strict=True)
+    print_judged(queries, "fitted without the building", (q.masses(x) for q, x in pairs))
     names = "on, through, before, left:" if in_space else "bias, fit, lead:"
     print(names, *(f"{value:.2f}" for value in fitted))
 

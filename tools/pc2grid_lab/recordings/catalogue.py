@@ -469,22 +469,20 @@ class Catalogue:
 
     @staticmethod
     def of(
-        recordings: Sequence[Recording] | None = None,
-        pairs: Sequence[Pair] | None = None,
+        recordings: Sequence[Recording] = RECORDINGS,
+        pairs: Sequence[Pair] = PAIRS,
         *,
         only: str | None = None,
         quick: bool = False,
     ) -> Catalogue:
         """Return what the quick form holds, or all; of it what `only` names.
 
-        recordings, pairs : of which; None: those of this file. only : a pattern of the shell for names of
-            recordings, buildings or kinds of pairs.
+        recordings, pairs : of which. only : a pattern of the shell for names of recordings, buildings or
+            kinds of pairs.
         """
-        recordings = RECORDINGS if recordings is None else recordings
-        pairs = PAIRS if pairs is None else pairs
 
         def wanted(*names: str) -> bool:
-            return only is None or any(fnmatch(name, only) for name in names)
+            return any(fnmatch(name, only or "*") for name in names)
 
         known = {recording.name: recording for recording in recordings}
         return Catalogue(

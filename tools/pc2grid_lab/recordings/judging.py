@@ -608,10 +608,9 @@ class Judge:
         done = kept_result(self._folder.kept("maps", pair.map_name))
         return f"{pair.map_name if done.error == NOT_RUN else 'no map'}: {done.error}" if done.failed else ""
 
-    def _asked(self, query: str, map_: str, until_s: float | None = None) -> Pair | None:
-        """Return the pair of a recording that was located in the map of another one, or of the first
-        `until_s` of it; None if there is none."""
-        pairs = (p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == (query, map_, until_s))
+    def _asked(self, query: str, map_: str) -> Pair | None:
+        """Return the pair of a recording that was located in the map of another one, if there is one."""
+        pairs = (p for p in self._catalogue.pairs if (p.query, p.map, p.until_s) == (query, map_, None))
         pair = next(pairs, None)
         return None if pair is None or self._problem(pair) else pair
 
@@ -627,8 +626,7 @@ class Judge:
         one = LocatedWindow(pair.query, number, span, kept_result(self._folder.answer(pair, span)))
         if one.answer is None or pair.kind == "elsewhere":
             return one
-        stamp_ns = int(one.answer["query"]["stamp_ns"])
-        drive = drive_of(query, self._folder)
+        stamp_ns, drive = int(one.answer["query"]["stamp_ns"]), drive_of(query, self._folder)
         where = drive.where(stamp_ns) if pair.placed is None else drive.own_pose(stamp_ns)
         return replace(one, where=where, hits_m=hits_at(self._folder, query, stamp_ns))
 
