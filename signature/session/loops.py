@@ -261,7 +261,7 @@ class LoopCloser:
             self._solve()
 
     def _overlaps(self, newest: int) -> Iterator[Edge]:
-        """Yield verified overlaps of the newest local map with older ones, near its tracked pose."""
+        """Yield verified overlaps of the newest local map with older ones, near its pose in the graph."""
         window = self._parameters.window(self._drift_m)
         # The local map before the newest is left out: tracking matched both against the same walls.
         before = self._nodes[: max(newest - 1, 0), :2]
@@ -282,7 +282,8 @@ class LoopCloser:
         if overlap is None:
             return []
         information = mass * self._parameters.information_share * overlap.information
-        return [Edge(older, newer, overlap.pose, information, loop=True, counts=mass * overlap.counts)]
+        counts = mass * overlap.counts
+        return [Edge(older, newer, overlap.pose, information, loop=True, counts=counts, mass=mass)]
 
     # --- place recognition --------------------------------------------------------------------------------
 
@@ -327,9 +328,12 @@ class LoopCloser:
 
     def _again(self, edge: Edge) -> Edge:
         """Measure an overlap again on the present local maps; return the old one if they no longer
-        overlap."""
-        guess = self._relative(edge.first, edge.second)
-        return next(iter(self._compare(edge.first, edge.second, guess, self._parameters.window(0.0))), edge)
+        overlap.
+
+        A recognised place stays as likely as it was: its alternatives are not measured again.
+        """
+        guess, window = self._relative(edge.first, edge.second), self._parameters.window(0.0)
+        return next(iter(self._compare(edge.first, edge.second, guess, window, edge.mass)), edge)
 
     def _optimised(self) -> F64:
         """Return keyframe poses (K, 3) that follow the anchors of their local maps.

@@ -250,7 +250,6 @@ def counts(monkeypatch: pytest.MonkeyPatch, *off: tuple[SE2, Evidence], side: fl
     off : so far from the tracked poses, which are true. All local maps match where they are told to be.
     """
     monkeypatch.setattr(LocalMap, "overlap", lambda self, newer, guess, *_: Overlap(guess, INFORMATION, 1.0))
-    monkeypatch.setattr(LoopCloser, "_again", lambda self, edge: edge)
     truth = square(100, side) * 2
     scans = [scan_of(pose, BLOCK) for pose in truth]
     _, found = closed(truth, scans, parameters=APART, recognizer=KnowsTheTruth(truth, *off))
