@@ -20,7 +20,8 @@ from signature.symmetry import symmetry_scores
 @dataclass(frozen=True, slots=True, kw_only=True)
 @frozen_arrays(boundary=(np.float32, "Nb"), freespace=(np.float32, "Nf"), symmetry=(np.float32, "S"))
 class Signature:
-    """The three signatures of a submap.
+    """The three signatures of a submap, as the paper has them: they are stored, exported and compared by
+    `distances`. Answers are ordered by what is visible from a viewpoint instead (`signature.visible`).
 
     boundary : (Nb,) float32, H^b of Eq. 2; sum 1, or all 0 if fewer than two boundary points are known.
     freespace : (Nf,) float32, H^f of Eq. 4; sum 1, or all 0 if no two free places are connected.

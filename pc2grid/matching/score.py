@@ -50,8 +50,8 @@ class Fit:
     looked_at : number of the map's wall points on ground known to the query, by weight.
     score : 0..1, geometric mean of forward and backward; hypotheses are ranked by it.
     covariance : (3, 3) of x, y, yaw from the refinement: wide along a corridor, narrow across it.
-    session_index : number of the map among those that were searched. submap_id : of its place that proposed
-        the pose; -1: none.
+    session_index : number of the map among those that were searched: of a session, or, where a loop is
+        recognised, of a place map. submap_id : of its place that proposed the pose; -1: none.
     """
 
     T_map_query: SE2

@@ -1,6 +1,9 @@
 """Correlative scan matching by branch and bound: where points fit on a map.
 
-This is the one coarse search, around proposed poses (`signature.places.hypotheses`) as over whole maps.
+This is the one coarse search of a query, around proposed poses (`signature.places.hypotheses`) as over whole
+maps. Tracking, and loops near their pose in the graph, search some metres with the few points of one scan or
+local map (`pc2grid.estimation.line_map.best_placements`).
+
 Poses lie on a lattice: squares of `SQUARE` x `SQUARE` cells, at headings two steps apart. A square has an
 upper bound for the score of its poses: each point on the maximum of the likelihood field within the distance
 that the square and the heading can move it (Olson 2015, "M3RSM: many-to-many multi-resolution scan matching";

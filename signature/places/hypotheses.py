@@ -35,7 +35,7 @@ class HypothesisParameters:
         by more than a wall's width, so that they must not outweigh the near ones.
     far_m : walls beyond are left out. What is near may be people and carts only: of a real hall, 4 s of a
         lidar were found with the walls between 8 and 20 m and not without them.
-    refined : share of `RelocalizeConfig.hypotheses` that is refined; some of these will merge.
+    refined : so many times `RelocalizeConfig.hypotheses` are refined; some of these will merge.
     around_m, around_rad : each place that may be the answer is searched so far around itself: by a square of
         the coarse search to each side, which may have found the shoulder of a peak. Two poses that are nearer
         are one place: a search around one has seen the other. By their covariances they are not: of 21
@@ -83,7 +83,8 @@ def look_up(
     known: Iterable[Fit] = (),
     allows: Callable[[Fit], bool] = lambda h: True,
 ) -> Iterator[tuple[Fit, ...]]:
-    """Look the walls of a local map up: the same call for an answer, a loop and a join.
+    """Look the walls of a local map up: the same call for an answer, a recognised loop and
+    a join.
 
     Yields, after each batch of areas, the hypotheses so far that are worth keeping, best first: the `known`
     ones, refined, and what fits there with any heading.

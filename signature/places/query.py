@@ -47,7 +47,7 @@ QUERY = QueryParameters()
 
 
 @dataclass(frozen=True, slots=True)
-class Keyframe:
+class QueryKeyframe:
     """A planar scan of a query, in the base frame, and the base there; path_m : metres driven until then.
     weak : its pose, or that of a scan since the keyframe before, is not fine (`Health`)."""
 
@@ -82,7 +82,7 @@ class QueryMap:
     slipped_m: float = 0.0
     T_odom_prior: SE2 | None = None
     since_prior_m: float = 0.0
-    keyframes: tuple[Keyframe, ...] = ()
+    keyframes: tuple[QueryKeyframe, ...] = ()
 
     @cached_property
     def likeness(self) -> float:
@@ -180,9 +180,12 @@ class Query:
         self.part = self.lost_scans = 0
         self._slipped_m = 0.0
         self.first_ns: int | None = None
-        self._keyframes: deque[Keyframe] = deque()
-        self._newest: Keyframe | None = None
-        self._at_prior: tuple[float, Keyframe | None] = math.inf, None  # time to the nearest scan; that scan
+        self._keyframes: deque[QueryKeyframe] = deque()
+        self._newest: QueryKeyframe | None = None
+        self._at_prior: tuple[float, QueryKeyframe | None] = (
+            math.inf,
+            None,
+        )  # time to the nearest scan; that scan
         self._drawn: QueryMap | None = None
 
     @property
@@ -199,7 +202,7 @@ class Query:
             self.lost_scans += 1
             self._at_prior = min(self._at_prior[0], self._off_prior(planar_scan)), None
             self.restart()
-            self._newest = Keyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
+            self._newest = QueryKeyframe(planar_scan, pose, 0.0) if len(planar_scan.hits_m) else None
             return
         self.lost_scans = 0
         if self.in_space is not None:
@@ -209,7 +212,7 @@ class Query:
             weak |= self._newest.weak and self._newest is not self._keyframes[-1]
             step = self._newest.T_odom_base.inverse() @ pose
             path_m = self._newest.path_m + math.hypot(step.x, step.y)
-        self._newest = Keyframe(planar_scan, pose, path_m, weak)
+        self._newest = QueryKeyframe(planar_scan, pose, path_m, weak)
         if self._off_prior(planar_scan) < self._at_prior[0]:
             self._at_prior = self._off_prior(planar_scan), self._newest
         self._keep(self._newest)
@@ -218,7 +221,7 @@ class Query:
         """Return the nanoseconds between a scan and the time of the prior; infinite without one."""
         return math.inf if self._prior_ns is None else abs(planar_scan.stamp_ns - self._prior_ns)
 
-    def _keep(self, newest: Keyframe) -> None:
+    def _keep(self, newest: QueryKeyframe) -> None:
         """Keep a scan if the robot has moved since the last one that was kept."""
         if self._keyframes:
             last = self._keyframes[-1].T_odom_base.inverse() @ newest.T_odom_base
@@ -261,7 +264,7 @@ class Query:
             self._drawn = self._draw(self._newest)
         return self._drawn
 
-    def _draw(self, newest: Keyframe) -> QueryMap:
+    def _draw(self, newest: QueryKeyframe) -> QueryMap:
         keyframes = tuple(self._keyframes) or (newest,)
         builder = GridBuilder(self._made_with.projection)
         for keyframe in keyframes:
