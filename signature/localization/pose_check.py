@@ -33,7 +33,7 @@ from pc2grid.matching.score import score_fit
 from pc2grid.model import Health, RegisteredScan
 from signature.localization.answer import Answer
 from signature.localization.localizer import MOST_KEPT, Localizer
-from signature.localization.posterior import kept
+from signature.localization.posterior import stayed
 from signature.places.map_index import MapIndex, Prior
 
 CheckStatus = Literal["fine", "lost", "unsure"]
@@ -142,7 +142,7 @@ def judge_pose(localizer: Localizer, T_map_base: SE2, session: str | None = None
     _, answer = localizer.search(
         localizer.query,
         near.in_region(seen, (believed,)),
-        lambda place: 1.0 / (1.0 - kept(seen)) if any(near.allows(seen, h) for h in place) else 1.0,
+        lambda place: 1.0 / (1.0 - stayed(seen)) if any(near.allows(seen, h) for h in place) else 1.0,
     )
     apart = [
         (number, *_apart(T_map_base, fit.T_map_query @ answer.T_odom_base))

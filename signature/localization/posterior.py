@@ -7,9 +7,9 @@ Each place of the maps that may be the query's has a mass, and so has "not in th
     nowhere  =  1 / N                                        it lies at no place of this map
     N        =  1 + sum_h prior(h) exp(z_h), and all else that is told apart from "nowhere"
 
-located      one place has at least the mass `RelocalizeConfig.accept`
-ambiguous    the best place, or one that fits equally well, is at least as likely as "nowhere", z + ln prior
-             >= 0; so where maps show one place and nothing says so, because their sessions are not joined
+located      the best place has at least the mass `RelocalizeConfig.accept`
+ambiguous    it has less, but is at least as likely as "nowhere", z + ln prior >= 0: several places share the
+             mass, or several maps show one place and nothing says so, because they are not joined
 not_found    all else
 
 *Evidence.* z_h is that of the walls (`pc2grid.matching.evidence`).
@@ -152,7 +152,7 @@ def judge(
         Place(fits=inside[k], mass=float(mass[k])) for k in np.argsort(-mass, kind="stable").tolist()
     )
     return Answer(
-        status=_status(places, index.config.accept),
+        status=_status(places, 1.0 - float(mass.sum()), index.config.accept),
         places=places,
         stamp_ns=query.stamp_ns,
         path_m=query.path_m,
@@ -165,12 +165,12 @@ def judge(
     )
 
 
-def _status(places: Sequence[Place], accept: float) -> Status:
+def _status(places: Sequence[Place], nowhere: float, accept: float) -> Status:
     """Return what the masses say. The first place need not be as likely as all else, but as "nowhere"."""
     first = sum(place.mass for place in places[:1])
     if first >= accept:
         return "located"
-    return "ambiguous" if places and first >= 1.0 - sum(place.mass for place in places) else "not_found"
+    return "ambiguous" if places and first >= nowhere else "not_found"
 
 
 def by_place(index: MapIndex, query: QueryMap, hypotheses: Iterable[Fit]) -> list[tuple[Fit, ...]]:
@@ -250,9 +250,7 @@ def weighed(answer: Answer, off_map: Sequence[Place], slipped: float, accept: fl
         [replace(away, mass=share * nowhere * away.mass) for away in off_map],
         answer.T_odom_base,
     )
-    status: Status = "ambiguous" if answer.located else answer.status
-    if sum(place.mass for place in places[:1]) >= accept:
-        status = "located"
+    status = _status(places, share * nowhere, accept)
     return replace(answer, status=status, places=tuple(places), off_map=tuple(beside)), share * slip
 
 
@@ -313,7 +311,7 @@ def _carried(place: Place, now: QueryMap | Answer, odds: float = 1.0) -> Place:
     return replace(place, fits=tuple(fits), mass=odds * place.mass)
 
 
-def kept(query: QueryMap) -> float:
+def stayed(query: QueryMap) -> float:
     """Return 1 - k, the share of the masses before a query that stays where it was."""
     return float((1.0 - POSTERIOR.slip) ** max(len(query.keyframes), 1))
 
@@ -351,7 +349,7 @@ class Belief:
     def before(self, index: MapIndex, query: QueryMap) -> tuple[PriorOf, tuple[Place, ...]]:
         """Return the prior of each place by the masses before all scans of a query, carried on by odometry,
         and those places of which the map shows too little. Masses are relative to that of "nowhere"."""
-        known, beside, share = [], [], kept(query)
+        known, beside, share = [], [], stayed(query)
         for past in self._before(query)[-1:]:
             odds = share / (1.0 - share * past.mass)
             known = [_carried(place, query, odds) for place in past.places]
@@ -458,7 +456,7 @@ def settle_in_space(
     poses = {k: _pose(fit, query.T_odom_base) for k, fit in fits.items() if isinstance(fit, SpatialFit)}
     order = sorted(range(len(mass)), key=lambda k: (k != best, -mass[k]))
     places = [replace(answer.places[k], mass=float(mass[k])) for k in order]
-    settled = _status(places, accept)
+    settled = _status(places, 1.0 - float(mass.sum()), accept)
     in_space = poses.get(best) if settled == "located" else None
     if in_space is not None:
         planar = np.ix_((0, 1, 5), (0, 1, 5))
