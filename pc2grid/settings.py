@@ -240,7 +240,10 @@ def dump_settings(settings: Section) -> str:
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
         tree = tomllib.loads(path.read_text(encoding="utf-8"))
-        return {name: _with_nulls(section) for name, section in tree.items()}
+        for section in tree.values():
+            if isinstance(section, dict):
+                section.update({key: None for key, value in section.items() if value == "null"})
+        return tree
     except FileNotFoundError:
         raise ConfigError(
             f"{path}: no such file", hint="`pc2grid config dump` prints one to start from"
@@ -249,12 +252,6 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path}: cannot be read: {error.strerror}") from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ConfigError(f"{path}: not TOML: {error}") from None
-
-
-def _with_nulls(section: Any) -> Any:
-    if not isinstance(section, dict):
-        return section
-    return {key: None if value == "null" else value for key, value in section.items()}
 
 
 def _assign(tree: dict[str, Any], assignment: str) -> None:

@@ -57,7 +57,7 @@ MAX_VOXELS = 200_000_000
 
 
 class VoxelCloud:
-    """Collects points; `edge_m` is the edge of a voxel.
+    """Collects points; `edge_m` is the edge of a voxel, and `corner_m` (3,) a corner of one.
 
     The first point lies in the middle of its voxel, so that a lattice of the same spacing keeps one point a
     voxel.
@@ -72,7 +72,7 @@ class VoxelCloud:
 
     def __init__(self, edge_m: float) -> None:
         self.edge_m = edge_m
-        self._corner_m: F64 | None = None  # of a voxel with the first point in its middle
+        self.corner_m: F64 = np.zeros(3)  # of a voxel: the first point is in its middle
         # The first part has each voxel once; the others are to be merged into it.
         nothing = np.empty(0, np.int64), np.empty((0, 3), np.float32), np.empty(0, np.int32)
         self._parts: list[_Voxels] = [nothing]
@@ -85,9 +85,9 @@ class VoxelCloud:
         if not len(points_m):
             return
         points = np.asarray(points_m, np.float64)
-        if self._corner_m is None:
-            self._corner_m = points[0] - 0.5 * self.edge_m
-        points = points - self._corner_m
+        if not len(self._parts[0][0]):
+            self.corner_m = points[0] - 0.5 * self.edge_m
+        points = points - self.corner_m
         voxel = np.floor(points / self.edge_m)
         if np.abs(voxel).max() >= HALF_VOXELS:
             raise LimitExceeded(
@@ -104,11 +104,6 @@ class VoxelCloud:
     def __len__(self) -> int:
         """Return the number of voxels that hold points."""
         return len(self._merged()[0])
-
-    @property
-    def corner_m(self) -> F64:
-        """Return a corner (3,) of a voxel."""
-        return np.zeros(3) if self._corner_m is None else self._corner_m
 
     def points_m(self) -> F64:
         """Return the mean (V, 3) of each voxel that holds points, by increasing x, then y, then z of the

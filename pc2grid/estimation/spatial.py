@@ -132,10 +132,10 @@ class SpatialMatcher:
         surfaces, points_m, weights = space.surfaces, self._thinned.points_m, self._thinned.weights
         found = surfaces.match(points_m, weights, surfaces.near(points_m, weights, guess, held), held)
         of_known, of_all = space.agreement(self._thinned, found.pose)
+        # So many points of a scan are worth this number of points with independent errors.
+        count = min(len(points_m), SURFACES.points)
+        independent = (SURFACES.noise_m / MATCHING_PARAMETERS.cell_m) ** 2 * count
         # The pose by the points alone: the prior is removed.
-        independent = (SURFACES.noise_m / MATCHING_PARAMETERS.cell_m) ** 2 * min(
-            len(points_m), SURFACES.points
-        )
         away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], found.pose[None]))
         information = found.information + LEAST_INFORMATION
         change = np.linalg.solve(information, J.T @ held.information @ away)

@@ -156,27 +156,36 @@ class Tracker:
         """Judge a scan by its match, and count the lost ones in a row.
 
         A scan that fits is FINE; DEGENERATE if one direction of its position is not determined; LOST if a
-        direction of the pose of a sensor in the hand without odometry is not known: wheels do not slip along
-        a wall. One that does not fit is also DEGENERATE if odometry gives its pose from a scan that was not
-        lost; else LOST. If it fits only the scans before it, which fix its position, the walls have changed.
+        direction of its pose is not known. One that does not fit is also DEGENERATE if odometry gives its
+        pose from a scan that was not lost; else LOST. So is one before which the walls have changed.
         """
-        p, read = TRACKING, scan.T_odom_base is not None
-        if self._standstill.left(scan, sure=placed.sure and not placed.first):
-            before = self._sensor.follow(expected)
-            if before is not None and weakest(before[1]) > p.known_m**-2:
-                self._walls_changed, self._lost_scans = True, p.give_up_scans + 1
-                return Health.LOST
-        sigma_m, sigma_rad = estimate.sigmas if self._in_hand and not read else (0.0, 0.0)
+        if self._walls_have_changed(scan, placed, expected):
+            self._walls_changed, self._lost_scans = True, TRACKING.give_up_scans + 1
+            return Health.LOST
         fits = placed.first or placed.alone is not None
-        if fits and sigma_m <= p.known_m and sigma_rad <= p.known_rad:
+        if fits and self._is_known(scan, estimate):
             self._lost_scans = 0
-            return Health.FINE if placed.first or placed.measured else Health.DEGENERATE
-        bridged = placed.motion is not None or (read and continues)
+            return Health.FINE if placed.measured else Health.DEGENERATE
+        bridged = placed.motion is not None or (scan.T_odom_base is not None and continues)
         if bridged and not self._lost_scans:
             return Health.DEGENERATE
         # A pose that fits anywhere along a wall does not become known by waiting.
-        self._lost_scans += p.give_up_scans + 1 if fits else 1
+        self._lost_scans += TRACKING.give_up_scans + 1 if fits else 1
         return Health.LOST
+
+    def _walls_have_changed(self, scan: Scan, placed: MatchedScan, expected: PoseWithCovariance) -> bool:
+        """Return True if a scan fits only the scans before it, which fix its position."""
+        if not self._standstill.left(scan, sure=placed.sure):
+            return False
+        before = self._sensor.follow(expected)
+        return before is not None and weakest(before[1]) > TRACKING.known_m**-2
+
+    def _is_known(self, scan: Scan, estimate: PoseWithCovariance) -> bool:
+        """Return True if no direction of a pose may slide: wheels do not along a wall, nor does odometry."""
+        if not self._in_hand or scan.T_odom_base is not None:
+            return True
+        sigma_m, sigma_rad = estimate.sigmas
+        return sigma_m <= TRACKING.known_m and sigma_rad <= TRACKING.known_rad
 
     def _finish(self, scan: Scan, points: F32, pose: F64, health: Health) -> Tracked:
         """Extend the maps by a scan that is due, and keep its final pose."""
@@ -251,7 +260,8 @@ class MatchedScan:
     pose : (4, 4) initial T_session_base for the smoother. alone : as of `ScanMatch`; None if the scan fits
     nowhere. motion : T_last_now, if the scan shows new ground and fits only the scans before.
     sure : True if it fits the map well. measured : True if its points fix every direction of the position.
-    first : True if there is no local map yet, nor any since tracking started again.
+    first : True if there is no local map yet, nor any since tracking started again: then the pose is measured
+    by definition.
     """
 
     pose: F64
@@ -290,7 +300,7 @@ def place(
     """
     sensor.take(scan, points_m)
     if not sensor:
-        return MatchedScan(belief.pose, sure=True, first=True)
+        return MatchedScan(belief.pose, measured=True, first=True)
     found = _candidates(sensor, belief, others)
     best = max(found)
     if best.fit.overlap < TRACKING.min_overlap or not (best.near or best.fit.credible):

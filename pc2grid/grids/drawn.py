@@ -300,15 +300,13 @@ def map_cloud(
     p = CLOUD_MAP
     points = np.asarray(level_points_m, np.float64)
     builder = GridBuilder(projection)
-    drawn = False
     for corner_m, near in _tiles(_without_noise(points, projection)):
         for view_m in _viewpoints(near, corner_m, projection):
             _draw(builder, near, view_m, projection)
-            drawn = True
-    if drawn:
+    grid = builder.grid()
+    if grid.cells.size:
         # A view through a wall that was not scanned ends on some obstacle of another room: free cells that
         # are far from all visible floor are removed.
-        grid = builder.grid()
         unseen = ~_mask(grid.to_cell(points[np.abs(points[:, 2]) < p.floor_m, :2]), grid.cells.shape)
         away_m = cv2.distanceTransform(unseen.astype(np.uint8), cv2.DIST_L2, 5) * grid.resolution_m
         cells = np.where(grid.free & (away_m > p.hidden_m), np.int8(UNKNOWN), grid.cells)

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy import ndimage
 
 from pc2grid.errors import ConfigError
@@ -407,8 +406,7 @@ class Passages:
         eight = np.ones((3, 3), bool)
         parts, count_before = ndimage.label(before, eight)
         _, count_after = ndimage.label(after, eight)
-        kept: NDArray[np.int64] = np.unique(parts[after])
-        if count_after != count_before or len(kept) != count_before:
+        if not count_before == count_after == len(np.unique(parts[after])):
             return False
         self.free[window] &= ~mask
         self._passable[window] = after

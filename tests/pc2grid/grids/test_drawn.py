@@ -297,8 +297,8 @@ def test_a_real_floor_is_not_doubted(tmp_path: Path) -> None:
     upright = level(points)
     assert not is_upside_down(upright) and other_floors(upright) == []
     assert is_upside_down(level(points @ OVER))
-    (above,) = other_floors(level(np.concatenate((points, raised(points, 3.0)))))
-    assert above.height_m == pytest.approx(3.0, abs=0.05)
+    ((height_m, _),) = other_floors(level(np.concatenate((points, raised(points, 3.0)))))
+    assert height_m == pytest.approx(3.0, abs=0.05)
     path = tmp_path / "thin.ply"
     write_cloud(path, thinned(points, 0.1))
     assert read(path).warnings == ()
