@@ -33,7 +33,7 @@ from pc2grid.io.building_file import (
 from pc2grid.io.maps import is_map_file, load_map
 from pc2grid.model import OccupancyGrid, SensorKind
 from pc2grid.settings import ReadConfig
-from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig, SimulationConfig
+from pc2grid.simulate.config import DepthConfig, LaserConfig, LidarConfig
 from pc2grid.simulate.plan import Passages, outline_mask
 
 # --- triangles and rays -------------------------------------------------------------------------------
@@ -242,15 +242,6 @@ class SimulatedSensor:
         return np.where(kept, reading, np.float32(np.nan))
 
 
-def make_sensor(kind: SensorKind, config: SimulationConfig) -> SimulatedSensor:
-    """Make the sensor of a kind as configured."""
-    if kind == "lidar":
-        return lidar(config.lidar)
-    if kind == "laser":
-        return laser(config.laser)
-    return depth(config.depth)
-
-
 def lidar(config: LidarConfig) -> SimulatedSensor:
     """Make a lidar: columns of beams, fired one after another during one turn, stamped at the first
     column."""
@@ -305,6 +296,10 @@ def depth_intrinsics(config: DepthConfig) -> F64:
     return np.array([(fx, 0, (config.width - 1) / 2), (0, fy, (config.height - 1) / 2), (0, 0, 1)])
 
 
+SENSORS: dict[SensorKind, Callable[[Any], SimulatedSensor]] = {"lidar": lidar, "laser": laser, "depth": depth}
+"""For each kind the function that makes one, of its section of the configuration."""
+
+
 def _mount(xyz_m: tuple[float, float, float]) -> F64:
     pose = np.eye(4)
     pose[:3, 3] = xyz_m
@@ -334,13 +329,8 @@ _SQUARE_SHARE = 0.5  # of the objects are aligned with the axes of the map
 _KEPT_FREE_M = 1.0  # around the start of the drive
 
 
-@dataclass(frozen=True, slots=True)
-class Prism:
-    """One part of an object: a convex outline (N, 2) in the object's frame, between two heights, metres."""
-
-    outline_m: F64
-    bottom_m: float
-    top_m: float
+Prism = tuple[F64, float, float]
+"""A part of an object: its convex outline (N, 2) in the frame of the object, and its lowest and highest z."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,7 +346,7 @@ class Furniture:
 
     def mesh(self) -> F32:
         """Return the triangles (T, 3, 3) in the map frame."""
-        parts = [prism(self.pose.apply(p.outline_m), p.bottom_m, p.top_m) for p in self.parts]
+        parts = [prism(self.pose.apply(outline_m), low, high) for outline_m, low, high in self.parts]
         return np.concatenate(parts)
 
 
@@ -414,13 +404,13 @@ def _rectangle(x0: float, y0: float, x1: float, y1: float) -> F64:
 def _legs(width: float, depth: float, thickness: float, top: float) -> list[Prism]:
     x, y, t = width / 2, depth / 2, thickness
     corners = ((-x, -y), (x - t, -y), (x - t, y - t), (-x, y - t))
-    return [Prism(_rectangle(a, b, a + t, b + t), 0.0, top) for a, b in corners]
+    return [(_rectangle(a, b, a + t, b + t), 0.0, top) for a, b in corners]
 
 
 def _box(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     width, depth, height = rng.uniform(0.3, 0.8), rng.uniform(0.3, 0.6), rng.uniform(0.3, 1.2)
     outline = _rectangle(-width / 2, -depth / 2, width / 2, depth / 2)
-    return outline, [Prism(outline, 0.0, height)]
+    return outline, [(outline, 0.0, height)]
 
 
 def _cylinder(
@@ -428,21 +418,21 @@ def _cylinder(
 ) -> tuple[F64, list[Prism]]:
     angles = np.arange(16) * (2 * math.pi / 16)
     outline = rng.uniform(*radius_m) * np.column_stack((np.cos(angles), np.sin(angles)))
-    return outline, [Prism(outline, 0.0, rng.uniform(*height_m))]
+    return outline, [(outline, 0.0, rng.uniform(*height_m))]
 
 
 def _chair(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     size, seat, back = rng.uniform(0.42, 0.5), rng.uniform(0.42, 0.48), rng.uniform(0.8, 1.0)
     half = size / 2
     outline = _rectangle(-half, -half, half, half)
-    rest = Prism(_rectangle(-half, -half, -half + 0.04, half), seat, back)
-    return outline, [Prism(outline, seat - 0.05, seat), rest, *_legs(size, size, 0.04, seat)]
+    rest = (_rectangle(-half, -half, -half + 0.04, half), seat, back)
+    return outline, [(outline, seat - 0.05, seat), rest, *_legs(size, size, 0.04, seat)]
 
 
 def _table(rng: np.random.Generator) -> tuple[F64, list[Prism]]:
     width, depth, height = rng.uniform(1.0, 1.6), rng.uniform(0.6, 0.8), rng.uniform(0.7, 0.76)
     outline = _rectangle(-width / 2, -depth / 2, width / 2, depth / 2)
-    return outline, [Prism(outline, height - 0.03, height), *_legs(width, depth, 0.06, height)]
+    return outline, [(outline, height - 0.03, height), *_legs(width, depth, 0.06, height)]
 
 
 FURNITURE: dict[str, tuple[Callable[[np.random.Generator], tuple[F64, list[Prism]]], float]] = {

@@ -23,6 +23,7 @@ from pc2grid.simulate.config import DepthConfig, LaserConfig, SimulationConfig
 from pc2grid.simulate.drive import Drive, SimulatedOdometry, drive_along, odometry_of, plan_route
 from pc2grid.simulate.plan import office_floorplan
 from pc2grid.simulate.scene import (
+    SENSORS,
     Building,
     Furniture,
     Scene,
@@ -32,7 +33,6 @@ from pc2grid.simulate.scene import (
     extrude,
     laser_angle_min,
     laser_time_increment,
-    make_sensor,
     place_clutter,
 )
 
@@ -188,7 +188,8 @@ def prepare_session(
     )
     drive = drive_along(points, turns, config.drive, stream(_DRIVE))
     odometry = odometry_of(drive, config.odometry, stream(_ODOMETRY)) if config.odometry.enabled else None
-    return Session(make_sensor(sensor, config), plan, clutter, drive, odometry, config, shell)
+    made = SENSORS[sensor](getattr(config, sensor))
+    return Session(made, plan, clutter, drive, odometry, config, shell)
 
 
 # --- recordings ---------------------------------------------------------------------------------------
