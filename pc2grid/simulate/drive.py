@@ -204,7 +204,7 @@ def plan_route(
         if turns_before:
             segments.append([leg[:1]])
         segments[-1].append(leg[1:])
-    lines = [_smooth(_resample(np.concatenate(part)), grid, clearance, least_m) for part in segments]
+    lines = [_smooth(np.concatenate(part), grid, clearance, least_m) for part in segments]
     points = np.concatenate([lines[0], *(line[1:] for line in lines[1:])])
     turns = np.cumsum([len(line) - 1 for line in lines])
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
@@ -326,24 +326,20 @@ def _legs(lattice: _Lattice, at: int, rng: np.random.Generator) -> Iterator[tupl
         heading = arriving / np.linalg.norm(arriving)
 
 
-def _resample(points_m: F64) -> F64:
-    """Return the same line with points STEP_M apart and the same ends."""
+def _smooth(points_m: F64, grid: OccupancyGrid, clearance: F32, least_m: float) -> F64:
+    """Put the points of a line STEP_M apart, and straighten it as far as its clearance allows (an elastic
+    band); its ends stay."""
     lengths = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))))
     count = max(round(float(lengths[-1]) / STEP_M), 1)
     at = np.linspace(0, lengths[-1], count + 1)
-    return np.column_stack([np.interp(at, lengths, points_m[:, k]) for k in (0, 1)])
-
-
-def _smooth(points_m: F64, grid: OccupancyGrid, clearance: F32, least_m: float) -> F64:
-    """Straighten the line as far as its clearance allows (an elastic band); its ends stay."""
-    if len(points_m) < 3:
-        return points_m
+    band = np.column_stack([np.interp(at, lengths, points_m[:, k]) for k in (0, 1)])
+    if len(band) < 3:
+        return band
 
     def room(at_m: F64) -> F32:
         cell = grid.to_cell(at_m)
         return clearance[cell[:, 0], cell[:, 1]]
 
-    band = points_m.copy()
     wanted = np.minimum(room(band), least_m)
     for reach in (8, 4, 2, 1):
         for _ in range(30):
