@@ -74,7 +74,25 @@ class PlanarMatcher:
     def take(self, scan: Scan, points_m: F32) -> None:
         """Prepare a scan for the following calls."""
         self._points_m = self._floor.remove(points_m)
-        self._planar_scan = self._project(scan, points_m)
+        T_level_base, sensor_m = self._floor.T_level_base(), scan.T_base_sensor[:3, 3]
+        level_m, ground = points_m, self._floor.ground
+        if ground is not None:
+            R = T_level_base.copy()
+            R[:3, 3] = 0.0  # a planar scan keeps the base's own origin; heights are relative to the ground
+            level_m = points_m @ R[:3, :3].T.astype(np.float32)
+            sensor_m, ground = R[:3, :3] @ sensor_m, ground.moved(R)
+        self._planar_scan = project_to_plane(
+            level_m,
+            stamp_ns=scan.stamp_ns,
+            sensor_m=sensor_m,
+            ground=ground,
+            config=self._projection,
+            sensor=scan.sensor,
+        )
+        if SENSOR_MODELS[scan.sensor].noise_per_m2 > 0.0:
+            self._depth_limit.observe(points_m, scan.T_base_sensor)
+            T_level_sensor = T_level_base @ scan.T_base_sensor
+            self._planar_scan = self._depth_limit.before(self._planar_scan, T_level_sensor)
 
     def match(self, belief: PoseWithCovariance) -> list[ScanMatch]:
         """Match from the expected pose and, if KISS-ICP brings half of the hits into other cells, from its
@@ -146,30 +164,6 @@ class PlanarMatcher:
         self._floor.follow(points_m, scan)
         self._maps.extend(self._planar_scan, SE2.from_matrix(pose))
         self._kiss.add(self._points_m, pose)
-
-    def _project(self, scan: Scan, points_m: F32) -> PlanarScan:
-        """Reduce points (N, 3) of the base frame to the plane."""
-        T_level_base = self._floor.T_level_base()
-        noisy = SENSOR_MODELS[scan.sensor].noise_per_m2 > 0.0
-        if noisy:
-            self._depth_limit.observe(points_m, scan.T_base_sensor)
-        sensor_m, ground = scan.T_base_sensor[:3, 3], self._floor.ground
-        if ground is not None:
-            R = T_level_base.copy()
-            R[:3, 3] = 0.0  # a planar scan keeps the base's own origin; heights are relative to the ground
-            points_m = points_m @ R[:3, :3].T.astype(np.float32)
-            sensor_m, ground = R[:3, :3] @ sensor_m, ground.moved(R)
-        planar_scan = project_to_plane(
-            points_m,
-            stamp_ns=scan.stamp_ns,
-            sensor_m=sensor_m,
-            ground=ground,
-            config=self._projection,
-            sensor=scan.sensor,
-        )
-        if not noisy:
-            return planar_scan
-        return self._depth_limit.before(planar_scan, T_level_base @ scan.T_base_sensor)
 
 
 def _turned(matrix: F64, yaw_rad: float) -> F64:
