@@ -226,8 +226,7 @@ def observe(
             touched[a, b] = stamp
         if band[0] <= points[n, 2] <= band[1]:
             if sums[a, b, 2] >= 200.0:
-                for m in range(3):
-                    sums[a, b, m] *= 0.5
+                sums[a, b] *= 0.5
             sums[a, b, 0] += points[n, 0] - i * edge
             sums[a, b, 1] += points[n, 1] - j * edge
             sums[a, b, 2] += 1.0

@@ -428,8 +428,7 @@ def aligned(
             # What the line depends on, as one number: the radius is less than the height.
             code = float(((row * width + column) * sectors + sector) * height + radius)
             if lines[k + 1, 0] != code and lines[k, 0] == code:  # neighbours on a wall share it
-                for part in range(6):
-                    lines[k + 1, part] = lines[k, part]
+                lines[k + 1] = lines[k]
             elif lines[k + 1, 0] != code:
                 # The line of the points around.
                 mx = my = nx = ny = straight = n = sx = sy = sxx = sxy = syy = 0.0

@@ -348,13 +348,10 @@ def add(
             used += 1
             slots[slot] = row
             codes[row] = code
-            for c in range(10):
-                moments[row, c] = 0.0
+            moments[row] = 0.0
         m = moments[row]
         if m[0] >= most:
-            kept = (most - 1.0) / m[0]
-            for c in range(10):
-                m[c] *= kept
+            m *= (most - 1.0) / m[0]
         powers = 1.0, points[n, 0] - i * edge, points[n, 1] - j * edge, points[n, 2] - k * edge
         place = 0
         for a in range(4):
