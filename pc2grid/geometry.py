@@ -292,15 +292,11 @@ def hand_over(array: A) -> A:
     return array
 
 
-def _is_read_only(array: NDArray[np.generic]) -> bool:
-    """Return True if nobody can write to an array, neither through it nor through the array that it is a view
-    of."""
-    base: object = array
-    while isinstance(base, np.ndarray):
-        if base.flags.writeable:
-            return False
-        base = base.base
-    return base.readonly if isinstance(base, memoryview) else base is None or isinstance(base, bytes)
+def _is_read_only(array: object) -> bool:
+    """Return True if nobody can write to an array, neither through it nor through what it is a view of."""
+    if isinstance(array, np.ndarray):
+        return not array.flags.writeable and _is_read_only(array.base)
+    return array.readonly if isinstance(array, memoryview) else array is None or isinstance(array, bytes)
 
 
 SUBPIXEL_BITS = 4

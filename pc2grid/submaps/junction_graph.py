@@ -179,8 +179,6 @@ def skeleton_of(
 
     free : (H, W) cells known to be free. Returns (H, W).
     """
-    if not free.any():
-        return np.zeros(free.shape, np.bool_)
     return thin(clearance_of(free, resolution_m) > clearance_m, thinning)
 
 
