@@ -49,11 +49,10 @@ _CLUTTER, _ROUTE, _DRIVE, _ODOMETRY, _NOISE = range(5)
 class Measurements:
     """The measurements of one scan.
 
-    index : number of the scan. time_s : of its stamp, since the session's start. values_m : (R,) float32, one
-    per ray, NaN for a ray without a return.
+    time_s : of its stamp, since the session's start. values_m : (R,) float32, one per ray, NaN for a ray
+    without a return.
     """
 
-    index: int
     time_s: float
     values_m: F32
 
@@ -105,7 +104,7 @@ class Session:
             true_m = scene.cast(rays.reshape(-1, 6)).reshape(times_s.shape)
             for index, ranges in zip(indices, true_m, strict=True):
                 rng = np.random.default_rng([self.config.seed, _NOISE, int(index)])
-                yield Measurements(int(index), float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
+                yield Measurements(float(index) / sensor.rate_hz, sensor.measure(ranges, rng))
 
     def scan(self, reading: Measurements) -> Scan:
         """Return a reading as the scan that `pc2grid.io` decodes from the recording."""
@@ -257,13 +256,13 @@ def simulate_session(
         log.metadata("pc2grid.simulation", about)
         log.tf_static(EPOCH_NS, BASE_FRAME, session.sensor.frame, session.sensor.T_base_sensor)
         odometry_sent = 0
-        for reading in session.readings():
+        for done, reading in enumerate(session.readings(), 1):
             odometry_sent = _write_odometry(log, session, odometry_sent, reading.time_s)
             _write_reading(log, session, reading)
             stamps.append(reading.stamp_ns)
             poses.append(session.drive.pose(reading.time_s).lift())
             if progress is not None:
-                progress((reading.index + 1) / count)
+                progress(done / count)
         _write_odometry(log, session, odometry_sent, np.inf)
     write_tum(truth_path, Trajectory(stamps_ns=np.array(stamps), T_session_base=np.array(poses)))
     return SimulatedSession(
