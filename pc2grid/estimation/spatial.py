@@ -130,20 +130,21 @@ class SpatialMatcher:
         """Match the scan taken last with the map from a guess (4, 4), with a belief as prior."""
         space = self._space
         surfaces, points_m, weights = space.surfaces, self._thinned.points_m, self._thinned.weights
-        found = surfaces.match(points_m, weights, surfaces.near(points_m, weights, guess, held), held)
-        of_known, of_all = space.agreement(self._thinned, found.pose)
+        near = surfaces.near(points_m, weights, guess, held)
+        pose, of_points, overlap, measured = surfaces.match(points_m, weights, near, held)
+        of_known, of_all = space.agreement(self._thinned, pose)
         # So many points of a scan are worth this number of points with independent errors.
         count = min(len(points_m), SURFACES.points)
         independent = (SURFACES.noise_m / MATCHING_PARAMETERS.cell_m) ** 2 * count
         # The pose by the points alone: the prior is removed.
-        away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], found.pose[None]))
-        information = found.information + LEAST_INFORMATION
+        away, _, J = (of_belief[0] for of_belief in steps(held.pose[None], pose[None]))
+        information = of_points + LEAST_INFORMATION
         change = np.linalg.solve(information, J.T @ held.information @ away)
         return ScanMatch(
-            pose=found.pose,
-            alone=(moved(found.pose[None], change[None])[0], information),
-            overlap=found.overlap,
-            measured=found.measured,
+            pose=pose,
+            alone=(moved(pose[None], change[None])[0], information),
+            overlap=overlap,
+            measured=measured,
             evidence=independent * of_all,
             credible=of_known >= SPATIAL_MATCHING.least_agreement,
         )

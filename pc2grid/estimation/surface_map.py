@@ -77,22 +77,6 @@ LEAST_INFORMATION = 1e-3 * np.eye(6)
 30 rad, farther than any match is moved. One point has 1e5 times as much."""
 
 
-@dataclass(frozen=True, slots=True)
-class SurfaceMatch:
-    """A scan matched with the map in space.
-
-    pose : (4, 4) T_map_base. information : (6, 6), from the points alone, of a change of the pose as in
-    `pc2grid.estimation.line_map`.
-    overlap : share of the points that meet a surface of the map.
-    measured : True if the points fix every direction of the position.
-    """
-
-    pose: F64
-    information: F64
-    overlap: float
-    measured: bool
-
-
 class VoxelShapes:
     """A map of voxels with the shape of the surface in each. edge_m : of a voxel."""
 
@@ -226,10 +210,16 @@ class SurfaceMap:
             self._cleared_at = here
             self.fine.forget_beyond(here, 1.25 * self._reach_m)
 
-    def match(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> SurfaceMatch:
+    def match(
+        self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance
+    ) -> tuple[F64, F64, float, bool]:
         """Register thinned points (N, 3), base frame, from a guess (4, 4), with a prior.
 
         weights : (N,) of the points, 0..1, by their noise.
+
+        Returns the pose (4, 4); the information (6, 6), from the points alone, of a change of it as in
+        `pc2grid.estimation.line_map`; the share of the points that meet a surface of the map; and True if
+        they fix every direction of the position.
         """
         p, chosen = SURFACES, random_subset(len(points_m), SURFACES.points)
         points_m, weights = points_m[chosen], weights[chosen]
@@ -242,12 +232,8 @@ class SurfaceMap:
             pose = moved(pose[None], step[None])[0]
             if scale_m == p.rounds[-1] and np.abs(step).sum() < p.converged:
                 break
-        return SurfaceMatch(
-            pose,
-            information,
-            found / max(len(points_m), 1),
-            weakest(information) > p.least_points * unit,
-        )
+        measured = weakest(information) > p.least_points * unit
+        return pose, information, found / max(len(points_m), 1), measured
 
     def near(self, points_m: F64, weights: F64, guess: F64, prior: PoseWithCovariance) -> F64:
         """Register thinned points (N, 3) by KISS-ICP from a guess (4, 4), and weigh the pose against a prior.
