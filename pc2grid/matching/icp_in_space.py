@@ -52,6 +52,16 @@ class RegistrationParameters:
     patch_m : errors of points nearer than this to each other are taken to be the same, in the covariance. In
         simulation the normalised squared errors are then about 6, as they should for 6 numbers.
     noise_m : least standard deviation of a distance; of voxels and of maps.
+
+    Rays:
+
+    views, rays : at most so many scans are compared, evenly spread, and of each so many rays.
+    bin_rad : size of the bins of directions in which surfaces hide each other.
+    gap_m : a surface is passed, or not reached, if it is at least so far off along the ray.
+    object_m : rays that end within a cell of this size hit one object.
+    object_rays : an object counts for a place if so many more of its rays end on surfaces of this place than
+        of the other.
+    above_m : surfaces higher above the floor belong to the building: they are seldom moved.
     """
 
     voxel_m: float = 0.1
@@ -67,31 +77,16 @@ class RegistrationParameters:
     patch_m: float = 2.0
     noise_m: float = 0.01
 
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RayParameters:
-    """How rays are compared with a map. All chosen by hand, tried in simulation.
-
-    views, rays : at most so many scans are compared, evenly spread, and of each so many rays.
-    bin_rad : size of the bins of directions in which surfaces hide each other.
-    gap_m : a surface is passed, or not reached, if it is at least so far off along the ray.
-    patch_m : rays that end within a cell of this size hit one object.
-    patch_rays : a patch counts for a place if so many more of its rays end on surfaces of this place than of
-        the other.
-    above_m : surfaces higher above the floor belong to the building: they are seldom moved.
-    """
-
     views: int = 5
     rays: int = 4000
     bin_rad: float = math.radians(1.5)
     gap_m: float = 0.4
-    patch_m: float = 0.5
-    patch_rays: int = 3
+    object_m: float = 0.5
+    object_rays: int = 3
     above_m: float = 2.0
 
 
 REGISTRATION = RegistrationParameters()
-RAYS = RayParameters()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,12 +130,12 @@ class Rays:
         """
         contradicted = self.through | self.before, other.through | other.before
         balance = (self.on & contradicted[1]).astype(np.int64) - (other.on & contradicted[0])
-        high = np.minimum(self.height_m, other.height_m) > RAYS.above_m
+        high = np.minimum(self.height_m, other.height_m) > REGISTRATION.above_m
         balance, end_m = balance[high], self.end_m[high]
-        cells = np.floor(end_m / RAYS.patch_m).astype(np.int64)
+        cells = np.floor(end_m / REGISTRATION.object_m).astype(np.int64)
         _, patch = np.unique(cells, axis=0, return_inverse=True)
         lead = np.bincount(patch.ravel(), balance)
-        over, under = lead >= RAYS.patch_rays, lead <= -RAYS.patch_rays
+        over, under = lead >= REGISTRATION.object_rays, lead <= -REGISTRATION.object_rays
         return int(np.count_nonzero(over)) - int(np.count_nonzero(under))
 
 
@@ -344,7 +339,7 @@ def compare_rays(views: Sequence[SpatialView], target: F64, T_map_query: F64) ->
     """
     from scipy.spatial import cKDTree
 
-    p, near_m = RAYS, REGISTRATION.rounds_m[-1]
+    p, near_m = REGISTRATION, REGISTRATION.rounds_m[-1]
     tree = cKDTree(target)
     every = max(1, math.ceil(len(views) / p.views))
     none = np.empty(0, np.bool_)
