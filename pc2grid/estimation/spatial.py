@@ -103,7 +103,7 @@ class SpatialMatcher:
 
     def __bool__(self) -> bool:
         """Return True if there is a local map."""
-        return bool(self._space)
+        return bool(self._space.surfaces)
 
     def take(self, scan: Scan, points_m: F32) -> None:
         """Prepare a scan for the following calls."""
@@ -323,9 +323,6 @@ class SpaceMap:
         self._added_at: F64 | None = None  # pose of the last scan that joined
         self._floor = FloorBelow()
         self._above_floor_m: float | None = None  # the base, by the last scan
-
-    def __bool__(self) -> bool:
-        return self._added_at is not None and bool(self.surfaces)
 
     def thin(self, scan: Scan, points_m: F32, turn: F64) -> ThinnedScan:
         """Downsample the points (N, 3) of a deskewed scan, base frame. turn : (3, 3) of the last scan."""
