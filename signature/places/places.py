@@ -99,13 +99,6 @@ class Order(NamedTuple):
     mass: F64
 
 
-class PlaceBlock(NamedTuple):
-    """The viewpoints of one map, and the row of its first place in the table of all."""
-
-    seen: SeenPlaces
-    first_row: int
-
-
 class Raster(NamedTuple):
     """The viewpoint in each square of the lattice, of all maps.
 
@@ -150,41 +143,37 @@ class Poses(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class PlaceIndex:
-    """K viewpoints of N places.
+    """K viewpoints of some maps.
 
     vectors : (K, D) float16, of their signatures. hidden : (K,) share of the rays whose ends are not known.
-    at_m : (K, 2) in the map of a block (K,). row : (K,) the place in the table.
+    at_m : (K, 2) in the map of a block (K,).
     """
 
     vectors: NDArray[np.float16]
     hidden: F32
     at_m: F32
     block: NDArray[np.int32]
-    row: NDArray[np.int32]
     raster: Raster
     weights: SeenWeights
     spread: Spread
 
     @staticmethod
-    def of(
-        blocks: Iterable[PlaceBlock], weights: SeenWeights | None = None, spread: Spread | None = None
-    ) -> PlaceIndex:
-        """Return an index of all viewpoints of the blocks, of which one is in memory at a time.
+    def of(blocks: Iterable[SeenPlaces], names: Sequence[str] = ()) -> PlaceIndex:
+        """Return an index of all viewpoints of the blocks, one a map, of which one is in memory at a time.
 
-        weights, spread : how signatures are compared; by default all three, as the program has learned it.
+        names : of the signatures that are compared, as the program has learned it; by default all three.
         """
-        weights, spread = weights or seen_weights(), spread or seen_spread()
+        weights, spread = seen_weights(*names), seen_spread(*names)
         dimensions = weights.matrix.shape[1]
         vectors, hidden = [np.empty((0, dimensions), np.float16)], [np.empty(0, np.float32)]
-        at_m, number, row = [np.empty((0, 2), np.float32)], [np.empty(0, np.int32)], [np.empty(0, np.int32)]
+        at_m, number = [np.empty((0, 2), np.float32)], [np.empty(0, np.int32)]
         count = 0
-        for seen, first_row in blocks:
+        for seen in blocks:
             shares = seen.shares
             vectors.append(weights.of_places(shares).astype(np.float16))
             hidden.append(1.0 - shares[:, -1])
             at_m.append(seen.at_m)
             number.append(np.full(len(seen), count, np.int32))
-            row.append((seen.place + first_row).astype(np.int32))
             count += 1
         at, block = np.concatenate(at_m), np.concatenate(number)
         return PlaceIndex(
@@ -192,7 +181,6 @@ class PlaceIndex:
             hidden=np.concatenate(hidden),
             at_m=at,
             block=block,
-            row=np.concatenate(row),
             raster=Raster.of(at, block, count),
             weights=weights,
             spread=spread,
@@ -205,12 +193,6 @@ class PlaceIndex:
 
     def __len__(self) -> int:
         return len(self.vectors)
-
-    @property
-    def nbytes(self) -> int:
-        """Return the memory that it takes, bytes."""
-        columns = (self.vectors, self.hidden, self.at_m, self.block, self.row, self.raster.at)
-        return sum(column.nbytes for column in columns)
 
     def scores(self, views: Sequence[View]) -> F32:
         """Return the log-likelihood ratio (K, V) of each viewpoint and each view showing one place, by
@@ -346,11 +328,11 @@ class Places:
             self._indexes[by] = (
                 self.index().shuffled(self._chance)
                 if by == "shuffled"
-                else PlaceIndex.of(self.blocks(on_progress), seen_weights(*names), seen_spread(*names))
+                else PlaceIndex.of(self.blocks(on_progress), names)
             )
         return self._indexes[by]
 
-    def blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[PlaceBlock]:
+    def blocks(self, on_progress: Callable[[float], None] = lambda share: None) -> Iterator[SeenPlaces]:
         """Yield the isovists of the places of each session: as stored, or else computed from the map."""
         starts = np.flatnonzero(np.diff(self.table.session_index, prepend=-1)).tolist()
         # Those of a session are side by side.
@@ -361,7 +343,7 @@ class Places:
                 grid, centers_m = self._grid_of(session), self.table.center_m[begin:end]
                 seen = SeenPlaces.of(grid, centers_m, self.sight_m)
             on_progress((begin + len(np.unique(seen.place))) / len(self.table))
-            yield PlaceBlock(seen, begin)
+            yield seen
         on_progress(1.0)
 
     def areas(self, rows: I64) -> Iterator[Area]:
