@@ -11,7 +11,7 @@ import contextlib
 import json
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import fields
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
@@ -29,7 +29,6 @@ from signature.database.document import (
     PARTS,
     DatabaseDamage,
     StoredSession,
-    SubmapArrays,
     explained,
     row_crc,
 )
@@ -206,8 +205,7 @@ class SubmapDatabase(contextlib.AbstractContextManager["SubmapDatabase"]):
                 continue
             with explained(self.location, f"submaps of session {row.name!r}"):
                 document.check_bins(part, config)
-            columns = {field.name: getattr(part, field.name) for field in fields(SubmapArrays)}
-            tables.append(SignatureTable(session_index=np.full(len(part), index, np.int32), **columns))
+            tables.append(replace(part, session_index=np.full(len(part), index, np.int32)))
         if session is not None and not tables:
             self.row(session)
         return SignatureTable.concatenated(tables or [SignatureTable.of((), np.empty((0, 2)))])

@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from pc2grid.errors import DatabaseCorrupt, DatabaseError, Pc2GridError
-from pc2grid.geometry import F32, F64, frozen_arrays
+from pc2grid.geometry import F32, F64
 from pc2grid.io.messages.types import EDGES_M, FARTHEST_M
 from pc2grid.model import POINT_STEPS, Loop, OccupancyGrid, PointMap, Submap, Trajectory
 from pc2grid.submaps.submaps import divide
@@ -41,66 +41,18 @@ from signature.boundary import boundary_bins
 from signature.config import Config
 from signature.database.protocol import BuildingFrame, Entry, Problem, SessionInfo
 from signature.freespace import freespace_bins
-from signature.paper import I32, Signature, SignatureTable, describe
+from signature.paper import Signature, SignatureTable, describe
 from signature.visible import SIGNATURE_COLUMNS, SeenPlaces
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-@frozen_arrays(
-    submap_id=(np.int32, "N"),
-    center_m=(np.float64, "N", 2),
-    boundary=(np.float32, "N", "Nb"),
-    freespace=(np.float32, "N", "Nf"),
-    symmetry=(np.float32, "N", 2),
-)
-class SubmapArrays:
-    """The N submaps of a session: their centres and their signatures.
-
-    A submap is the part of the map around its centre that the settings of the session define
-    (`pc2grid.submaps.submaps.view_at`), so its cells are not stored twice.
-
-    submap_id (N,) : int32, increasing. center_m (N, 2) : float64, in the map frame. boundary (N, Nb),
-    freespace (N, Nf), symmetry (N, 2) : float32, as in `Signature`.
-    """
-
-    submap_id: I32
-    center_m: F64
-    boundary: F32
-    freespace: F32
-    symmetry: F32
-
-    def __len__(self) -> int:
-        return len(self.submap_id)
-
-    @staticmethod
-    def of(submaps: Sequence[Submap], signatures: Sequence[Signature], config: Config) -> SubmapArrays:
-        """Make the arrays of submaps and their signatures.
-
-        Raises ValueError for a number of signatures other than that of the submaps, and for submaps or
-        signatures that the configuration does not make.
-        """
-        if len(signatures) != len(submaps):
-            raise ValueError(f"{len(submaps)} submaps but {len(signatures)} signatures")
-        for submap in submaps:
-            if submap.radius_m != config.partition.radius_m:
-                raise ValueError(
-                    f"submap {submap.submap_id} has the radius {submap.radius_m:g} m where its settings"
-                    f" make {config.partition.radius_m:g} m"
-                )
-        table = SignatureTable.of(
-            signatures,
-            np.array([submap.center_m for submap in submaps]),
-            submap_id=[submap.submap_id for submap in submaps],
-        )
-        return SubmapArrays(**{field.name: getattr(table, field.name) for field in fields(SubmapArrays)})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredSession:
     """Everything that is stored of a session.
 
-    submaps : their centres and signatures. seen : visible surroundings of their
-    centres. frame : its place in its building; None if it was not joined with another session.
+    submaps : their centres and signatures; `session_index` is 0, and not stored. A submap is the part of the
+    map around its centre that the settings of the session define (`pc2grid.submaps.submaps.view_at`), so its
+    cells are not stored twice. seen : visible surroundings of their centres. frame : its place in its
+    building; None if it was not joined with another session.
     """
 
     info: SessionInfo
@@ -108,7 +60,7 @@ class StoredSession:
     trajectory: Trajectory
     loops: tuple[Loop, ...]
     points: PointMap | None
-    submaps: SubmapArrays
+    submaps: SignatureTable
     seen: SeenPlaces
     frame: BuildingFrame | None = None
 
@@ -136,7 +88,7 @@ def stored_session(entry: Entry) -> StoredSession:
     """Return a session as it is stored. Raises ValueError for content that its settings do not make."""
     session_map, signatures, provenance = entry
     grid, config = session_map.grid, provenance.config
-    submaps = SubmapArrays.of(session_map.submaps, signatures, config)
+    submaps = _table(session_map.submaps, signatures, config)
     return StoredSession(
         info=SessionInfo(
             name=stored_name(session_map.session),
@@ -163,6 +115,24 @@ def stored_session(entry: Entry) -> StoredSession:
     )
 
 
+def _table(submaps: Sequence[Submap], signatures: Sequence[Signature], config: Config) -> SignatureTable:
+    """Return the centres and signatures of submaps.
+
+    Raises ValueError for a number of signatures other than that of the submaps, and for submaps that the
+    configuration does not make.
+    """
+    if len(signatures) != len(submaps):
+        raise ValueError(f"{len(submaps)} submaps but {len(signatures)} signatures")
+    for submap in submaps:
+        if submap.radius_m != config.partition.radius_m:
+            raise ValueError(
+                f"submap {submap.submap_id} has the radius {submap.radius_m:g} m where its settings"
+                f" make {config.partition.radius_m:g} m"
+            )
+    centers_m, ids = np.array([submap.center_m for submap in submaps]), [s.submap_id for s in submaps]
+    return SignatureTable.of(signatures, centers_m, submap_id=ids)
+
+
 def completed(parts: Mapping[str, Any]) -> StoredSession:
     """Complete a session of which parts were lost.
 
@@ -177,7 +147,7 @@ def completed(parts: Mapping[str, Any]) -> StoredSession:
     if "submaps" not in found:
         _, submaps = divide(grid, config.partition)
         signatures = [describe(submap, config.signature) for submap in submaps]
-        found["submaps"] = SubmapArrays.of(submaps, signatures, config)
+        found["submaps"] = _table(submaps, signatures, config)
         found["info"] = replace(found["info"], submaps=len(submaps))
         found.pop("seen", None)
     if found["points"] is None:
@@ -212,6 +182,7 @@ def encode(part: str, value: Any) -> bytes:
     """Return a part of a session as it is stored."""
     content, arrays = _ADAPTERS[part].dump_python(value), {}
     if isinstance(content, dict):
+        content.pop("session_index", None)
         arrays = {name: field for name, field in content.items() if isinstance(field, np.ndarray)}
         content = {name: field for name, field in content.items() if name not in arrays}
     return pack(content, arrays, compress=part not in _UNCOMPRESSED)
@@ -220,6 +191,8 @@ def encode(part: str, value: Any) -> bytes:
 def decode(part: str, data: bytes) -> Any:
     """Return the inverse of `encode`. Raises ValueError and others for damaged content."""
     content, arrays = unpack(data)
+    if part == "submaps":
+        arrays["session_index"] = np.zeros(len(arrays.get("submap_id", ())), np.int32)
     value = _ADAPTERS[part].validate_python({**content, **arrays} if isinstance(content, dict) else content)
     if value is None and part not in ("points", "frame"):
         raise ValueError("is not there")
@@ -383,7 +356,7 @@ def check_points(points: PointMap | None, info: SessionInfo, _: object = None) -
     _each(code[1:] > code[:-1], "the voxel after {} is not after it")
 
 
-def check_submaps(submaps: SubmapArrays, info: SessionInfo, grid: OccupancyGrid | None) -> None:
+def check_submaps(submaps: SignatureTable, info: SessionInfo, grid: OccupancyGrid | None) -> None:
     """Check that submap ids increase, submaps lie on their map, and histograms have the sum 1, or 0."""
     _as_many(len(submaps), info.submaps, "submaps")
     _each(np.diff(submaps.submap_id, prepend=-1) > 0, "the number of submap {} does not increase")
@@ -404,7 +377,7 @@ def check_histograms(histograms: F32, what: str) -> None:
     _each((histograms >= 0).all(axis=1), f"{what} histogram {{}} has a negative share")
 
 
-def check_bins(submaps: SubmapArrays, config: Config) -> None:
+def check_bins(submaps: SignatureTable, config: Config) -> None:
     """Check the number of bins against the configuration; other histograms cannot be compared with a
     query's."""
     radius_m, bins = config.partition.radius_m, (submaps.boundary.shape[1], submaps.freespace.shape[1])
