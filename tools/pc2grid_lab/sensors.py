@@ -182,9 +182,8 @@ class PlanDrives:
         self, length_m: float, seed: int, start_m: tuple[float, float] | None = None
     ) -> SimulationConfig:
         """Return the configuration of one drive."""
-        rates = {sensor: {"rate_hz": self.rate} for sensor in SENSORS}
         one = {"length_m": length_m, "seed": seed, "clutter": self.clutter, "start_m": start_m}
-        return SimulationConfig.model_validate({**one, **rates})
+        return SimulationConfig.model_validate(one | {sensor: {"rate_hz": self.rate} for sensor in SENSORS})
 
     @property
     def mapping(self) -> SimulationConfig:

@@ -213,13 +213,13 @@ def trajectory(*stamps_s: float) -> Trajectory:
 def test_true_poses_are_interpolated_or_carried() -> None:
     own = trajectory(*np.arange(0.0, 30.0, 0.25))
     dense = RecordedDrive((), trajectory(0.0, 0.2, 0.4))
-    between = dense.true_pose(100_000_000)
-    assert between is not None and (between.x, between.y) == pytest.approx((0.1, 0.01))
+    part, between = dense.where(100_000_000) or (0, SE2())
+    assert part == -1 and (between.x, between.y) == pytest.approx((0.1, 0.01))
     sparse = RecordedDrive((own,), trajectory(0.0, 1.0, 8.0))
-    carried = sparse.true_pose(6_000_000_000)
-    assert carried is not None and (carried.x, carried.yaw) == pytest.approx((6.0, 0.3))
-    assert sparse.true_pose(25_000_000_000) is None  # 17 s from the last true pose
-    assert RecordedDrive((), trajectory(0.0, 8.0)).true_pose(6_000_000_000) is None
+    part, carried = sparse.where(6_000_000_000) or (0, SE2())
+    assert part == -1 and (carried.x, carried.yaw) == pytest.approx((6.0, 0.3))
+    assert sparse.where(25_000_000_000) is None  # 17 s from the last true pose
+    assert RecordedDrive((), trajectory(0.0, 8.0)).where(6_000_000_000) is None
 
 
 def test_a_world_that_lies_as_the_first_image_is_put_upright() -> None:

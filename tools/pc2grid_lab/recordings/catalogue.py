@@ -556,18 +556,17 @@ def own_recordings(data: Path, *, without: Path, of_base: bool) -> tuple[list[Re
     if not data.is_dir():
         raise ConfigError(f"{data}: no such folder", hint="give the folder of recordings")
     named = {recording.file for recording in RECORDINGS}
-    lengths_s: dict[Recording, float | None] = {}
-    for file in _recordings(data, without.resolve()):
-        if file.relative_to(data).as_posix() not in named:
-            recording, length_s = _row(data, file, of_base)
-            lengths_s[recording] = length_s
+    lengths_s = dict(
+        _row(data, file, of_base)
+        for file in _recordings(data, without.resolve())
+        if file.relative_to(data).as_posix() not in named
+    )
     pairs = []
     for query, length_s in lengths_s.items():
         if length_s is None:
             continue
         until_s = beginning_s(length_s)
-        later = _asked("later part", query, query, length_s - until_s)
-        pairs += [replace(later, until_s=until_s)]
+        pairs.append(_asked("later part", query, query, length_s - until_s, until_s))
         pairs += [
             _asked("other day", query, other, length_s)
             for other, other_s in lengths_s.items()
@@ -623,11 +622,13 @@ def _row(data: Path, file: Path, of_base: bool) -> tuple[Recording, float | None
     return recording, length_s
 
 
-def _asked(kind: PairKind, query: Recording, map_: Recording, asked_s: float) -> Pair:
-    """Return windows of the last `asked_s` of a recording, or of all of it."""
+def _asked(
+    kind: PairKind, query: Recording, map_: Recording, asked_s: float, until_s: float | None = None
+) -> Pair:
+    """Return windows of the last `asked_s` of a recording, or of all of it. until_s : see `Pair`."""
     window_s = round(min(_WINDOW_S, asked_s / 2), 1)
     windows = min(_WINDOWS, round(2 * asked_s / max(window_s, 0.1)))
-    return Pair(kind, query.name, map_.name, window_s, windows, quick=True)
+    return Pair(kind, query.name, map_.name, window_s, windows, until_s=until_s, quick=True)
 
 
 _CLUTTER, _RATE_HZ, _COLUMNS = 15, 5.0, 720

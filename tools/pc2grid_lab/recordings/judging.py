@@ -107,28 +107,25 @@ class RecordedDrive:
         return None
 
     def where(self, stamp_ns: int) -> tuple[int, SE2] | None:
-        """Return the same; of a recording with true poses the part is -1, and the pose the true one."""
-        if self.truth is None:
-            return self.own_pose(stamp_ns)
-        true = self.true_pose(stamp_ns)
-        return None if true is None else (-1, true)
+        """Return the same; of a recording with true poses the part is -1, and the pose the true one.
 
-    def true_pose(self, stamp_ns: int) -> SE2 | None:
-        """Return t_world_base by the true poses; where they are far apart, carried on by the own
-        trajectory."""
-        assert self.truth is not None
-        T, own = pose_at_stamp(self.truth, stamp_ns, same_ns=SAME_NS, gap_ns=_GAP_NS), self.own_pose(stamp_ns)
+        Where true poses are far apart, the own trajectory around the stamp is laid on those there.
+        """
+        own, truth = self.own_pose(stamp_ns), self.truth
+        if truth is None:
+            return own
+        T = pose_at_stamp(truth, stamp_ns, same_ns=SAME_NS, gap_ns=_GAP_NS)
         if T is not None:
-            return SE2.from_matrix(T)
+            return -1, SE2.from_matrix(T)
         if own is None:
             return None
-        near = np.flatnonzero(np.abs(self.truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
+        near = np.flatnonzero(np.abs(truth.stamps_ns - stamp_ns) <= _CARRIED_NS)
         pairs = [
-            (there[1], SE2.from_matrix(self.truth.T_session_base[k]))
+            (there[1], SE2.from_matrix(truth.T_session_base[k]))
             for k in near.tolist()
-            if (there := self.own_pose(int(self.truth.stamps_ns[k]))) is not None and there[0] == own[0]
+            if (there := self.own_pose(int(truth.stamps_ns[k]))) is not None and there[0] == own[0]
         ]
-        return fit_frame(pairs, AHEAD_M) @ own[1] if pairs else None
+        return (-1, fit_frame(pairs, AHEAD_M) @ own[1]) if pairs else None
 
 
 @cache
@@ -499,12 +496,11 @@ class Judge:
             carried = put_down_ns is not None and said["stamp_ns"] >= put_down_ns
             name = one.after if carried and one.after is not None else one.before
             own_ns = said["stamp_ns"] - (shift_ns if carried else 0)
-            place, right = self._followed_place(one, name, own_ns), None
-            if said["pose"] is not None and place is not None:
-                right = is_right(_pose(said), *place)[0]
+            place = self._followed_place(one, name, own_ns)
+            right = is_right(_pose(said), *place)[0] if said["pose"] is not None and place else None
             parts = drive_of(self._catalogue.recordings[name], self._folder).parts
-            begin_ns = int(parts[0].stamps_ns[0]) + round((one.until_s or 0.0) * 1e9)
-            begin_ns = put_down_ns - shift_ns if carried else begin_ns
+            began_ns = int(parts[0].stamps_ns[0]) + round((one.until_s or 0.0) * 1e9)
+            begin_ns = put_down_ns - shift_ns if carried else began_ns
             ways = [np.interp((begin_ns, own_ns), part.stamps_ns, part.path_m()) for part in parts]
             since_s, since_m = (own_ns - begin_ns) * 1e-9, float(sum(np.ptp(way) for way in ways))
             given_up = said["state"] in NOTICED and _was_right(looks)
