@@ -27,7 +27,7 @@ from pc2grid_cli import console, options, output
 from signature.database import SubmapDatabase, open_database
 from signature.database.protocol import BuildingFrame, SessionInfo
 from signature.localization.answer import Answer
-from signature.shown.page import write_report
+from signature.shown.page import Found, write_report
 from signature.shown.picture import draw_building, draw_session
 
 BuildingFrames = Mapping[str, BuildingFrame]
@@ -232,21 +232,26 @@ def _write_mcap(path: Path, database: SubmapDatabase, session: str, given: optio
 
 
 def write_answer(
-    path: Path, database: SubmapDatabase, answer: Answer, located: Trajectory, force: bool
+    path: Path, database: SubmapDatabase, answer: Found, located: Trajectory, force: bool
 ) -> None:
-    """Write a located recording in the map. located : its poses there."""
-    assert answer.session is not None
-    assert answer.T_map_base is not None
-    assert answer.T_map_odom is not None
-    assert answer.covariance is not None
-    first, last = int(located.stamps_ns[0]), int(located.stamps_ns[-1])
+    """Write what was located in the map: a recording, whose poses there are `located`; or another map, with
+    map -> query_map between them."""
+    assert answer.session is not None and answer.covariance is not None
+    assert answer.T_map_base is not None and answer.T_map_odom is not None
+    first, last = (int(located.stamps_ns[k]) for k in (0, -1)) if len(located) else (0, 0)
     with LogWriter.to(path, overwrite=force) as writer:
         _write_map_message(writer, database, answer.session, first)
+        T_map_odom, T_odom_map = answer.T_map_odom.lift(), answer.T_map_odom.inverse().lift()
+        if answer.drawn is not None:
+            writer.write("/query_map", 0, export.occupancy_grid(0, answer.drawn, "query_map"))
+            writer.tf_static(0, "map", "query_map", T_map_odom)
+            writer.markers("/hypotheses", 0, [_hypotheses(answer)])
+            writer.write("/pose", 0, export.pose_with_covariance(0, answer.T_map_odom, answer.covariance))
+            return
         way = database.trajectory(answer.session)
         if len(way):
             writer.path("/path", way, stamp_ns=first)
         writer.path("/query_path", located, stamp_ns=first)
-        T_map_odom, T_odom_map = answer.T_map_odom.lift(), answer.T_map_odom.inverse().lift()
         for stamp_ns, T_map_base in zip(located.stamps_ns, located.T_session_base, strict=True):
             # Each time anew: tf2 does not extrapolate from one transform on /tf.
             writer.tf(int(stamp_ns), "map", "odom", T_map_odom)
@@ -255,21 +260,6 @@ def write_answer(
         pose = last, answer.T_map_base, answer.covariance
         writer.write("/pose", last, export.pose_with_covariance(*pose))
         writer.write("/initialpose", last, export.initialpose(*pose))
-
-
-def write_located_map(
-    path: Path, database: SubmapDatabase, answer: Answer, query: OccupancyGrid, force: bool
-) -> None:
-    """Write a map that was located in another one: both grids, and map -> query_map between them."""
-    assert answer.session is not None
-    assert answer.T_map_odom is not None
-    assert answer.covariance is not None
-    with LogWriter.to(path, overwrite=force) as writer:
-        _write_map_message(writer, database, answer.session, 0)
-        writer.write("/query_map", 0, export.occupancy_grid(0, query, "query_map"))
-        writer.tf_static(0, "map", "query_map", answer.T_map_odom.lift())
-        writer.markers("/hypotheses", 0, [_hypotheses(answer)])
-        writer.write("/pose", 0, export.pose_with_covariance(0, answer.T_map_odom, answer.covariance))
 
 
 def _write_map_message(
@@ -305,5 +295,4 @@ def _hypotheses(answer: Answer) -> Marker:
 
 def _lift(points_m: F64 | list[tuple[float, float]]) -> F64:
     """Return points (N, 2) as (N, 3) at z = 0."""
-    flat = np.asarray(points_m, np.float64).reshape(-1, 2)
-    return np.column_stack((flat, np.zeros(len(flat))))
+    return np.pad(np.asarray(points_m, np.float64).reshape(-1, 2), ((0, 0), (0, 1)))

@@ -30,7 +30,7 @@ from pc2grid.matching.score import Fit
 from pc2grid.model import SENSOR_MODELS, Trajectory
 from pc2grid.observer import Observer, TimeSpan
 from pc2grid_cli import console, known_pose, options, output
-from pc2grid_cli.export import write_answer, write_located_map
+from pc2grid_cli.export import write_answer
 from pc2grid_cli.output import Document
 from signature.config import Config
 from signature.database import SubmapDatabase
@@ -313,9 +313,7 @@ def _write(
         write_trajectory(outputs["trajectory"], in_map(found.poses, stated) or located)
     if "initialpose" in outputs and stated.T_map_base is not None and stated.covariance is not None:
         write_initialpose(outputs["initialpose"], stated.stamp_ns, stated.T_map_base, stated.covariance)
-    if "output" in outputs and found.drawn is not None:
-        write_located_map(outputs["output"], database, found, found.drawn, force)
-    elif "output" in outputs and located is not None:
+    if "output" in outputs and located is not None:
         write_answer(outputs["output"], database, found, located, force)
     if "plot" in outputs:
         draw_answer(outputs["plot"], database, found, found.poses)
