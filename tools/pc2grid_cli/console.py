@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import math
 import os
 import signal
 import sys
@@ -112,9 +111,7 @@ class Console(ProgressBars):
         else:
             message = f"internal error: {type(error).__name__}: {error}"
             hint, code = "this is a bug; run again with --debug and report what it prints", FAILED
-        print(f"pc2grid: error: {one_line(message)}", file=sys.stderr)
-        if hint:
-            print(f"hint: {one_line(hint)}", file=sys.stderr)
+        _print_error(message, hint)
         return code
 
     def run(self, command: Callable[[], Any]) -> int:
@@ -180,17 +177,10 @@ def print_result(result: Any, indent: int | None = 1) -> None:
 
 def json_text(document: Any, indent: int | None = 1) -> str:
     """Return a document as JSON. JSON has no NaN and no infinity: such a value becomes null."""
-    return json.dumps(_finite(document), indent=indent, ensure_ascii=False, allow_nan=False)
+    from pydantic_core import to_jsonable_python
 
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, dict):
-        return {key: _finite(inner) for key, inner in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(inner) for inner in value]
-    return value
+    finite = to_jsonable_python(document, inf_nan_mode="null")
+    return json.dumps(finite, indent=indent, ensure_ascii=False, allow_nan=False)
 
 
 @contextlib.contextmanager
@@ -238,12 +228,16 @@ def _report_usage(error: Any) -> int:
     context = getattr(error, "ctx", None)
     if type(error).__name__ == "NoArgsIsHelpError":
         print(error.ctx.get_help(), file=sys.stderr)
-        return USAGE
-    message = " ".join(error.format_message().split())  # click lists choices on lines of their own
-    print(f"pc2grid: error: {one_line(message)}", file=sys.stderr)
-    if context is not None:
-        print(f"hint: {context.command_path} --help", file=sys.stderr)
+    else:  # click lists choices on lines of their own
+        _print_error(" ".join(error.format_message().split()), context and f"{context.command_path} --help")
     return USAGE
+
+
+def _print_error(message: str, hint: str | None) -> None:
+    """Print what went wrong in one line, and what to do next in another."""
+    print(f"pc2grid: error: {one_line(message)}", file=sys.stderr)
+    if hint:
+        print(f"hint: {one_line(hint)}", file=sys.stderr)
 
 
 class _StopSignal:

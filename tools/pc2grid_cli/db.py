@@ -128,7 +128,8 @@ def join(given: options.DbJoin, terminal: console.Console) -> None:
     """Compare every two sessions, store how they lie to each other, and print it."""
     from signature.join.building import join_sessions
 
-    output.check_file("plot", given.plot, given.force)
+    if given.plot is not None:
+        output.check_file("plot", given.plot, given.force)
     with open_database(given.database) as opened:
         names = [info.name for info in opened.sessions()]
         if len(names) < 2:

@@ -49,15 +49,13 @@ _OF_OTHERS = {suffix for known in SUFFIXES.values() for suffix in known} | {".ba
 """Suffixes of formats that a database or the stem of a map must not be named after."""
 
 
-def check_file(option: str, path: Path | None, force: bool) -> None:
-    """Refuse a file that the option `--{option}` cannot write; None is no file.
+def check_file(option: str, path: Path, force: bool) -> None:
+    """Refuse a file that the option `--{option}` cannot write.
 
     A name without a suffix is taken, unless the suffix selects the format.
 
     Raises OutputError for a suffix of another format, and as `require_writable`.
     """
-    if path is None:
-        return
     known, suffix = SUFFIXES[option], path.suffix.lower()
     if suffix not in known and (suffix or option == "cloud"):
         raise OutputError(
