@@ -44,17 +44,6 @@ class ConvertedInputs:
     severe: bool = False
     warnings: list[str] = field(default_factory=list)
 
-    def document(self) -> Document:
-        """Return what `--json` prints."""
-        return {
-            "database": self.database,
-            "lossy": self.lossy,
-            "sessions": self.sessions,
-            "unchanged": self.unchanged,
-            "failed": self.failed,
-            "joined": self.joined,
-        }
-
     def add(self, entry: Entry, given: options.Convert) -> None:
         """Keep and print a session made of one input."""
         session, _, origin = entry
@@ -209,7 +198,15 @@ def _conclude(done: ConvertedInputs, given: options.Convert) -> int | None:
     """Print what there is now, and what is to be said of it. Return the exit code."""
     count, path = len(given.inputs), Path(given.output)
     if given.json:
-        console.print_result(plain(done.document()))
+        document = {
+            "database": done.database,
+            "lossy": done.lossy,
+            "sessions": done.sessions,
+            "unchanged": done.unchanged,
+            "failed": done.failed,
+            "joined": done.joined,
+        }
+        console.print_result(plain(document))
     elif path.is_file():
         print(f"{done.database}: {path.stat().st_size / 1e6:.1f} MB")
     for warning in done.warnings:

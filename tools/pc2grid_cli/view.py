@@ -70,27 +70,20 @@ def run(given: options.ViewDatabase, terminal: console.Console) -> None:
         locator.pages = server.pages
         server.pages[""] = live_page(opened)
         try:
-            _serve(server, locator, given, terminal)
+            print(server.url, flush=True)
+            if given.source is None:
+                terminal.note("drop a recording onto the page; Ctrl-C ends this")
+            if not given.no_browser:
+                _open_browser(server.url)
+            if given.source is None:
+                server.serve_forever()
+                return
+            with server.in_background():
+                locator.follow(given.source)
+                terminal.note("the page stays as it is; Ctrl-C ends this")
+                threading.Event().wait()
         finally:
             server.stop()
-
-
-def _serve(
-    server: ViewServer, locator: Locator, given: options.ViewDatabase, terminal: console.Console
-) -> None:
-    """Print the address, and serve; follow the source, if there is one."""
-    print(server.url, flush=True)
-    if given.source is None:
-        terminal.note("drop a recording onto the page; Ctrl-C ends this")
-    if not given.no_browser:
-        _open_browser(server.url)
-    if given.source is None:
-        server.serve_forever()
-        return
-    with server.in_background():
-        locator.follow(given.source)
-        terminal.note("the page stays as it is; Ctrl-C ends this")
-        threading.Event().wait()
 
 
 class Locator:

@@ -176,10 +176,19 @@ class _Robot:
         may_reset = self._resets.allows(answer.state)
         if session is None or not answer.is_told:
             return []
-        return [
-            *self._tell_map(publisher, answer, session, lock),
-            *self._tell_pose(publisher, live, answer, may_reset),
-        ]
+        told = self._tell_map(publisher, answer, session, lock)
+        if self._given.publish == "initialpose" and may_reset:
+            assert answer.covariance is not None
+            publisher.initialpose(*_now(answer, live), answer.covariance)
+            told.append("/initialpose")
+        if self._given.publish == "tf":
+            T_map_odom, odom_frame = answer.T_map_odometry, live.poses.frame
+            if T_map_odom is None or odom_frame is None:
+                console.warn("--publish tf: the robot has no odometry; nothing is published")
+            else:
+                publisher.start_tf(odom_frame, T_map_odom, live.now_ns)
+                told.append("/tf")
+        return told
 
     def _tell_map(
         self, publisher: Nav2Publisher, answer: Answer, session: str, lock: threading.Lock
@@ -191,24 +200,6 @@ class _Robot:
             grid = map_of(self.database, session, self.frames)
         publisher.map(answer.stamp_ns, grid)
         return ["/map"]
-
-    def _tell_pose(
-        self, publisher: Nav2Publisher, live: LiveLog, answer: Answer, may_reset: bool
-    ) -> list[str]:
-        publish = self._given.publish
-        if publish == "initialpose" and may_reset:
-            assert answer.covariance is not None
-            stamp_ns, T_map_base = _now(answer, live)
-            publisher.initialpose(stamp_ns, T_map_base, answer.covariance)
-            return ["/initialpose"]
-        if publish != "tf":
-            return []
-        T_map_odom, odom_frame = answer.T_map_odometry, live.poses.frame
-        if T_map_odom is None or odom_frame is None:
-            console.warn("--publish tf: the robot has no odometry; nothing is published")
-            return []
-        publisher.start_tf(odom_frame, T_map_odom, live.now_ns)
-        return ["/tf"]
 
 
 def _now(answer: Answer, live: LiveLog) -> tuple[int, SE2]:
