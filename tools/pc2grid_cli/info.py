@@ -7,7 +7,7 @@ import math
 from dataclasses import dataclass, fields
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -18,9 +18,6 @@ from pc2grid.geometry import invert_pose, transform_points
 from pc2grid.io.source import Choice, LogInfo, is_submap_file
 from pc2grid.model import SENSOR_MODELS
 from pc2grid_cli import console, options, output
-
-if TYPE_CHECKING:
-    from pc2grid.grids.drawn import DrawnMap
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,6 +68,8 @@ def describe_map(path: Path, assignments: list[str] | None = None) -> dict[str, 
     drawn = load_drawn_map(path, options.Settings(assignments=assignments).settings())
     grid, R = drawn.grid, drawn.T_map_file[:3, :3]
     height, width = grid.cells.shape
+    middle = [*grid.to_point(np.array([(height // 2, width // 2)]))[0], 0.0]
+    floor_z_m = float(transform_points(invert_pose(drawn.T_map_file), np.array([middle]))[0, 2])
     return {
         "path": str(path),
         "format": drawn.kind,
@@ -81,17 +80,10 @@ def describe_map(path: Path, assignments: list[str] | None = None) -> dict[str, 
         "free_m2": round(grid.free_m2, 2),
         "occupied_m2": round(float(np.count_nonzero(grid.occupied)) * grid.resolution_m**2, 2),
         "voxels": len(drawn.level_points_m),
-        "floor_z_m": round(_floor_z_m(drawn), 3),
+        "floor_z_m": round(floor_z_m, 3),  # in the frame of the file, in the middle of the map
         "tilt_deg": round(math.degrees(math.acos(min(1.0, float(R[2, 2])))), 2),
         "warnings": list(drawn.warnings),
     }
-
-
-def _floor_z_m(drawn: DrawnMap) -> float:
-    """Return the height of the floor in the frame of the file, in the middle of the map."""
-    height, width = drawn.grid.cells.shape
-    middle = drawn.grid.to_point(np.array([(height // 2, width // 2)]))[0]
-    return float(transform_points(invert_pose(drawn.T_map_file), np.array([[*middle, 0.0]]))[0, 2])
 
 
 def _map_as_text(d: dict[str, Any]) -> str:

@@ -72,11 +72,12 @@ def files_of(given: object, names: Iterable[str]) -> dict[str, Path]:
 
 def written_files(outputs: Mapping[str, Path]) -> list[Path]:
     """Return the files of some options; `map` names the stem of two."""
-    files = []
-    for option, path in outputs.items():
-        ends = (".yaml", ".pgm") if option == "map" else ("",)
-        files += [path.with_name(f"{path.name}{end}") for end in ends]
-    return files
+    ends = {"map": (".yaml", ".pgm")}
+    return [
+        path.with_name(f"{path.name}{end}")
+        for option, path in outputs.items()
+        for end in ends.get(option, ("",))
+    ]
 
 
 def map_stem(path: Path) -> Path:
