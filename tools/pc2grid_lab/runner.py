@@ -75,6 +75,7 @@ def commit() -> str:
 
 
 T = TypeVar("T")
+Key = TypeVar("Key")
 Advance = Callable[[float], object]
 
 
@@ -101,6 +102,14 @@ def once(path: Path, make: Callable[[], T]) -> T:
     if not path.exists():
         keep(path, make())
     return cast(T, kept(path))
+
+
+def grouped(pairs: Iterable[tuple[Key, T]]) -> dict[Key, list[T]]:
+    """Return the values of each key, in the order in which they come."""
+    groups: dict[Key, list[T]] = {}
+    for key, value in pairs:
+        groups.setdefault(key, []).append(value)
+    return groups
 
 
 def names_of(files: Sequence[Path]) -> list[str]:

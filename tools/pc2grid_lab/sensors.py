@@ -37,7 +37,7 @@ from pc2grid_lab.commands import CompareSensors
 from pc2grid_lab.pages import Cell, print_cells
 from pc2grid_lab.recordings.catalogue import MAP_DRIVE
 from pc2grid_lab.recordings.table import QueryRow, counts_of
-from pc2grid_lab.runner import in_processes, names_of, once, write_text
+from pc2grid_lab.runner import grouped, in_processes, names_of, once, write_text
 from pc2grid_lab.truth import AHEAD_M, JUDGEMENT, apart, fit_frame, is_right
 from signature.config import Config
 from signature.localization.localizer import Localizer
@@ -324,11 +324,11 @@ def matrix(trials: Sequence[Trial]) -> list[Cell]:
     """Return the figures of the trials that lie in the map of their own building, by map sensor, query sensor
     and travel: shares of all, of the located ones (wrong), of the first right place among the first
     `RECALL_AT` retrieved ones; errors of those that are located and right, metres."""
-    groups: dict[tuple[str, str, float], list[QueryRow]] = {}
-    for trial in trials:
-        if trial.in_building and trial.row.covered and trial.row.travel_m is not None:
-            key = (trial.map_sensor, trial.query_sensor, trial.row.travel_m)
-            groups.setdefault(key, []).append(trial.row)
+    groups = grouped(
+        ((trial.map_sensor, trial.query_sensor, trial.row.travel_m), trial.row)
+        for trial in trials
+        if trial.in_building and trial.row.covered and trial.row.travel_m is not None
+    )
     names = ("map_sensor", "query_sensor", "travel_m")
     return [{**dict(zip(names, key, strict=True)), **_figures(groups[key])} for key in sorted(groups)]
 

@@ -15,6 +15,7 @@ from pc2grid_lab.recordings.table import (
     RowChange,
     Table,
     changes,
+    counts_of,
     markdown_page,
     sensor_matrix,
     show,
@@ -196,8 +197,8 @@ def test_the_matrix_of_sensors_shows_its_gaps() -> None:
 def test_answers_that_are_not_judged_are_counted_beside_right_and_wrong() -> None:
     located = replace(query(0, "right"), right=None)
     row = pair_row(queries=(query(1, "right"), query(2, "refused"), located), sensors="laser in map")
-    counts = [row.counts[outcome] for outcome in ("right", "wrong", "not judged", "refused")]
-    assert counts == [1, 0, 1, 1]
+    counts = counts_of(row.queries)
+    assert [counts[outcome] for outcome in ("right", "wrong", "not judged", "refused")] == [1, 0, 1, 1]
     text = markdown_page(table(row))
     assert "0 wrong, 1 not judged (1 building)" in text
     assert "2 located answers none is known to be wrong; 1 are not judged" in text and "## Not judged" in text

@@ -63,6 +63,7 @@ from pc2grid_lab.runner import (
     FRONT,
     LABORATORY,
     digest_of_sources,
+    grouped,
     in_processes,
     keep,
     kept,
@@ -119,9 +120,8 @@ def paper_tasks(
 def that_share_submaps(tasks: Iterable[PaperTask]) -> list[list[PaperTask]]:
     """Return the tasks of each map and radius, for `computed_cells`: by the queries that they share; the most
     first."""
-    groups: dict[tuple[Path, float], list[PaperTask]] = {}
-    for task in sorted(tasks, key=lambda task: (task.offset_m, task.level)):
-        groups.setdefault((task.map_path, task.radius_m), []).append(task)
+    by_queries = sorted(tasks, key=lambda task: (task.offset_m, task.level))
+    groups = grouped(((task.map_path, task.radius_m), task) for task in by_queries)
     return sorted(groups.values(), key=len, reverse=True)
 
 
@@ -652,12 +652,11 @@ class Measures(NamedTuple):
 
 def _rows(text: str) -> dict[str, dict[str, Measures]]:
     """Parse a table: each line has a name and, for each map, AUC, RP9 and F1 in thousandths."""
-    table = {}
-    for line in text.strip().splitlines():
-        name, *numbers = line.split()
-        values = [int(number) / 1000 for number in numbers]
-        table[name] = {m: Measures(*values[3 * i : 3 * i + 3]) for i, m in enumerate(MAPS)}
-    return table
+    rows = (line.split() for line in text.strip().splitlines())
+    return {
+        name: {m: Measures(*(int(n) / 1000 for n in numbers[3 * i : 3 * i + 3])) for i, m in enumerate(MAPS)}
+        for name, *numbers in rows
+    }
 
 
 TABLE_3 = (

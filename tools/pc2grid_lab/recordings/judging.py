@@ -39,7 +39,7 @@ from pc2grid_lab.recordings.table import (
     Warned,
     WarningVerdict,
 )
-from pc2grid_lab.runner import NOT_RUN, Finished, kept_result
+from pc2grid_lab.runner import NOT_RUN, Finished, grouped, kept_result
 from pc2grid_lab.truth import (
     AGREEMENT,
     AHEAD_M,
@@ -375,9 +375,8 @@ class LocatedWindow:
     @property
     def places(self) -> list[tuple[str, SE2, int]]:
         """Return session, pose and number of the place of each hypothesis, best first."""
-        if self.answer is None:
-            return []
-        return [(h["session"], SE2(h["x"], h["y"], h["yaw"]), h["place"]) for h in self.answer["hypotheses"]]
+        hypotheses = [] if self.answer is None else self.answer["hypotheses"]
+        return [(h["session"], SE2(h["x"], h["y"], h["yaw"]), h["place"]) for h in hypotheses]
 
 
 class Judge:
@@ -570,19 +569,20 @@ class Judge:
         for query, map_ in itertools.permutations(known, 2):
             if lie.has_edge(query.name, map_.name) or query.sensor == "map":
                 continue
-            clues, within_m = [], []
             pair = self._asked(query.name, map_.name)
             known_by = {} if pair is None else self._frames(pair)[2]
-            for part in drive_of(query, self._folder).parts[:1]:
-                for k in _steps(part, AGREEMENT.place_m):
-                    place = self._lies_at(query, map_, int(part.stamps_ns[k]), known_by)
-                    if place is not None:
-                        clues.append(Clue(SE2.from_matrix(part.T_session_base[k]), place[0]))
-                        within_m.append(place[1])
-            if len(clues) >= 2:
-                back = tuple(Clue(clue.T_map_base, clue.T_drive_base) for clue in clues)
-                lie.add_edge(query.name, map_.name, frame=Frame(tuple(clues), min(within_m)))
-                lie.add_edge(map_.name, query.name, frame=Frame(back, min(within_m)))
+            places = [
+                (SE2.from_matrix(part.T_session_base[k]), place)
+                for part in drive_of(query, self._folder).parts[:1]
+                for k in _steps(part, AGREEMENT.place_m)
+                if (place := self._lies_at(query, map_, int(part.stamps_ns[k]), known_by)) is not None
+            ]
+            if len(places) >= 2:
+                within_m = min(within_m for _, (_, within_m) in places)
+                there = tuple(Clue(own, pose) for own, (pose, _) in places)
+                back = tuple(Clue(pose, own) for own, (pose, _) in places)
+                lie.add_edge(query.name, map_.name, frame=Frame(there, within_m))
+                lie.add_edge(map_.name, query.name, frame=Frame(back, within_m))
         return lie
 
     def _lies_at(
@@ -735,10 +735,7 @@ def _frames_by(
     said: Iterable[tuple[tuple[int, str], Clue]], frame_of: Callable[[list[Clue]], Frame | None]
 ) -> Frames:
     """Return the frames that follow from the clues of each part of a drive and session of a map."""
-    groups: dict[tuple[int, str], list[Clue]] = {}
-    for key, clue in said:
-        groups.setdefault(key, []).append(clue)
-    found = ((key, frame_of(clues)) for key, clues in groups.items())
+    found = ((key, frame_of(clues)) for key, clues in grouped(said).items())
     return {key: frame for key, frame in found if frame is not None}
 
 

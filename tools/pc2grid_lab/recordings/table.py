@@ -21,7 +21,7 @@ from pc2grid.display import counted
 from pc2grid_cli import output
 from pc2grid_lab.pages import ALPHA, Heads, by_chance, markdown, number, share, strong
 from pc2grid_lab.recordings.catalogue import FOREIGN_MAPS, PAIR_KINDS
-from pc2grid_lab.runner import NOT_RUN
+from pc2grid_lab.runner import NOT_RUN, grouped
 
 MISSING = "not in the data folder"
 FINE = 0.9
@@ -124,21 +124,23 @@ def judged(right: bool | None) -> str:
     return "not judged" if right is None else "right" if right else "wrong"
 
 
-def counts_of(queries: Iterable[QueryRow]) -> Counter[str]:
+def counts_of(queries: Sequence[QueryRow]) -> Counter[str]:
     """Return how many queries have each outcome, and how many are of a kind.
 
     queries : all. located : right, wrong, or not judged. covered : judged, and in the map; covered right : of
     those, located and right. overlooked : missed by the search alone, see `FINE`.
     """
-    counts: Counter[str] = Counter()
-    for query in queries:
-        counts[query.outcome] += 1
-        counts["queries"] += 1
-        counts["located"] += query.located
-        counts["covered"] += query.covered is True
-        counts["covered right"] += query.covered is True and query.outcome == "right"
-        counts["overlooked"] += query.overlooked
-    return counts
+    covered = [query for query in queries if query.covered]
+    return Counter(
+        {
+            **Counter(query.outcome for query in queries),
+            "queries": len(queries),
+            "located": sum(query.located for query in queries),
+            "covered": len(covered),
+            "covered right": sum(query.outcome == "right" for query in covered),
+            "overlooked": sum(query.overlooked for query in queries),
+        }
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -163,11 +165,6 @@ class PairRow:
     def name(self) -> str:
         """Return the name of the row."""
         return f"{self.query} in {self.map}"
-
-    @property
-    def counts(self) -> Counter[str]:
-        """Return the counts of its queries."""
-        return counts_of(self.queries)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -385,18 +382,17 @@ def _notes_on_maps(table: Table) -> list[str]:
 
 def _disturbed(table: Table) -> list[str]:
     """Return how far maps and answers hang on the last bit: a line for each disturbed recording."""
-    errors: dict[str, list[float]] = {}
-    for row in table.maps:
-        errors.setdefault(row.name.partition(_DISTURBED)[0], []).append(row.error_m or math.nan)
-    verdicts: dict[tuple[str, str, int], set[bool | None]] = {}
-    for pair in table.pairs:
-        map_ = re.sub(rf"{_DISTURBED}\d+| 0\.\..*", "", pair.map)
-        for query in filter(lambda query: query.located, pair.queries):
-            verdicts.setdefault((map_, pair.query, query.window), set()).add(query.right)
+    errors = grouped((row.name.partition(_DISTURBED)[0], row.error_m or math.nan) for row in table.maps)
+    verdicts = grouped(
+        ((re.sub(rf"{_DISTURBED}\d+| 0\.\..*", "", pair.map), pair.query, query.window), query.right)
+        for pair in table.pairs
+        for query in pair.queries
+        if query.located
+    )
     return [
         f"- {name}, disturbed: {min(found):.3f} to {max(found):.3f} m, {max(found) / min(found):.2f} times;"
         f" windows right in one of its maps and wrong in another:"
-        f" {sum(at[0] == name and right >= {True, False} for at, right in verdicts.items())}"
+        f" {sum(at[0] == name and {*rights} >= {True, False} for at, rights in verdicts.items())}"
         for name, found in errors.items()
         if len(found) > 1
     ]
@@ -448,7 +444,7 @@ def _places(table: Table) -> list[str]:
 def _pair_cells(row: PairRow) -> list[str]:
     if row.problem:
         return [row.query, row.map, row.sensors, *[""] * 13, row.problem]
-    counts, known = row.counts, row.truth is not None
+    counts, known = counts_of(row.queries), row.truth is not None
     failed = f" ({counts['failed']} failed)" if counts["failed"] else ""
     errors_m = [q.error_m for q in row.queries if q.outcome == "right" and q.error_m is not None]
     # Of the right place, of the covered queries that are not located.
@@ -493,11 +489,9 @@ def sensor_matrix(table: Table) -> list[str]:
 
     A dash: no two recordings of one building have these sensors, so that nothing was measured.
     """
-    groups: dict[tuple[str, str], list[PairRow]] = {}
-    for row in table.pairs:
-        if row.kind != "elsewhere" and not row.problem:
-            query, _, map_ = row.sensors.partition(" in ")
-            groups.setdefault((query, map_ or query), []).append(row)
+    inside = [row for row in table.pairs if row.kind != "elsewhere" and not row.problem]
+    sensors = (row.sensors.split(" in ") for row in inside)
+    groups = grouped(zip(((some[0], some[-1]) for some in sensors), inside, strict=True))
     driven = {pair: rows for pair, rows in groups.items() if set(pair) & set(_DRIVEN)}
     return [
         *_matrix(groups, _SENSORS, _SENSORS),
@@ -810,7 +804,7 @@ def change_lines(changed: Sequence[RowChange]) -> list[str]:
 
 
 def _total(rows: Iterable[PairRow]) -> Counter[str]:
-    return counts_of(query for row in rows for query in row.queries)
+    return counts_of([query for row in rows for query in row.queries])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
