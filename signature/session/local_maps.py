@@ -9,8 +9,9 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from pc2grid.estimation.line_map import PointGrid, best_placements, evenly
+from pc2grid.estimation.line_map import LineMatch, PointGrid, best_placements, evenly
 from pc2grid.geometry import F64, I64, SE2, SUBPIXEL_BITS, polygon_corners
 from pc2grid.matching.evidence import LEFT, evidence_of, masses
 from pc2grid.matching.score import score_fit
@@ -109,20 +110,29 @@ class LocalMap:
         drawn[cells[:, 0], cells[:, 1]] = OCCUPIED
         return OccupancyGrid(cells=drawn, resolution_m=self._parameters.cell_m, origin_m=(low_x, low_y))
 
+    def match(self, points_m: F64, normal_rad: NDArray[np.floating], guess: SE2) -> LineMatch:
+        """Refine the pose of points (N, 2) with normals (N,) in this local map, from the points alone."""
+        no_prior = np.zeros((3, 3))
+        return self._grid.match(
+            points_m, normal_rad, guess, guess, no_prior, radii=self._parameters.radii_cells
+        )
+
+    def sample(self) -> tuple[F64, F64]:
+        """Return the points (S, 2) that are compared with another local map, and their normals (S,)."""
+        chosen = evenly(len(self.points_m), self._parameters.search_points)
+        return self.points_m[chosen], self.normal_rad[chosen]
+
     def overlap(self, newer: LocalMap, guess: SE2, window_m: float, window_rad: float) -> Overlap | None:
         """Match a newer local map with this one near a guess; None if they hardly show one place.
 
         Correlative scan matching over the window proposes poses. Of these the likeliest, by the evidence of
         the walls of both, counts as much as it is likely (`pc2grid.matching.evidence`).
         """
-        p, no_prior = self._parameters, np.zeros((3, 3))
-        chosen = evenly(len(newer.points_m), p.search_points)
-        points, normals = newer.points_m[chosen], newer.normal_rad[chosen]
-        starts = best_placements(self._field, self._low_m, p.cell_m, points, guess, window_m, window_rad)
-        matches = [
-            self._grid.match(points, normals, start, start, no_prior, radii=p.radii_cells)
-            for _, start in starts
-        ]
+        points, normals = newer.sample()
+        starts = best_placements(
+            self._field, self._low_m, self._parameters.cell_m, points, guess, window_m, window_rad
+        )
+        matches = [self.match(points, normals, start) for _, start in starts]
         evidence = evidence_of([score_fit(self.walls, newer.walls, match.pose) for match in matches])
         counts = [float(masses([one])[0]) for one in evidence]
         if max(counts, default=0.0) < LEFT:
