@@ -21,7 +21,7 @@ from websockets.sync.client import ClientConnection, connect
 from websockets.typing import Subprotocol
 
 from pc2grid.errors import LiveError
-from pc2grid.io.live.live_log import LIVE, Feed, LiveParameters
+from pc2grid.io.live.feed import LIVE, Feed, LiveParameters
 from pc2grid.io.messages.ros import short_name
 from pc2grid.io.source import RawMessage, TopicInfo
 from pc2grid.settings import ReadConfig

@@ -18,7 +18,8 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 import pc2grid
-from pc2grid.io.live.live_log import Feed, LiveLog
+from pc2grid.io.live.feed import Feed
+from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.source import RawMessage, TopicInfo
 from pc2grid.settings import ReadConfig

@@ -17,8 +17,9 @@ import pytest
 
 from pc2grid.errors import LiveError, NoScans, Pc2GridError
 from pc2grid.geometry import SE2
+from pc2grid.io.live.feed import LiveParameters
 from pc2grid.io.live.foxglove_websocket import ConnectionParameters, FoxgloveWebsocket
-from pc2grid.io.live.live_log import LiveLog, LiveParameters
+from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.live.nav2 import Nav2Publisher
 from pc2grid.io.recording import open_log
 from pc2grid.model import OccupancyGrid, Scan

@@ -8,7 +8,8 @@ from collections.abc import Collection, Sequence
 import pytest
 
 from pc2grid.errors import NoScans
-from pc2grid.io.live.live_log import Arrived, Feed, Inbox, LiveLog, LiveParameters
+from pc2grid.io.live.feed import Arrived, Feed, Inbox, LiveParameters
+from pc2grid.io.live.live_log import LiveLog
 from pc2grid.io.source import RawMessage, Tally, TopicInfo
 from pc2grid.settings import ReadConfig
 from tests.helpers.recordings import T0, Message, laser_drive, ros
