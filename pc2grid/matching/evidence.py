@@ -99,9 +99,6 @@ class Evidence:
         return float(np.dot((EVIDENCE.bias, EVIDENCE.fit, EVIDENCE.lead), self.terms))
 
 
-NO_EVIDENCE = Evidence(known_agreement=0.0, compared=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
-
-
 def evidence_of(
     fits: Sequence[Fit], likeness: float = 0.0, rivals: Sequence[Fit] = ()
 ) -> tuple[Evidence, ...]:

@@ -10,12 +10,13 @@ from typing import cast
 import numpy as np
 import pytest
 
-from pc2grid.matching.evidence import EVIDENCE, NO_EVIDENCE, Evidence, evidence_of, masses, tempered
+from pc2grid.matching.evidence import EVIDENCE, Evidence, evidence_of, masses, tempered
 from pc2grid.matching.score import Fit
 
 AGREEMENTS = np.linspace(0.0, 1.0, 11).tolist()
 WALLS = [5.0, 30.0, 100.0, 300.0, 2000.0]
 LEADS = [-0.1, 0.0, 0.01, 0.05, 0.1, 0.15]
+NO_EVIDENCE = Evidence(known_agreement=0.0, compared=0.0, backward=0.0, looked_at=0.0, lead=0.0, likeness=0.0)
 USUAL = Evidence(known_agreement=0.9, compared=200.0, backward=0.9, looked_at=150.0, lead=0.15, likeness=0.4)
 
 
